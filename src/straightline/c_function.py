@@ -239,12 +239,13 @@ def _name_arrays(
 
 def _name_leaves(label: str, tree: PyTree) -> list[str]:
     """Return a name in C for each array of a tree: `label` and its path, as in state_speed_0; other signs become _."""
-    results = []
+    names = []
     for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
-        text = "_".join([label, *parts])
-        results.append("".join(c if c.isalnum() and c.isascii() else "_" for c in text))
-    return results
+        # An entry of the path is an attribute's name, a dictionary's key, or an index.
+        entries = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
+        text = "_".join([label, *entries])
+        names.append("".join(c if c.isalnum() and c.isascii() else "_" for c in text))
+    return names
 
 
 def _find_code_line(operation: str, equations: Sequence[Any]) -> str:

@@ -33,25 +33,27 @@ class ZeroFoldingGraph(Graph):
     """
 
     def __init__(self) -> None:
+        """Make an empty graph, in which nothing is known to be finite yet: neither an input nor a number."""
         super().__init__()
         # What is finite for certain: 0 times such a number is 0, and needs no operation.
         self.finite_buffers: set[Buffer] = set()  # inputs that hold no NaN
-        self.finite: set[Node] = set()  # numbers that follow from these alone
+        self.finite: set[Node] = set()  # numbers that are computed from these alone
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return a node (scalar operation), 0 for a product of zero and a number that is finite whatever the data.
 
-        PRESERVING operations, and selections, of finite numbers are finite: so notes `finite` what follows from those.
+        The node is noted as finite (`self.finite`) if its arguments are and its operation is one of PRESERVING, whose
+        results are finite then, or a selection.
         """
         if op == "mul" and type in REAL:
             for a, b in (args, args[::-1]):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
                     return self.constant(0.0, type)
-        made = super().node(op, type, *args, value=value)
-        numbers = args[1:] if op == "select" else args  # a selection is of its numbers, whatever its condition is
+        node = super().node(op, type, *args, value=value)
+        numbers = args[1:] if op == "select" else args  # of a selection the condition does not count
         if type in REAL and (op in PRESERVING or op == "select") and all(map(self._is_finite, numbers)):
-            self.finite.add(made)
-        return made
+            self.finite.add(node)
+        return node
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Return the node of buffer[offset + sum strides * indices]; note it as finite if all of its buffer are."""
@@ -69,6 +71,7 @@ class CLowering(Lowering):
     """Lowering into a `ZeroFoldingGraph`: written out, with known arrays as tables that a step can index."""
 
     def __init__(self) -> None:
+        """Make a lowering into an empty `ZeroFoldingGraph`, which drops products of zero with finite numbers."""
         super().__init__()
         self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 

@@ -145,11 +145,12 @@ def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
     unsigned, signed = f"uint{bits}_t", f"int{bits}_t"
     if is_unsigned and op in UNSIGNED:
         return UNSIGNED[op](*arguments, t=unsigned)
-    # What a shift of a signed number is by: at most all bits but one, which leaves the sign.
-    last = arguments[-1]
-    in_range = f"{last} < {bits}" if is_unsigned else f"{last} >= 0 && {last} < {bits}"
-    by = f"(({in_range}) ? {last} : {bits - 1})"
-    return WHOLE[op](*arguments, t=unsigned if is_unsigned else signed, u=unsigned, s=signed, b=bits, by=by)
+    # A signed number is shifted by at most all bits but one, which leaves the sign.
+    shift = arguments[-1]
+    in_range = f"{shift} < {bits}" if is_unsigned else f"{shift} >= 0 && {shift} < {bits}"
+    limited_shift = f"(({in_range}) ? {shift} : {bits - 1})"
+    own_type = unsigned if is_unsigned else signed
+    return WHOLE[op](*arguments, t=own_type, u=unsigned, s=signed, b=bits, by=limited_shift)
 
 
 def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
@@ -221,9 +222,8 @@ class CSource:
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name_node(node)
         largest = float(np.finfo(np.float32).max)
-        return write_literal(
-            min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real
-        )
+        clipped = min(max(node.value, -largest), largest) if node.type == "f64" else node.value
+        return write_literal(clipped, node.type, self.real)
 
     def write_statements(self, block: Block, indent: str = "    ") -> list[str]:
         """Return the lines of C for a block's operations and statements, in order, each after `indent`."""
@@ -354,14 +354,16 @@ class CSource:
         A result's variable is declared as 0 before, and gets its value at the block's end. `needed` are the nodes that
         the C function's results need.
         """
-        results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
+        pairs = [(result, value) for result, value in zip(guard.results, guard.values, strict=True)
+                 if result in self.needed]  # fmt: skip
         lines = []
-        for outcome, _ in results:
-            self.names[outcome] = self._new_name()
-            lines.append(f"{indent}{c_type(outcome.type, self.real)} {self.names[outcome]} = 0;")
-        deeper = f"{indent}    "
-        lines += [f"{indent}if ({self.name_node(guard.condition)}) {{", *self.write_statements(guard.body, deeper)]
-        return [*lines, *(f"{deeper}{self.names[r]} = {self.name_node(v)};" for r, v in results), f"{indent}}}"]
+        for result, _ in pairs:
+            self.names[result] = self._new_name()
+            lines.append(f"{indent}{c_type(result.type, self.real)} {self.names[result]} = 0;")
+        inner = f"{indent}    "
+        lines += [f"{indent}if ({self.name_node(guard.condition)}) {{", *self.write_statements(guard.body, inner)]
+        lines += [f"{inner}{self.names[result]} = {self.name_node(value)};" for result, value in pairs]
+        return [*lines, f"{indent}}}"]
 
 
 def _wrap_numbers(numbers: Sequence[str]) -> list[str]:

@@ -19,7 +19,7 @@ from straightline.machine_code import MachineCode, TieredCode, choose_hasty_widt
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
 from straightline.result_memory import make_aligned_array
-from straightline.size_limits import ALONE, LITTLE, LONGEST
+from straightline.size_limits import ALONE, LITTLE, LONGEST, divide_rounded_up
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
@@ -34,10 +34,10 @@ class CompiledFunction:
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
+        """Write the code as text of LLVM, which the first call compiles; the class says what the arguments are."""
         self.differs = list(differs)
         self.types = [DTYPES[b.type] for b in program.inputs]
-        self.shapes = [b.shape for b in program.inputs]
-        self.tree = program.tree
+        self.shapes, self.tree = [b.shape for b in program.inputs], program.tree
         # If runs share all arguments, they are one, whose results are computed in the arrays that are returned.
         is_one_run, (_name, _flags, fuses) = not any(self.differs), find_processor_features()
         self.code: ModuleText = write_module(program, self.differs, width, fuse=fuses, alone=is_one_run)
@@ -55,11 +55,11 @@ class CompiledFunction:
         self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
     def with_first_arguments(self, *arguments: PyTree) -> "CompiledFunction":
-        """Return the same code with its first arguments (leaves) bound to these, which calls then leave out."""
-        new = copy(self)
-        new._first = [convert_to_memory(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
-        new._check_shapes(new._first, 0, new._count_runs(new._first))
-        new._addresses, new._shared = list_addresses(new._first), None
+        """Return a copy that has the same code, its first arguments (leaves) bound to these: calls leave them out."""
+        new, leaves = copy(self), jax.tree.leaves(arguments)
+        new._first = [convert_to_memory(x, type) for x, type in zip(leaves, self.types, strict=False)]
+        new._check_shapes(new._first, first=0, runs=new._count_runs(new._first))
+        new._addresses, new._shared = list_addresses(new._first), None  # what all runs share is computed anew
         return new
 
     def make_in_place_code(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlaceCode":
@@ -73,14 +73,15 @@ class CompiledFunction:
         return InPlaceCode(self, runs, inputs)
 
     def generate_code(self, arrays: Sequence[Any] = ()) -> str:
-        """Generate machine code for a first call of these arrays, or of one run; return "", or why LLVM makes none."""
-        if self._refusal is None:
+        """Generate machine code for a first call of these arrays; return why LLVM makes none, "" if it does."""
+        if self._refusal is None:  # the answer is kept: a later call generates nothing
+            runs = self._count_runs(arrays)
             try:
-                if self.once is not None:
-                    self.once.generate_code(1)
-                if not all(self.code.common):
-                    tiers, width = self._choose_code_and_width(self._count_runs(arrays))
-                    tiers.generate_code(-(-self._count_runs(arrays) // width))
+                if self.once is not None:  # the code of what all runs share
+                    self.once.generate_code(blocks=1)
+                if not all(self.code.common):  # some results differ between runs
+                    tiers, width = self._choose_code_and_width(runs)
+                    tiers.generate_code(blocks=divide_rounded_up(runs, width))
                 self._refusal = ""
             except Unsupported as error:
                 self._refusal = str(error)
@@ -135,7 +136,7 @@ class CompiledFunction:
             return jax.tree.unflatten(self.tree, outputs)
         # What differs between runs, block by block: each call computes its own rows of the outputs.
         tiers, width = self._choose_code_and_width(sum(counts))
-        machine, begin = tiers.choose_machine(-(-sum(counts) // width)), 0
+        machine, begin = tiers.choose_machine(divide_rounded_up(sum(counts), width)), 0
         for call_arrays, count in zip(arrays, counts, strict=True):
             rows = [x[begin : begin + count] for x in outputs]
             pointers, memory = self._list_addresses(call_arrays, rows, shared), (call_arrays, code.tables, rows, shared)
@@ -155,7 +156,7 @@ class CompiledFunction:
         if shared is None:
             shared = allocate_aligned(self.code.shared)
             pointers = self._list_addresses(arrays, outputs, shared)
-            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
+            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)  # no scratch; block 0 to 1, of one run
             self._shared = shared if all(self.differs[len(self._first) :]) else None
         self._copy_shared_outputs(outputs, shared)
         return shared
@@ -167,19 +168,19 @@ class CompiledFunction:
 
     def _compute_blocks(self, call: "MemoryOfCall", cores: int | None) -> None:
         """Compute all blocks of a call, each the runs of one vector: here if that is little work, else in threads."""
-        blocks, scratch, work = -(-call.runs // call.machine.width), self.code.scratch, self.code.blocks.work
-        # Blocks of a thread's part: an even share, but no less than is worth a thread. -(-a // b) is a / b rounded up.
-        share = max(-(-blocks // ((cores or cpu_count()) * SHARES)), -(-LITTLE // max(work, 1)))
+        blocks, scratch = divide_rounded_up(call.runs, call.machine.width), self.code.scratch
+        # Blocks that a thread computes at a time: an even share, but no less than is worth a thread.
+        even_share = divide_rounded_up(blocks, (cores or cpu_count()) * SHARES)
+        share = max(even_share, divide_rounded_up(LITTLE, max(self.code.blocks.work, 1)))
         if cores == 1 or share >= blocks:
-            call.compute(0, blocks, scratch)
-            return
+            return call.compute(0, blocks, scratch)
         starts = range(0, blocks, share)
         list(get_thread_pool().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_shared_outputs(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         """Copy the outputs that all runs share to every run, from their places (bytes) in the shared memory."""
-        parts = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
-        for array, is_common, offset, buffer in parts:
+        places = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
+        for array, is_common, offset, buffer in places:
             if is_common:
                 size = buffer.size * array.itemsize
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
@@ -222,9 +223,9 @@ class InPlaceCode:
         self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
         # The code for so many runs, and whether a call is so little work that threads would cost more.
         self._tiers, width = compiled._choose_code_and_width(runs)
-        self._blocks = -(-runs // width)
+        self._blocks = divide_rounded_up(runs, width)
         self._is_little = runs == 1 or self._blocks * code.blocks.work < LITTLE
-        # What all runs share is computed now, unless it follows from an argument of the calls.
+        # What all runs share is computed now, unless an argument of the calls decides it.
         self._shared_varies = compiled.once is not None and not all(differs)
         if compiled.once is not None and not self._shared_varies:
             self._compute_shared(compiled.once)
@@ -236,10 +237,10 @@ class InPlaceCode:
             ValueError: an array of another shape or type, or not contiguous; several runs that share all arguments.
         """
         compiled, left_out, runs = self._compiled, len(self._compiled._first), self.runs
-        kinds = zip(compiled.shapes, compiled.types, compiled.differs, strict=True)
-        new = [np.zeros((runs, *s) if d else s, t) for s, t, d in list(kinds)[left_out:]]
+        arguments = list(zip(compiled.shapes, compiled.types, compiled.differs, strict=True))[left_out:]
+        new = [np.zeros((runs, *shape) if differs else shape, type) for shape, type, differs in arguments]
         inputs = [in_place.get(n, x) for n, x in enumerate(new)]
-        compiled._check_shapes(inputs, left_out, runs)
+        compiled._check_shapes(inputs, first=left_out, runs=runs)
         if runs != 1 and compiled._by_run is None:
             raise ValueError(f"runs: expected one, since they share all arguments, got {runs}")
         for n, (x, expected) in enumerate(zip(inputs, new, strict=True)):
@@ -255,7 +256,7 @@ class InPlaceCode:
             return
         machine = self._tiers.choose_machine(self._blocks)
         if self._is_little:
-            machine.run(*self._addresses, 0, -(-self.runs // machine.width), self.runs)
+            machine.run(*self._addresses, 0, divide_rounded_up(self.runs, machine.width), self.runs)
         else:
             call = MemoryOfCall(machine=machine, pointers=self._pointers, memory=self._memory, runs=self.runs)
             self._compiled._compute_blocks(call, cores=None)
@@ -273,29 +274,30 @@ class SingleRunCode:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
-        every, (_name, _flags, fuses) = [True] * len(program.inputs), find_processor_features()
-        self.code = write_module(program, differing=every, width=1, fuse=fuses, alone=True, last=in_place)
+        """Write and compile the code of one run, and allocate its memory; the class says what `in_place` is."""
+        all_differ, (*_, fuses) = [True] * len(program.inputs), find_processor_features()
+        self.code = write_module(program, differing=all_differ, width=1, fuse=fuses, alone=True, last=in_place)
         level = int(self.code.operations <= ALONE)  # 1, with care, unless the program is long
-        self.machine, self.tree, self._in_place = emit_code(self.code.blocks, level, 1), program.tree, in_place
+        self.machine, self.tree, self._in_place = emit_code(self.code.blocks, level, width=1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._allocate_memory([])
 
     def with_new_memory(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
-        """Return the same code with memory of its own, in which the first arguments are these, only read by a call."""
+        """Return a copy with memory of its own; its `first` arguments are these arrays, which calls only read."""
         new = copy(self)
         new._allocate_memory(first)
         return new
 
     def _allocate_memory(self, first: Sequence[np.ndarray]) -> None:
         """Allocate the arrays of calls; results in `_in_place` (result: argument) are written over their argument."""
-        kinds = self._arguments
-        self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]
-        self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]
-        fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in self.code.outputs]
-        self.outputs = [self.inputs[self._in_place[k]] if k in self._in_place else x for k, x in enumerate(fresh)]
+        given = zip(first, self._arguments, strict=False)
+        self.inputs = [np.ascontiguousarray(x, type).reshape(shape) for x, (shape, type) in given]
+        self.inputs += [np.zeros(shape, type) for shape, type in self._arguments[len(first) :]]
+        new = [np.zeros(b.shape, DTYPES[b.type]) for b in self.code.outputs]
+        self.outputs = [self.inputs[self._in_place[k]] if k in self._in_place else x for k, x in enumerate(new)]
         self.scratch, self._shared = allocate_aligned(self.code.scratch), allocate_aligned(self.code.shared)
-        every = [*self.inputs, *self.code.tables, *self.outputs, self._shared]
-        self.pointers = np.array(list_addresses(every), dtype=np.uint64)
+        arrays = [*self.inputs, *self.code.tables, *self.outputs, self._shared]
+        self.pointers = np.array(list_addresses(arrays), dtype=np.uint64)
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:

@@ -39,10 +39,10 @@ class NodeMaker(Protocol):
 
 def wrap_integer(number: int, like: Any) -> Any:
     """Return a number as an integer of the type of `like`: its lowest bits, as arithmetic that overflows has them."""
-    kind = type(like)
-    bits = 8 * like.itemsize
-    rest = number % (1 << bits)
-    return kind(rest - (1 << bits) if rest > np.iinfo(kind).max else rest)
+    integer_type, bits = type(like), 8 * like.itemsize
+    lowest_bits = number % (1 << bits)
+    is_negative = lowest_bits > np.iinfo(integer_type).max  # as a signed number in two's complement
+    return integer_type(lowest_bits - (1 << bits) if is_negative else lowest_bits)
 
 
 def _shift_left(a: Any, b: Any) -> Any:
@@ -57,14 +57,15 @@ def _shift_right(a: Any, b: Any) -> Any:
 
 
 def _shift_right_signed(a: Any, b: Any) -> Any:
-    """Return a >> b with copies of the highest bit from the left, also of an unsigned a; all copies if b is too large.
+    """Return a >> b with copies of the highest bit from the left, also of an unsigned a.
 
-    That is a b below 0 or of all bits or more.
+    All bits are such copies if b is below 0, or the number of bits or more.
     """
-    last = 8 * a.itemsize - 1
-    is_negative = int(a) >> last == 1  # an unsigned number whose highest bit is set is read as one below zero
-    signed = int(a) - (1 << last + 1) if is_negative else int(a)
-    return wrap_integer(signed >> (int(b) if 0 <= b <= last else last), a)
+    highest = 8 * a.itemsize - 1  # number of the highest bit
+    is_negative = int(a) >> highest == 1  # an unsigned number whose highest bit is set is read as one below zero
+    signed = int(a) - (1 << highest + 1) if is_negative else int(a)
+    shift = int(b) if 0 <= b <= highest else highest
+    return wrap_integer(signed >> shift, a)
 
 
 def _divide(a: Any, b: Any) -> Any:
@@ -125,8 +126,10 @@ def _convert_number(a: Any, kind: Any) -> Any:
     """
     if not isinstance(a, np.floating) or kind in (np.float64, np.float32, np.bool_):
         return a.astype(kind)
-    ends = np.iinfo(kind)
-    return kind(0 if np.isnan(a) else ends.max if a >= ends.max else ends.min if a <= ends.min else int(a))
+    limits = np.iinfo(kind)
+    if np.isnan(a):
+        return kind(0)
+    return kind(limits.max if a >= limits.max else limits.min if a <= limits.min else int(a))
 
 
 # Operations whose numbers of known numbers are computed here; others wait for the run.
@@ -149,11 +152,10 @@ def fold_node(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> 
 
     SIMPLER has a rule for the operations that can be simplified.
     """
-    for a in args:
-        if a.op != "constant":
-            rule = SIMPLER.get(op)
-            return None if rule is None else rule(graph, type, *args)
-    return _evaluate(graph, op, type, args)
+    if all(a.op == "constant" for a in args):
+        return _evaluate(graph, op, type, args)
+    rule = SIMPLER.get(op)
+    return None if rule is None else rule(graph, type, *args)
 
 
 # The same of doubles, as Python computes them in a tenth of the time: of a matrix's known zeros there are millions.

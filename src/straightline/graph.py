@@ -20,7 +20,8 @@ class Graph:
     """
 
     def __init__(self, max_nodes: int = 2 * LONGEST) -> None:
-        self.max_nodes = max_nodes  # of all blocks together; one more is refused
+        """Make a graph with one empty block, which is open; more than `max_nodes` nodes in all are refused."""
+        self.max_nodes = max_nodes
         self.top = Block(None)  # the outermost block, around all loops
         self.current = self.top  # the open block
         self.serial = 0  # number of the last node that was made; nodes are counted from 1
@@ -42,10 +43,10 @@ class Graph:
         """Return the node of a constant, one for equal ones, rounded to single precision if it is of that type."""
         value = DTYPES[type](value).item() if type == "f32" else value
         key = (type, value if value != 0 or type not in REAL else str(value))  # 0.0 == -0.0, but they differ
-        known = self.top.seen.get(key)
-        if known is None:
-            known = self.top.seen[key] = self.make_fresh_node("constant", type, (), self.top, value)
-        return known
+        node = self.top.seen.get(key)
+        if node is None:
+            node = self.top.seen[key] = self.make_fresh_node("constant", type, (), self.top, value)
+        return node
 
     def make_fresh_node(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
         """Return a new node, that no other stands for, with the next number (`serial`); no block contains it yet.
@@ -73,25 +74,25 @@ class Graph:
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Return the node of buffer[offset + sum strides * indices], no further out than the block that fills that."""
-        # Indices that are known become part of the offset.
-        open_pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
+        # Indices that are known become part of the offset; `varying` are the strides and indices of all others.
+        varying = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
-        if buffer.table is not None and not open_pairs:
+        if buffer.table is not None and not varying:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
         # If the other indices choose a row alone, it is known which entry of the row is loaded: of entries that are the
         # same number (`first`), the first one.
         row_length = len(buffer.first)
-        if row_length and all(s % row_length == 0 for s, _ in open_pairs):
+        if row_length and all(s % row_length == 0 for s, _ in varying):
             offset += buffer.first[offset % row_length] - offset % row_length
-        indices = tuple(i for _, i in open_pairs)
-        value = (buffer, offset, tuple(s for s, _ in open_pairs))
+        indices = tuple(i for _, i in varying)
+        value = (buffer, offset, tuple(s for s, _ in varying))
         return self._find_or_make("load", buffer.type, indices, value, buffer.block.depth)
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
         """Add to the open block the statement buffer[offset + sum strides * indices] = node."""
-        written = Store(self.current, buffer, node, offset, strides, indices)
-        buffer.stores.append(written)
-        self.current.items.append(written)
+        statement = Store(self.current, buffer, node, offset, strides, indices)
+        buffer.stores.append(statement)
+        self.current.items.append(statement)
 
     def _find_or_make(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
         """Return the equal node of an open block, or make one: in the outermost block that may have it.

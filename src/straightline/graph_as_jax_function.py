@@ -38,6 +38,7 @@ class _JaxEvaluation:
     """Values of nodes and numbers in memory while JAX traces the function."""
 
     def __init__(self, program: Program):
+        """Find the nodes that a program's results need; raise Unsupported where a result is a random key."""
         self.program = program
         nodes = [n for x in program.outputs if not isinstance(x, StridedArray) for n in x.ravel().tolist()]
         if not all(isinstance(n, Node) for n in nodes):
@@ -62,16 +63,17 @@ class _JaxEvaluation:
     def _gather_result(self, value: Any) -> jax.Array:
         """Return an array of the result: its nodes' values stacked, or read from memory.
 
-        There, entry (i, j, ...) lies at start + offset + strides * (i, j, ...) + moves: steps times nodes' values.
+        There, entry (i, j, ...) lies at start + offset + strides * (i, j, ...) + the sum of the moves, each a stride
+        times the value of a node.
         """
         if not isinstance(value, StridedArray):
-            nodes = [self.value(n) for n in value.ravel().tolist()]
-            return jnp.stack(nodes).reshape(value.shape) if nodes else jnp.zeros(value.shape)
+            numbers = [self.value(n) for n in value.ravel().tolist()]
+            return jnp.stack(numbers).reshape(value.shape) if numbers else jnp.zeros(value.shape)
         owner, start = value.buffer.owner
-        grid = np.indices(value.shape).reshape(value.ndim, -1)
-        places = np.array(value.strides, int) @ grid + start + value.offset
-        moved = sum((s * self.value(i) for s, i in value.moves), jnp.asarray(places))
-        return self.memory[owner][moved].reshape(value.shape)
+        indices = np.indices(value.shape).reshape(value.ndim, -1)
+        known_places = np.array(value.strides, int) @ indices + start + value.offset
+        places = sum((stride * self.value(node) for stride, node in value.moves), jnp.asarray(known_places))
+        return self.memory[owner][places].reshape(value.shape)
 
     def value(self, node: Node) -> jax.Array:
         """Return the value of a node."""
@@ -134,9 +136,10 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
-            """Set values and memory as a turn begins: those from outside, and the carry (numbers, arrays).
+            """Set `self.values` and `self.memory` as a turn begins: those from outside the loop, and the carry.
 
-            `carried` are the places of the loop's numbers, `filled` the buffers that it fills.
+            The carry is a pair: the numbers of the parameters whose places are `carried`, and the arrays of the
+            buffers `filled`, which the loop fills.
             """
             numbers, arrays = carry
             self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
@@ -145,7 +148,7 @@ class _JaxEvaluation:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
         def run_turn(counter: Any, carry: PyTree) -> PyTree:
-            """Return the carry after the body: the numbers `carried`, and the memory of the buffers `filled`."""
+            """Return the carry after a turn: the `carried` numbers for the next, and what the buffers `filled` hold."""
             begin_turn(carry, counter)
             self.evaluate_block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
@@ -173,7 +176,11 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(guard.body), self.values, self.memory
 
         def evaluate_body() -> PyTree:
-            """Return the guarded block's values that are `used`, and the memory of the buffers that it fills."""
+            """Return the guarded block's values that are used outside it, and what the buffers that it fills hold.
+
+            `used` are the places of the former in `guard.values`, `filled` are the latter. `self.values` and
+            `self.memory` begin as they are outside of the block.
+            """
             self.values, self.memory = dict(outer_values), dict(outer_memory)
             self.evaluate_block(guard.body.items)
             return [self.value(guard.values[k]) for k in used], [self.memory[b] for b in filled]

@@ -36,11 +36,16 @@ class Lowering:
     """Lowering of operations one after another into a graph."""
 
     def __init__(self, most: int = 2 * LONGEST) -> None:
+        """Begin a program without operations; more than `most` nodes are refused."""
         self.graph = Graph(most)
-        self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
-        self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches
-        self.written_out = WRITTEN_OUT  # executions of a loop's operations up to which its turns are written out
-        self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}  # entries of A B' -> A and B, of each product
+        # Programs of custom operations, traced for one run, by the operation and the shapes of its arguments.
+        self.kernels: dict[Any, ClosedJaxpr] = {}
+        # How many numbers a program within a loop or branch computes, by an estimate.
+        self.sizes: dict[Jaxpr, int] = {}
+        # A loop whose turns compute no more numbers than this, all together, is written out turn by turn.
+        self.written_out = WRITTEN_OUT
+        # The factors A and B of each product A B', by the nodes of its entries.
+        self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
 
     def inline_program(
         self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()

@@ -24,6 +24,7 @@ class Unsupported(Exception):  # noqa: N818
     """Error of a program that is not supported: the operation, and its place in the program."""
 
     def __init__(self, operation: str, where: str = ""):
+        """Make the error of an operation that cannot be compiled; `where`: its place in the program, if known."""
         super().__init__(f"{operation}{f' at {where}' if where else ''}")
         self.operation, self.where = operation, where
 
@@ -38,6 +39,11 @@ class Node:
     __slots__ = ("args", "block", "op", "serial", "type", "value")
 
     def __init__(self, op: str, type: Type, args: tuple["Node", ...], block: "Block", value: Any, serial: int):
+        """Hold one scalar operation: its name, the type of its result, its arguments, and the block that computes it.
+
+        `value` is what is known of it at compile time, and `serial` the number of nodes that were made up to this
+        one.
+        """
         self.op, self.type, self.args, self.block, self.value, self.serial = op, type, args, block, value, serial
 
     def __repr__(self) -> str:
@@ -53,6 +59,7 @@ class RandomKey:
     __slots__ = ("first", "second")
 
     def __init__(self, first: Node, second: Node):
+        """Hold the first and the second 32-bit word of a key of random numbers, each a node."""
         self.first, self.second = first, second
 
 
@@ -108,6 +115,15 @@ class Buffer:
     __slots__ = ("block", "first", "inside", "kind", "parts", "shape", "stores", "table", "type")
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
+        """Hold the description of an array in memory, which nothing fills yet and no other buffer contains.
+
+        Args:
+            kind: what fills it: "input", "scratch", "table" or "carried".
+            type: of its numbers.
+            shape: of the array of one run.
+            block: of the program, in which it is filled.
+            table: the numbers of a "table", which all runs share; None of other kinds.
+        """
         self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
         self.stores: list[Store] = []  # statements that fill it
         self.inside: tuple[Buffer, int] | None = None  # the buffer that it is a part of, and from which entry on
@@ -176,6 +192,7 @@ class LoopExit:
     __slots__ = ("loop",)
 
     def __init__(self, loop: Loop):
+        """Hold the loop that is left here once its condition holds in no run."""
         self.loop = loop
 
 
@@ -185,6 +202,7 @@ class Guard:
     __slots__ = ("block", "body", "condition", "results", "values")
 
     def __init__(self, body: Block, condition: Node):
+        """Make the statement that computes the block `body` where `condition` holds in some run."""
         self.body, self.condition = body, condition
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self

@@ -126,14 +126,14 @@ def list_needed_items(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
 
     A set would have an order that changes from process to process, and with it the program's text.
     """
-    results: dict[Any, None] = {}
-    waiting: list[Any] = list(roots)
-    while waiting:
-        node = waiting.pop()
-        if node not in results:
-            results[node] = None
-            waiting += node.args if needs_arguments_alone(node) else _list_needs(node)
-    return results
+    needed: dict[Any, None] = {}
+    to_visit: list[Any] = list(roots)
+    while to_visit:
+        item = to_visit.pop()
+        if item not in needed:
+            needed[item] = None
+            to_visit += item.args if needs_arguments_alone(item) else _list_needs(item)
+    return needed
 
 
 REFERRING = frozenset(("load", "parameter", "result", "counter", "guarded"))  # nodes that need more than arguments
@@ -277,7 +277,7 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
 
 
 def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return what of these items, in order, differs between runs: what varies with these inputs, and some memory more.
+    """Return which of these items, in order, differ between runs: what varies with these inputs, and some memory.
 
     What runs share is computed once, before them. Of an array that a loop carries in memory only the numbers of the
     last turn are left then: where runs need those of every turn, the array counts as differing, and each run has one.
@@ -304,15 +304,15 @@ def find_crossing_items(items: Iterable[Any], spread: set[Any]) -> set[Any]:
 
     Statements are the stores into their memory, and the loops and guards around them.
     """
-    results = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
-    left = list(results)
-    while left:
-        x = left.pop()
-        around = [] if isinstance(x, Buffer) else [x.block.owner]
-        around += [x.value[0]] if isinstance(x, Node) and x.op in ("parameter", "result", "guarded") else []
-        left += [s for s in around if s is not None and s not in results]
-        results.update(around)
-    return results - {None}
+    written = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
+    to_visit = list(written)
+    while to_visit:
+        item = to_visit.pop()
+        around = [] if isinstance(item, Buffer) else [item.block.owner]
+        around += [item.value[0]] if isinstance(item, Node) and item.op in ("parameter", "result", "guarded") else []
+        to_visit += [statement for statement in around if statement is not None and statement not in written]
+        written.update(around)
+    return written - {None}
 
 
 def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:

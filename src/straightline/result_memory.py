@@ -25,6 +25,7 @@ class _LoanedBytes:
     """Kept bytes lent to an array: NumPy holds this object for it and its views, and drops it with the last one."""
 
     def __init__(self, memory: np.ndarray):
+        """Hold the array of bytes that is lent, and offer it to NumPy."""
         self._memory = memory
         # NumPy's protocol, by which an array of this object's bytes holds the object.
         self.__array_interface__ = memory.__array_interface__
@@ -39,8 +40,9 @@ def make_aligned_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
     One of LEAST bytes or more takes memory of an earlier result that is free again, if any fits.
     """
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_LoanedBytes(_take_memory(size + LINE)))
+    size = math.prod(shape) * np.dtype(dtype).itemsize  # bytes
+    needed = size + LINE  # room to begin at a multiple of a cache line
+    memory = np.empty(needed, np.uint8) if size < LEAST else np.asarray(_LoanedBytes(_take_memory(needed)))
     numbers: np.ndarray = align_to_cache_line(memory)[:size].view(dtype)
     return numbers.reshape(shape)
 

@@ -45,8 +45,8 @@ class RecurringNodes(NamedTuple):
 def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
     """Rewrite each counted loop of one run in which many values may repeat; return what the outputs need then.
 
-    Rewritten, a loop reads the values of turns that repeat from memory. Many: the numbers that may repeat, S, have more
-    than DEAR operations beside those that others need of it, which have to be stored.
+    A rewritten loop reads the values of turns that repeat from memory. Many are more than DEAR operations, beside those
+    whose results have to be stored since others need them.
     """
     items = list_needed_items(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
@@ -108,13 +108,16 @@ def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
     They are those of the rows that a turn reads; no carried number is in them. `nodes` are the body's, in order.
     """
     results, known = dict[Node, None](), {loop.counter}
-    for n in nodes:
-        buffer = n.value[0].owner[0] if n.op == "load" else None
-        filled = buffer is None or (buffer.kind != "carried" and n.value[0].block is not loop.body)
-        plain = n.op == "load" or n.op not in REFERRING
-        if plain and filled and known.issuperset(_list_nodes_of_body(n.args, loop.body)):
-            known.add(n)
-            results[n] = None
+    for node in nodes:
+        is_load = node.op == "load"
+        reads_older_memory = not is_load or (
+            node.value[0].owner[0].kind != "carried" and node.value[0].block is not loop.body
+        )
+        refers_to_loop = not is_load and node.op in REFERRING  # a number that a loop or a guard carries
+        follows = known.issuperset(_list_nodes_of_body(node.args, loop.body))
+        if reads_older_memory and not refers_to_loop and follows:
+            known.add(node)
+            results[node] = None
     return results
 
 
@@ -133,13 +136,13 @@ def _leave_fused_products_in_turn(needed: Iterable[Any], found: dict[Node, None]
     Fused, product and sum are rounded once; a product that is stored apart is rounded itself, and bits would change.
     """
     users: defaultdict[Node, list[Any]] = defaultdict(list)
-    for x in needed:
-        for used in list_used_nodes(x):
-            users[used].append(x)
-    for n in [n for n in found if n.op == "mul" and n.type in REAL and len(users[n]) == 1]:
-        user = users[n][0]
+    for item in needed:
+        for node in list_used_nodes(item):
+            users[node].append(item)
+    for product in [n for n in found if n.op == "mul" and n.type in REAL and len(users[n]) == 1]:
+        user = users[product][0]
         if isinstance(user, Node) and user.op in ("add", "sub") and user not in found:
-            del found[n]
+            del found[product]
 
 
 def _list_needed_elsewhere(items: Iterable[Any], found: RecurringNodes) -> list[Node]:
@@ -152,9 +155,12 @@ class RingBuffer:
     """Memory for rows of some numbers of these types, one buffer for each type; filled in the turns of a loop."""
 
     def __init__(self, graph: Graph, types: Sequence[Type], loop: Loop, rows: int = RING):
-        counts = Counter(types)
-        buffers = {type: Buffer("scratch", type, (rows, counts[type]), loop.block) for type in counts}
-        self._graph, self._places = graph, [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
+        """Allocate memory around a loop for the newest `rows` rows, each of one number of each of `types`."""
+        count_by_type = Counter(types)
+        buffers = {type: Buffer("scratch", type, (rows, n), loop.block) for type, n in count_by_type.items()}
+        self._graph = graph
+        # Of each number of a row its buffer and its column there: how many numbers of its type come before it.
+        self._places = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
         """Store these numbers, in the order of the types, as a row of the ring."""

@@ -29,9 +29,8 @@ class StridedArray:
         A move is a stride times a node, which data decide.
         """
         self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
-        self.loaded: tuple[Block, np.ndarray] | None = (
-            None  # nodes that load it, after the block that they were made in
-        )
+        # The nodes that load its entries, behind the block that they were made in; None before they are made.
+        self.loaded: tuple[Block, np.ndarray] | None = None
 
     @classmethod
     def of_whole_buffer(cls, buffer: Buffer) -> "StridedArray":
@@ -56,15 +55,17 @@ class StridedArray:
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
     ) -> "StridedArray":
-        """Return another view of the same memory, at a further offset, and further moves (stride, node that counts)."""
+        """Return another view of the same memory: its offset is added to this one's, its moves (stride, node) too."""
         return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
     def row(self, index: Node | int) -> "StridedArray":
         """Return the view of entry `index` along the first axis; one that a node says is a move of the address."""
-        if isinstance(index, int) or index.op == "constant":
-            known = index if isinstance(index, int) else int(index.value)
-            return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
-        return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
+        shape, strides, stride_of_row = self.shape[1:], self.strides[1:], self.strides[0]
+        if isinstance(index, int):
+            return self.view(shape, strides, offset=stride_of_row * index)
+        if index.op == "constant":
+            return self.view(shape, strides, offset=stride_of_row * int(index.value))
+        return self.view(shape, strides, 0, (stride_of_row, index))
 
     def get_known_numbers(self) -> np.ndarray:
         """Return the numbers of a known array: a view of its table with these strides, which NumPy counts in bytes."""

@@ -15,6 +15,7 @@ from straightline.llvm.module_text import write_module
 from straightline.lowering import make_placeholder
 from straightline.machine_code import TieredCode, choose_hasty_width, find_processor_features
 from straightline.program import Program, SummedOutputs, fold_rows_into_batches, lower_function, row_length_of_sums
+from straightline.size_limits import divide_rounded_up
 
 PARTS = 64  # sums of their own, which computers of any number of cores share out
 
@@ -47,15 +48,16 @@ class SummingProgram:
         each of the blocks that are computed at once (`in_flight`) has others.
         """
         length = row_length_of_sums(self.width, self.summed.batches)
-        collected = sums = 0.0
-        for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
-            if common:
+        bytes_of_run = bytes_of_sums = 0.0
+        for buffer, is_summed, is_common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
+            if is_common:
                 continue
-            if summed:
-                sums += 8.0 * buffer.size * length
+            if is_summed:
+                bytes_of_sums += 8.0 * buffer.size * length
             else:
-                collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
-        return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
+                bytes_of_run += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
+        variables = float(self.code.shared) + in_flight * float(self.code.scratch)
+        return runs * bytes_of_run, lanes * bytes_of_sums, variables
 
     def bind_arguments(self, arguments: Sequence[Any], runs: int) -> "SummingProgramWithArguments":
         """Return the program with its arguments (all but the run's number), and what all runs share, computed.
@@ -75,22 +77,18 @@ class SummingProgram:
             runs: how many.
             first: number of the first one; 0 by default.
         """
+        bound, end = self.bind_arguments(jax.tree.leaves(arguments), runs), first + runs
         # A part is some whole vectors of runs: a PARTS-th of all vectors, rounded up.
-        begun = self.bind_arguments(jax.tree.leaves(arguments), runs)
-        part_length = -(-runs // (PARTS * self.width)) * self.width
-        starts = range(first, first + runs, part_length)
-        sums = [begun.make_zero_sums() for _ in starts]
-
-        def compute_part(part: int) -> list[np.ndarray | None]:
-            """Add the runs of a part to its sums; return its results that are collected, None for all others."""
-            return begun.add_runs(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
-
-        collected = list(get_thread_pool().map(compute_part, range(len(starts))))
-        return jax.tree.unflatten(self.tree, self._join_results_of_parts(begun, sums, collected, first, runs))
+        part_length = divide_rounded_up(runs, PARTS * self.width) * self.width
+        starts = range(first, end, part_length)
+        numbers_of_runs = [np.arange(start, min(start + part_length, end)) for start in starts]
+        sums = [bound.make_zero_sums() for _ in starts]
+        collected = list(get_thread_pool().map(bound.add_runs, numbers_of_runs, sums))
+        return jax.tree.unflatten(self.tree, self._join_results_of_parts(bound, sums, collected, first, runs))
 
     def _join_results_of_parts(
         self,
-        begun: "SummingProgramWithArguments",
+        bound: "SummingProgramWithArguments",
         sums: Sequence[Sequence[np.ndarray]],
         collected: Sequence[Sequence[np.ndarray | None]],
         first: int,
@@ -101,12 +99,10 @@ class SummingProgram:
         A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
         runs share is repeated for each run, or counts once for each run of a batch.
         """
-        totals, runs_by_batch = (
-            iter(begun.add_partial_sums(sums)),
-            _count_runs_by_batch(first, runs, self.summed.batches),
-        )
+        totals = iter(bound.add_partial_sums(sums))
+        runs_by_batch = _count_runs_by_batch(first, runs, self.summed.batches)
         leaves: list[Any] = []
-        for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
+        for shared, is_summed, *parts in zip(bound.shared, self.summed.outputs, *collected, strict=True):
             if shared is None:
                 leaves.append(next(totals) if is_summed else np.concatenate(parts))
             elif is_summed:
@@ -136,7 +132,8 @@ class SummingProgramWithArguments:
                 kind = np.dtype(DTYPES[buffer.type])
                 computed = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
-        self._machine = None if all(program.common) else program.blocks.choose_machine(-(-runs // program.width))
+        blocks = divide_rounded_up(runs, program.width)
+        self._machine = None if all(program.common) else program.blocks.choose_machine(blocks)
 
     def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
         """Return sums over no runs of each summed result that runs do not share, for `add` and `add_partial_sums`.
@@ -144,7 +141,7 @@ class SummingProgramWithArguments:
         `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
         """
         length = row_length_of_sums(self.program.width, self.program.summed.batches)
-        shapes = [(*b.shape, length) for b, s in self._list_outputs() if s]
+        shapes = [(*buffer.shape, length) for buffer, is_summed in self._list_outputs() if is_summed]
         try:  # threads may take from it at once
             taken = [] if memory is None else memory.pop()
         except IndexError:
@@ -166,7 +163,7 @@ class SummingProgramWithArguments:
         if len(numbers) and self._machine is not None:
             scratch = allocate_aligned(self.program.code.scratch)
             pointers = self._list_pointers(numbers, outputs)
-            blocks = -(-len(numbers) // self._machine.width)  # a block: the runs of one vector
+            blocks = divide_rounded_up(len(numbers), self._machine.width)  # a block: the runs of one vector
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return collected
 
@@ -257,11 +254,11 @@ def _count_summed_leaves(tree: Any) -> int:
     Raises:
         ValueError: a tree of results that is no pair.
     """
-    parts, kind = tree.children(), tree.node_data()
-    if kind is None or kind[0] is not tuple or len(parts) != 2:
+    children, container = tree.children(), tree.node_data()
+    if container is None or container[0] is not tuple or len(children) != 2:
         expected = "a pair of what is summed and what is collected"
         raise ValueError(f"function of a run: expected {expected}, got {tree}")
-    count: int = parts[0].num_leaves
+    count: int = children[0].num_leaves
     return count
 
 
@@ -276,7 +273,7 @@ def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
 def _count_runs_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
     """Return how many of the runs from `first` on each batch has; run r is in batch r mod `batches`.
 
-    All have the same number, but for the rest, of which the batches from that of the first run on have one each.
+    All have runs // batches of them, and of the remaining runs the batches from that of the first run on one each.
     """
-    rest = np.arange(first, first + runs % batches)
-    return np.bincount(rest % batches, minlength=batches) + runs // batches
+    remaining = np.arange(first, first + runs % batches)
+    return np.bincount(remaining % batches, minlength=batches) + runs // batches

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files import Covariance, json_field
-from heliograph.files.sources import Sources, Unread
+from heliograph.files.sources import TopicReader, Unread
 from tests.files import bags
 
 PLANT = hg.Plant(lambda x, u: x, 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["east", "north"], inputs=["dt"])
@@ -26,7 +26,7 @@ MATRIX = [4.0, 0.5, 0.1, 0.5, 9.0, 0.2, 0.1, 0.2, 25.0]  # rows east, north, up
 
 
 def read(source, message, network=NETWORK):
-    (reading,) = Sources({"t": source}, network).read("t", message, "t")
+    (reading,) = TopicReader({"t": source}, network).read("t", message, "t")
     if isinstance(reading, Unread):
         raise reading.error
     return reading.values

@@ -7,10 +7,10 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.sources import Sources
+from heliograph.files.sources import TopicReader
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.source_translator import Translator
-from heliograph.serving.device_status import DeviceStatusService
+from heliograph.serving.device_status_service import DeviceStatusService
 from heliograph.serving.storage import Store
 
 json_field, Available = hg.files.json_field, hg.files.Available
@@ -71,7 +71,7 @@ def table(where, topic="zigbee2mqtt/+", **more):
 )
 def test_values_of_a_device_count_from_online_to_offline(network, offline, online):
     """Each device has its own word; before the first it is online."""
-    sources, used = Sources(table(Available("zigbee2mqtt/+/availability")), network), []
+    sources, used = TopicReader(table(Available("zigbee2mqtt/+/availability")), network), []
     for word in (None, online, offline, offline, online):
         if word is not None:
             assert sources.take_device_word("zigbee2mqtt/a/availability", word, "m")
@@ -85,7 +85,7 @@ def test_conditions_hold_together(network):
     """Of a list: the gateway, the device, and a field of the message."""
     gateway = Available("gateway/status", online="up", offline=["down", "gone"], path="word")
     where = [gateway, Available("+/+/LWT"), {"fix": 3}]
-    sources = Sources(table(where, "zigbee2mqtt/#"), network)
+    sources = TopicReader(table(where, "zigbee2mqtt/#"), network)
     assert sources.subscribed_topics == ["zigbee2mqtt/#", "gateway/status", "+/+/LWT"]
     used = []
     for topic, word in [("gateway/status", '{"word": "UP"}'), ("gateway/status", "gone"), ("gateway/status", "up"),
@@ -97,7 +97,7 @@ def test_conditions_hold_together(network):
 
 
 def test_a_topic_on_which_no_word_came_is_named(network):
-    assert Sources(table(Available("zigbe2mqtt/+/availability")), network).notes == [
+    assert TopicReader(table(Available("zigbe2mqtt/+/availability")), network).notes == [
         "no word of online or offline came: zigbe2mqtt/+/availability"
     ]
 
@@ -126,7 +126,7 @@ def test_conditions_that_do_not_fit_are_one_line(network):
     with pytest.raises(
         ValueError, match=r"^Available, topic 'a/b/\+': expected \+ at levels that 'zigbee2mqtt/\+' has"
     ):
-        Sources(table(Available("a/b/+")), network)
+        TopicReader(table(Available("a/b/+")), network)
 
 
 def test_a_service_hears_the_words(network):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.sources import Sources, Unread, convert_time, decode_json, match_topic
+from heliograph.files.sources import TopicReader, Unread, convert_time, decode_json, match_topic
 from heliograph.files.sources.message_fields import field_at
 
 json_field = hg.files.json_field
@@ -30,7 +30,7 @@ def only(readings):
 
 
 def read(source, message, network=NETWORK):
-    return only(Sources({"t": source}, network).read("t", message, "t"))
+    return only(TopicReader({"t": source}, network).read("t", message, "t"))
 
 
 def test_a_field_becomes_its_output_in_its_unit():
@@ -108,23 +108,23 @@ def test_wildcards_are_those_of_mqtt(topic, pattern, expected):
 
 
 def test_unknown_topics_are_counted_and_never_guessed():
-    sources = Sources({"house/+": json_field("t", "garden", "in", plant=hg.files.Level(1))}, NETWORK)
+    sources = TopicReader({"house/+": json_field("t", "garden", "in", plant=hg.files.Level(1))}, NETWORK)
     assert sources.read("house/garden", {"t": 1}, "m") and not sources.read("home/garden", {"t": 1}, "m")
     assert sources.read("home/garden", "no message", "m") == [] and dict(+sources.unknown) == {"home/garden": 2}
 
 
 def test_a_topic_feeds_several_nodes():
     table = {"t": [json_field("a", "garden", "in"), json_field("h", "inputs", "heating")]}
-    readings = Sources(table, NETWORK).read("t", {"a": 1, "h": 2}, "m")
+    readings = TopicReader(table, NETWORK).read("t", {"a": 1, "h": 2}, "m")
     assert [reading.node for reading in readings] == ["garden", "inputs"]
 
 
 def test_steps_are_times_of_networks_that_count_steps():
     assert read(json_field("v", "garden", time="k", time_unit="step"), {"v": 1, "k": 3}, COUNTING).time == 3
     with pytest.raises(ValueError, match=r"'t', time: expected the seconds of a step .* got 'k' in s"):
-        Sources({"t": json_field("v", "garden", time="k")}, COUNTING)
+        TopicReader({"t": json_field("v", "garden", time="k")}, COUNTING)
     with pytest.raises(ValueError, match="expected a time that is no step"):
-        Sources({"t": json_field("v", "garden", "in", time="k", time_unit="step")}, NETWORK)
+        TopicReader({"t": json_field("v", "garden", "in", time="k", time_unit="step")}, NETWORK)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_message_that_cannot_be_read_is_one_line(source, message, line):
 )
 def test_a_table_that_does_not_fit_is_one_line(table, line):
     with pytest.raises(ValueError, match=line):
-        Sources(table, NETWORK)
+        TopicReader(table, NETWORK)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_plant_and_node_come_from_a_topic_or_a_field():
         "ranging/+": json_field("r", hg.files.Field("anchor_id", {"17": "north"}), "in", plant=hg.files.Level(1)),
         "+/south/t": json_field("t", hg.files.Level(-2), "out", plant="device"),
     }
-    sources = Sources(table, TWO)
+    sources = TopicReader(table, TWO)
     (reading,) = sources.read("ranging/tag7", {"r": 2.0, "anchor_id": 17}, "m")
     assert (reading.plant, reading.node, reading.values[0]) == ("tag7", "north", 2.0)
     (reading,) = sources.read("house/south/t", {"t": 3.0, "device": 5}, "m")
@@ -199,10 +199,10 @@ def test_plant_and_node_come_from_a_topic_or_a_field():
 def test_a_wildcard_that_would_merge_sensors_is_refused():
     """What the line names mends it."""
     with pytest.raises(ValueError, match=r"'zigbee2mqtt/\+', plant: expected plant=hg.files.Level\(1\)"):
-        Sources({"zigbee2mqtt/+": json_field("t", "garden", "in")}, NETWORK)
-    sources = Sources({"zigbee2mqtt/+": json_field("t", "garden", "in", plant=hg.files.Level(1))}, NETWORK)
+        TopicReader({"zigbee2mqtt/+": json_field("t", "garden", "in")}, NETWORK)
+    sources = TopicReader({"zigbee2mqtt/+": json_field("t", "garden", "in", plant=hg.files.Level(1))}, NETWORK)
     assert [sources.read(f"zigbee2mqtt/{name}", {"t": 1}, "m")[0].plant for name in "ab"] == ["a", "b"]
-    assert Sources({"zigbee2mqtt/+": json_field("t", hg.files.Level(1), "in")}, TWO).of("zigbee2mqtt/north")
+    assert TopicReader({"zigbee2mqtt/+": json_field("t", hg.files.Level(1), "in")}, TWO).of("zigbee2mqtt/north")
 
 
 @pytest.mark.parametrize(
@@ -214,18 +214,18 @@ def test_a_wildcard_that_would_merge_sensors_is_refused():
     ],
 )
 def test_a_condition_leaves_messages_out_and_counts_them(where, used):
-    sources = Sources({"t": json_field("v", "garden", "in", where=where)}, NETWORK)
+    sources = TopicReader({"t": json_field("v", "garden", "in", where=where)}, NETWORK)
     read = [bool(sources.read("t", {"v": 1, "fix": fix, "ok": fix > 2}, "m")) for fix in (1, 3)]
     assert read == used and sources.excluded["t"] == used.count(False)
 
 
 def test_a_message_with_a_count_and_without_a_value_measured_nothing():
-    sources = Sources({"t": json_field("v", "garden", "in", time="at", sequence="n")}, NETWORK)
+    sources = TopicReader({"t": json_field("v", "garden", "in", time="at", sequence="n")}, NETWORK)
     readings = [sources.read("t", {"at": 1, **rest}, "m")[0] for rest in ({"n": 4}, {"v": 2.0}, {"n": 5, "v": 3.0})]
     assert [r.sequence for r in readings] == [4, 0, 5] and not sources.describe_absent_field()
     np.testing.assert_array_equal([r.values[0] for r in readings], [np.nan, 2.0, 3.0])
     # Where no message has it, it is misspelt.
-    sources = Sources({"t": json_field("w", "garden", "in", time="at", sequence="n")}, NETWORK)
+    sources = TopicReader({"t": json_field("w", "garden", "in", time="at", sequence="n")}, NETWORK)
     sources.read("t", {"at": 1, "n": 1, "v": 2}, "m")
     assert "expected a field 'w', got no 'w' in at, n, v" in sources.describe_absent_field()
     with pytest.raises(ValueError, match="expected a field 'v'"):
@@ -267,7 +267,7 @@ def test_a_doubled_field_is_refused(text):
 def test_a_message_that_says_it_is_not_valid_is_refused_and_not_lost():
     """By a flag, by a checksum's result, by a word of its own; its count is read, so that it counts as none lost."""
     source = json_field("v", "garden", "in", sequence=hg.files.Count("n", bits=4), valid="crc_ok")
-    sources = Sources({"t": source}, NETWORK)
+    sources = TopicReader({"t": source}, NETWORK)
     for flag, number in ((True, 14), (1, 15), (False, 0), ("yes", 1), (True, 2)):
         (item,) = sources.read("t", {"v": 1.5, "n": number, "crc_ok": flag}, "m")
         if isinstance(item, Unread):

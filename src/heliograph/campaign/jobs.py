@@ -160,9 +160,9 @@ def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarr
     # Shapes are those of any filter, (run, time, ...): all have the same states.
     example = next(values for filters in estimates.values() for values in filters.values())
     runs, horizon = example["nees_per_dimension"].shape
-    node_count, filter_count = len(labels.nodes), len(labels.filters)
+    axes = (runs, horizon, len(labels.nodes), len(labels.filters))
     arrays = {
-        variable: np.full((runs, horizon, node_count, filter_count, *example[variable].shape[2:]), np.nan)
+        variable: np.full((*axes, *example[variable].shape[2:]), np.nan)
         for variable in ("error", "variance", "nees_per_dimension")
     }
     # Each filter goes to its place along the axes (node, filter).
@@ -174,7 +174,7 @@ def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarr
     # Of whole trajectories also truth and measurements, each filled up to the longest of any node.
     if "truth" in recorded:
         arrays["truth"] = recorded["truth"]
-        arrays["measurement"] = np.full((runs, horizon, node_count, labels.received), np.nan)
+        arrays["measurement"] = np.full((runs, horizon, len(labels.nodes), labels.received), np.nan)
         for node, z in recorded["measurements"].items():
             arrays["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
     return arrays

@@ -61,7 +61,7 @@ def backtest(
     check_count("--skip", skip, 1 if refit else 0)
 
     def compute(advance: "Advance") -> "heliograph.forecasting.Backtest":
-        """Read the data of one plant, and forecast from its rows."""
+        """Read the data of one plant, and forecast `rows_ahead` from its rows, by the options of the command line."""
         from heliograph.files.network_file import load_module
 
         advance("reading")
@@ -123,6 +123,10 @@ def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "
     build, (z, u, _, _) = NetworkAgain(reference), recording
 
     def fit_to_first(rows: int) -> "Network":
+        """Return the network that `build` makes, its free numbers fitted to so many first rows of z and u.
+
+        `advance` shows the progress, in rows of the recording.
+        """
         advance("fitting to the rows before", rows, len(recording.time))
         return heliograph.fit(build, {name: values[:rows] for name, values in z.items()}, u[:rows]).network
 

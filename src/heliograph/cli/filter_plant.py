@@ -264,7 +264,8 @@ def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]"
     def write(record: "Record", path: Path | StoreAddress) -> None:
         """Write the estimates of a record, in the form that the path asks for: a store, a bag (.mcap) or a table.
 
-        `origin`: date of time 0; `module`: names in the network's file, of which `pose` says what a bag's poses are.
+        `data` is the plant that was filtered, `origin` the date of its time 0; `module` has the names in the network's
+        file, of which `pose` says what the poses of a bag are.
         """
         if isinstance(path, StoreAddress):
             write_columns_to_store(path, estimate_columns(record), data.plant, origin)

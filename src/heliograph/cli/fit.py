@@ -3,6 +3,7 @@
 import re
 import sys
 from fractions import Fraction
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -64,13 +65,16 @@ def fit(
 
     with GentleStop() as stop:
 
-        def work(advance: "Advance") -> "FitResults":
-            """Return what is learned with the command's options; `advance` shows progress, `stop` has signals."""
+        def learn(advance: "Advance") -> "FitResults":
+            """Return what is learned with the options of the command line, until a signal stops it (`stop`).
+
+            `share`: of the rows, the last ones, that only judge; `advance` shows the progress.
+            """
             return fit_and_judge(
                 network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop
             )
 
-        learned = write_results(out, STAGES, work, lambda learning: collect_results_files(learning, out, network))
+        learned = write_results(out, STAGES, learn, lambda results: collect_results_files(results, out, network))
         print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
@@ -132,11 +136,11 @@ def fit_and_judge(
     changes: list[PredictionBeforeAndAfter] = []
     uniform: list[HeldOutTransforms] = []
     if learned_rows < rows:
-        changes = (
-            stop.run_unless_stopped(lambda: compare_before_and_after(start, fitted.network, z, u, learned_rows)) or []
-        )
+        compare = partial(compare_before_and_after, start, fitted.network, z, u, learned_rows)
+        changes = stop.run_unless_stopped(compare) or []
     if changes:
-        uniform = stop.run_unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
+        transform = partial(transform_held_out, fitted.network, changes, z, u, learned_rows)
+        uniform = stop.run_unless_stopped(transform) or []
     # The law of lost messages, by node of which some were lost.
     advance("looking at losses")
     losses = stop.run_unless_stopped(lambda: _estimate_losses_by_node(start, recording)) or {}
@@ -249,7 +253,10 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
     def write(folder: Path) -> None:
-        """Write the learned numbers (`content`) and the network with them into a folder, later renamed to `out`."""
+        """Write fitted.json and the network with the fitted numbers into a folder, which is later renamed to `out`.
+
+        `content` has the fitted numbers; `network` is the network as the user names it, FILE or FILE:NAME.
+        """
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison_to_json(learned)}

@@ -60,7 +60,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
     with progress(2) as advance:
         if "://" in recording:
             from heliograph.serving.brokers.broker_address import parse_address
-            from heliograph.serving.brokers.listening import listen
+            from heliograph.serving.brokers.broker_inspection import listen
 
             advance(f"listening for {seconds:g} s")
             return listen(parse_address(recording), seconds), ""

@@ -222,7 +222,7 @@ def _refuse_replacing_inputs(
 ) -> None:
     """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
     from heliograph.files.messages.folder_of_message_files import is_message_folder, list_used_files
-    from heliograph.files.sources.sources import Sources
+    from heliograph.files.sources.topic_reader import TopicReader
     from heliograph.numerics.check import fail
 
     if (
@@ -231,7 +231,7 @@ def _refuse_replacing_inputs(
         or not (isinstance(measurements, Path) and is_message_folder(measurements))
     ):
         return
-    if out.resolve() in [file.resolve() for file in list_used_files(measurements, Sources(sources, network))]:
+    if out.resolve() in [file.resolve() for file in list_used_files(measurements, TopicReader(sources, network))]:
         raise fail(f"output file {out}", "another file than the measurements", "one of them")
 
 

@@ -63,6 +63,7 @@ class GentleStop:
     """
 
     def __init__(self) -> None:
+        """Begin before any signal; the handlers of signals are not replaced yet."""
         self._number = 0  # of the first signal; 0 for none
         self._handlers: dict[int, object] = {}  # of each signal before `note_next_signal_only`, to be put back
 

@@ -23,7 +23,7 @@ from .fitted import (
 from .estimates.forecasts_table import (
     write_forecast as write_forecast,
 )
-from .sources.json_field import (
+from .sources.source_description import (
     Count as Count,
     Field as Field,
     Level as Level,

@@ -189,8 +189,9 @@ class CsvColumnReader:
         `values` of dates are nanoseconds since 1970, NAT for an empty cell; EXACT: 2^53, up to which doubles are exact.
         """
         if self._dated.get(name):
-            whole = [NAT if value != value else int(value) for value in values]  # before the first date all are empty
-            return np.array(whole, dtype=np.int64).view("datetime64[ns]")
+            # NaN, which alone differs from itself, is in all cells before the first date.
+            nanoseconds = [NAT if value != value else int(value) for value in values]
+            return np.array(nanoseconds, dtype=np.int64).view("datetime64[ns]")
         numbers = np.array(values, dtype=np.float64)
         if np.any(np.abs(numbers) >= EXACT) and all(map(WHOLE.fullmatch, cells)):
             return np.array([int(cell) for cell in cells], dtype=np.int64)

@@ -60,10 +60,10 @@ class Available:
 
         It is `self.topic`, where + stands for the level of `topic` at the same place.
         """
-        levels, values = self.topic.split("/"), topic.split("/")
-        if "+" in levels[len(values) :]:
+        pattern, levels = self.topic.split("/"), topic.split("/")
+        if "+" in pattern[len(levels) :]:
             raise fail(f"Available, topic {self.topic!r}", f"+ at levels that {topic!r} has", "more levels")
-        return "/".join(values[i] if level == "+" else level for i, level in enumerate(levels))
+        return "/".join(levels[i] if level == "+" else level for i, level in enumerate(pattern))
 
     def says_offline(self, payload: object, where: str) -> bool:
         """Return whether a payload, a word or an object with one at `self.path`, says offline rather than online.
@@ -71,7 +71,8 @@ class Available:
         Raises:
             ValueError: a word that is neither; one line.
         """
-        word = str(field_at(payload, self.path, where) if isinstance(payload, dict) else payload).strip().casefold()
+        value = field_at(payload, self.path, where) if isinstance(payload, dict) else payload
+        word = str(value).strip().casefold()
         if word not in (*self.online, *self.offline):
             raise fail(where, f"one of {', '.join((*self.online, *self.offline))}", show_value(payload))
         return word in self.offline
@@ -128,10 +129,10 @@ class DeviceStatuses:
         if not conditions:
             return False
         # The words of a topic are a bit for each condition, as they are stored when they have changed.
-        said, before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
+        content, bits_before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
         for condition in conditions:
-            self._note_word(condition, topic, offline=said != "" and condition.says_offline(said, where))
-        if self._encode_words_as_bits(topic) != before:
+            self._note_word(condition, topic, offline=content != "" and condition.says_offline(content, where))
+        if self._encode_words_as_bits(topic) != bits_before:
             self._changed.add(topic)
         return True
 

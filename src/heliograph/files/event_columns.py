@@ -62,10 +62,11 @@ class NodeEvents:
 
     def keep_events(self, which: np.ndarray) -> None:
         """Keep only the events of the mask `which`, (events,)."""
-        columns, matrix = self.arrays(), self.value_matrix()[which]
+        time_arrival_sequence, kept_values = self.arrays(), self.value_matrix()[which]
         # NumPy's name of 64-bit integers is "l" on some systems, that of `array` is "q".
-        self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c[which]) for c in columns)
-        self.values = array("d", matrix.ravel())
+        kept_columns = [column[which] for column in time_arrival_sequence]
+        self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c) for c in kept_columns)
+        self.values = array("d", kept_values.ravel())
 
     def value_matrix(self) -> Float[np.ndarray, "events size"]:
         """Return the values, a row for each event."""
@@ -78,10 +79,10 @@ class NodeEvents:
         reading = unread.counted
         if reading is None:
             return
-        moments = (reading.time, arrival, self.time[-1] if self.time else None)
-        near = next((moment for moment in moments if moment is not None), None)
-        if near is not None and reading.sequence is not None:
-            self.unread.append((near, reading.sequence))
+        candidates = (reading.time, arrival, self.time[-1] if self.time else None)
+        moment = next((candidate for candidate in candidates if candidate is not None), None)
+        if moment is not None and reading.sequence is not None:
+            self.unread.append((moment, reading.sequence))
             self.period = reading.period
 
     def count_lost(self) -> int | None:
@@ -103,11 +104,11 @@ class NodeEvents:
 
         Only where a message does not say it (NaN), by the running `counts` of the events, in order of time, in `rows`.
         """
-        gaps = np.diff(counts, prepend=counts[:1]) - 1.0
-        gaps[gaps < 0] = np.nan  # the first, and after a restart
+        lost = np.diff(counts, prepend=counts[:1]) - 1.0
+        lost[lost < 0] = np.nan  # not known of the first message, nor after a restart
         has_count = min(self.sequence, default=-1) >= 0
-        missing = np.isnan(table[rows, -1]) & has_count
-        table[rows[missing], -1] = gaps[missing]
+        to_fill = np.isnan(table[rows, -1]) & has_count
+        table[rows[to_fill], -1] = lost[to_fill]
 
     def describe_doubtful_count(self, name: str) -> list[str]:
         """Return a line if a count begins at 0 again sooner than its bits say, and one if it stands still.
@@ -280,8 +281,8 @@ def count_verdicts(
 ) -> dict[int, dict[Verdict, int]]:
     """Return {number of a node: {verdict: how many of its events have it}}; `verdicts`: of each event by its index."""
     return {
-        int(n): {verdict: int(np.sum(verdicts[node == n] == i)) for i, verdict in enumerate(VERDICTS)}
-        for n in np.unique(node)
+        int(number): {verdict: int(np.sum(verdicts[node == number] == i)) for i, verdict in enumerate(VERDICTS)}
+        for number in np.unique(node)
     }
 
 
@@ -294,9 +295,9 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
     if not len(time):
         return 0
     differences = np.diff(sequence[np.lexsort((sequence, time))])
-    # Those of a count that went through its largest number; 1, so that nothing is missing, after a restart.
-    around = np.mod(differences, period) if period else differences
-    advances = np.where(differences > 0, differences, np.where(around <= GAP, around, 1))
+    # A smaller count has gone through its largest number, or after a restart begins anew: then nothing is missing (1).
+    counted_around = np.mod(differences, period) if period else differences
+    advances = np.where(differences > 0, differences, np.where(counted_around <= GAP, counted_around, 1))
     return int(np.sum(np.maximum(advances - 1, 0)))
 
 
@@ -304,20 +305,20 @@ def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return for each row how many equal ones, of the same rank, come before it; row i has entry i of each column."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
-    first = np.searchsorted(ranks[order], ranks[order])
-    numbers = np.empty(len(order), dtype=np.int64)
-    numbers[order] = np.arange(len(order)) - first
-    return numbers
+    first_of_equals = np.searchsorted(ranks[order], ranks[order])  # in this order, the place of the first equal row
+    counts = np.empty(len(order), dtype=np.int64)
+    counts[order] = np.arange(len(order)) - first_of_equals
+    return counts
 
 
 def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return the rank of each row by these columns, the first of which matters most; equal rows have the same rank."""
     order = np.lexsort(columns[::-1])  # which takes the one that matters most last
-    new = np.zeros(len(order), dtype=bool)
+    differs_from_row_before = np.zeros(len(order), dtype=bool)
     for column in columns:
-        new[1:] |= column[order][1:] != column[order][:-1]
+        differs_from_row_before[1:] |= column[order][1:] != column[order][:-1]
     ranks = np.empty(len(order), dtype=np.int64)
-    ranks[order] = np.cumsum(new)
+    ranks[order] = np.cumsum(differs_from_row_before)
     return ranks
 
 
@@ -334,9 +335,9 @@ def _find_newest_final_row(
     # Number of the first event before which each one is final: after its own, and where the watermark is past its time.
     watermark = events.arrival - window
     final_from = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
-    newest = np.full(count + 1, -1)
-    np.maximum.at(newest, final_from, rank)
-    return np.maximum.accumulate(newest[:count])
+    newest_final = np.full(count + 1, -1)  # of the events that become final before each one, then of all so far
+    np.maximum.at(newest_final, final_from, rank)
+    return np.maximum.accumulate(newest_final[:count])
 
 
 def node_counts_losses(network: Network, name: str) -> bool:
@@ -378,9 +379,9 @@ def place_values_in_rows(
 
 def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
     """Return each column with NaN replaced by the last value before it, 0 before the first."""
-    rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
-    last = np.maximum.accumulate(rows, axis=0) if len(values) else rows
-    return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))
+    own_row = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])  # -1: no value in this row
+    last_row = np.maximum.accumulate(own_row, axis=0) if len(values) else own_row
+    return np.asarray(np.where(last_row < 0, 0.0, np.take_along_axis(values, np.maximum(last_row, 0), axis=0)))
 
 
 def make_inputs_leading_to_rows(
@@ -394,6 +395,6 @@ def make_inputs_leading_to_rows(
         unit: how many of these parts are one unit of time.
         place: index of dt, the time since the row before, among the inputs.
     """
-    before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
-    since = np.diff(times, prepend=times[:1]) / unit
-    return np.insert(before, place, since, 1)
+    inputs_of_row_before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
+    dt = np.diff(times, prepend=times[:1]) / unit
+    return np.insert(inputs_of_row_before, place, dt, axis=1)

@@ -86,11 +86,11 @@ class EventTable:
         """
         if plant not in self._plants:
             raise fail("plant", f"one of {', '.join(map(repr, self._plants)) or 'none'}", repr(plant))
-        single = EventTable(self.network, None, self.start, self.numbers)
-        single.step, single._plants = self.step, {plant: self._plants[plant]}
-        single.notes, single.broken = self.notes, self.broken
-        single.refused, single.reasons = self.refused, self.reasons
-        return single
+        events = EventTable(self.network, step=None, start=self.start, numbers=self.numbers)
+        events.step, events._plants = self.step, {plant: self._plants[plant]}
+        events.notes, events.broken = self.notes, self.broken
+        events.refused, events.reasons = self.refused, self.reasons
+        return events
 
     @property
     def columns(self) -> dict[str, NodeEvents]:
@@ -148,8 +148,7 @@ class EventTable:
     def refusals(self) -> dict[str, Counter[Reason]]:
         """Return by node how many messages were refused for their flag or counter; nodes without any are absent."""
         counts = dict[str, Counter[Reason]]()
-        by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
-        for node, columns in by_node:
+        for node, columns in (item for columns_by_node in self._plants.values() for item in columns_by_node.items()):
             if columns.refused:
                 counts.setdefault(node, Counter()).update(columns.refused)
         return counts
@@ -242,12 +241,12 @@ class EventTable:
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
         """Return by node with events how long each took to be logged, in seconds or time's unit, in order of time."""
-        results, second = {}, 1 if self.numbers else SECOND
+        lateness, unit = {}, 1 if self.numbers else SECOND
         for name in () if self._times_are_steps else self.network.names:
-            time, arrival, _ = self.columns[name].arrays()
+            time, arrival, _sequence = self.columns[name].arrays()
             if len(time):
-                results[name] = ((arrival - time) / second)[np.argsort(time, kind="stable")]
-        return results
+                lateness[name] = ((arrival - time) / unit)[np.argsort(time, kind="stable")]
+        return lateness
 
     def delays(self, step: float | None = None) -> dict[str, Delays]:
         """Return by node the law (probabilities) of its delays in steps, with intervals; nodes without any are absent.
@@ -258,16 +257,17 @@ class EventTable:
         Raises:
             ValueError: a step that is not positive.
         """
-        results, second = {}, 1 if self.numbers else SECOND
+        laws, unit = {}, 1 if self.numbers else SECOND
         for name, delays in self.lateness().items():
-            size = self.step / SECOND if step is None and self.step is not None else step
-            if size is None:
-                apart = np.diff(np.unique(self.columns[name].arrays()[0]))
+            length = self.step / SECOND if step is None and self.step is not None else step
+            if length is None:
+                time, _arrival, _sequence = self.columns[name].arrays()
+                intervals = np.diff(np.unique(time))
                 counts_steps = self.numbers and self.steps
-                size = float(np.median(apart)) / second if len(apart) and not counts_steps else 1.0
-            if np.any(delays > -size / 2):  # else nothing arrived at or after its step
-                results[name] = learn_delays(delays, size)
-        return results
+                length = float(np.median(intervals)) / unit if len(intervals) and not counts_steps else 1.0
+            if np.any(delays > -length / 2):  # else nothing arrived at or after its step
+                laws[name] = learn_delays(delays, length)
+        return laws
 
     def judge(
         self, window: float = np.inf, ahead: float = AHEAD

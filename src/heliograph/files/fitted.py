@@ -105,10 +105,11 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
         values = json.loads(path.read_text(encoding="utf-8"))["values"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise fail(f"fitted numbers {path}", "a file that `heliograph fit` wrote", type(error).__name__) from None
-    known = {parameter.name: parameter.start.shape for parameter in network_of_numbers.parameters.every}
-    if {name: np.shape(value) for name, value in values.items()} != known:
-        raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(known)}", list(values))
-    return network_of_numbers.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
+    free_shapes = {parameter.name: parameter.start.shape for parameter in network_of_numbers.parameters.every}
+    if {name: np.shape(value) for name, value in values.items()} != free_shapes:
+        raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(free_shapes)}", list(values))
+    numbers = {name: np.asarray(value) if np.ndim(value) else float(value) for name, value in values.items()}
+    return network_of_numbers.at(numbers)
 
 
 def _tabulate_delays(delays: Delays) -> dict[str, Any]:

@@ -127,8 +127,8 @@ def cut_recordings(parts: Iterable[Recording], rows: int) -> Iterator[Recording]
         joined = _join_recordings(held)
         for begin in range(0, count - rows + 1, rows):
             yield _select_rows(joined, slice(begin, begin + rows))
-        left = count % rows
-        held, count = [_select_rows(joined, slice(count - left, None))], left
+        rest = count % rows  # rows behind the last whole block
+        held, count = [_select_rows(joined, slice(count - rest, None))], rest
     if count:
         yield _join_recordings(held)
 
@@ -138,8 +138,8 @@ def _join_recordings(parts: list[Recording]) -> Recording:
     if len(parts) == 1:
         return parts[0]
     measurements = {node: np.concatenate([part.measurements[node] for part in parts]) for node in parts[0].measurements}
-    # Fields 1 and 2 of a recording are its inputs and times.
-    inputs, time = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
+    inputs = np.concatenate([part.inputs for part in parts])
+    time = np.concatenate([part.time for part in parts])
     truth = None if parts[0].truth is None else np.concatenate([np.asarray(part.truth) for part in parts])
     return Recording(measurements, inputs, time, truth)
 

@@ -32,12 +32,13 @@ class RecordingRows(NamedTuple):
 
 def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
     """Return the rows of several parts of a table, one after the other."""
+    numbers, time = np.concatenate([part.numbers for part in parts]), np.concatenate([part.time for part in parts])
     # The fields after numbers and time are dictionaries of columns by name.
-    named = (
+    columns = (
         {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
         for i in range(2, len(RecordingRows._fields))
     )
-    return RecordingRows(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
+    return RecordingRows(numbers, time, *columns)
 
 
 def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[RecordingRows, list[InputError], int]:
@@ -108,9 +109,10 @@ class RowsWithMissing(NamedTuple):
         # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
         before, after = self.read_row[missing], np.minimum(self.read_row[missing] + 1, len(time) - 1)
         numbers = self.numbers[self.arrived]
-        share = np.maximum(self.numbers[missing] - numbers[before], 0) / np.maximum(numbers[after] - numbers[before], 1)
-        moved = share * (time[after] - time[before]).astype(np.float64)
-        filled[missing] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
+        rows_behind = np.maximum(self.numbers[missing] - numbers[before], 0)
+        share = rows_behind / np.maximum(numbers[after] - numbers[before], 1)
+        since_row_before = share * (time[after] - time[before]).astype(np.float64)
+        filled[missing] += since_row_before.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
         return filled
 
 

@@ -67,4 +67,5 @@ def _comment_on_unit(topic: TopicStatistics, path: str, mark: str = "  #") -> st
     if path not in topic.measured_in:
         return ""
     unit = topic.measured_in[path]
-    return f"{mark} {unit}{' (of an angle: scale=np.pi / 180)' * (unit.lower().strip() in DEGREES)}"
+    remedy = " (of an angle: scale=np.pi / 180)" if unit.lower().strip() in DEGREES else ""
+    return f"{mark} {unit}{remedy}"

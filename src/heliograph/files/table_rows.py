@@ -36,7 +36,7 @@ def _join_column(parts: list[np.ndarray]) -> np.ndarray:
     A part of int64 has numbers too large for doubles. So the column stays int64 where all its numbers are whole, since
     float64 would round the large ones.
     """
-    kinds = {part.dtype.kind for part in parts}
+    kinds = {part.dtype.kind for part in parts}  # of NumPy: M dates, i integers, f floats
     if "M" in kinds:  # a part without dates has empty cells alone, as those before the first date
         parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
     elif kinds == {"i", "f"} and all(_are_whole_numbers(part) for part in parts):

@@ -35,7 +35,8 @@ def open_table(path: Path) -> Iterator[Append]:
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     check_writable(path)
-    with whole_file(path) as partial, (_open_csv if format_of(path) == ".csv" else _open_parquet)(partial) as append:
+    open_file = _open_csv if format_of(path) == ".csv" else _open_parquet
+    with whole_file(path) as partial, open_file(partial) as append:
         yield append
 
 
@@ -80,9 +81,11 @@ def _make_arrow_table(columns: Mapping[str, np.ndarray]) -> "pa.Table":
     """Return columns as a table of Arrow, the form in which Parquet is written; dates are in UTC."""
     import pyarrow as pa
 
-    arrays = {name: pa.array(np.ascontiguousarray(c)) for name, c in columns.items()}
-    dated = {name: a.cast(pa.timestamp("ns", "UTC")) for name, a in arrays.items() if columns[name].dtype.kind == "M"}
-    return pa.table(arrays | dated)
+    arrays = {}
+    for name, column in columns.items():
+        array = pa.array(np.ascontiguousarray(column))
+        arrays[name] = array.cast(pa.timestamp("ns", "UTC")) if column.dtype.kind == "M" else array
+    return pa.table(arrays)
 
 
 def _write_csv_rows(columns: Mapping[str, np.ndarray], file: TextIO) -> None:

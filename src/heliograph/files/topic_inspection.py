@@ -129,11 +129,11 @@ class TopicStatistics:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
         self.choose_time_field()
         times = np.sort(np.array(self.logged, dtype=np.int64))
-        apart = np.diff(times) / SECOND  # seconds
-        span = float(apart.sum())
-        rate = f"{len(apart) / span:.3g} Hz" if span > 0 else "-"
+        intervals = np.diff(times) / SECOND
+        span = float(intervals.sum())
+        rate = f"{len(intervals) / span:.3g} Hz" if span > 0 else "-"
         count = f"{max(len(times), self.messages)}"  # some may have come at a time that is not known
-        gap = f"{apart.max():.3g} s" if len(apart) else "-"
+        gap = f"{intervals.max():.3g} s" if len(intervals) else "-"
         quantiles = np.quantile(np.array(self.late), [0.5, 0.95, 1.0]) if self.late else []
         return [self.kind, count, rate, gap, " ".join(f"{value:.3g}" for value in quantiles) or "-"]
 
@@ -145,9 +145,9 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         ValueError: no bag, or one that cannot be opened.
     """
     topics, broken = dict[str, TopicStatistics](), ""
-    for part in parts_of(path) or [path]:
-        ended = _inspect_mcap(part, topics) if holds_messages(part) else _inspect_one_bag(part, topics, progress)
-        broken = broken or ended
+    for bag in parts_of(path) or [path]:
+        reason = _inspect_mcap(bag, topics) if holds_messages(bag) else _inspect_one_bag(bag, topics, progress)
+        broken = broken or reason
     return topics, broken
 
 
@@ -364,8 +364,9 @@ def _read_stamp(data: bytes) -> int:
 
     Four bytes come before it, of which the second says whether the little end comes first.
     """
-    seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return int(seconds) * 10**9 + int(rest)
+    is_little_endian = data[1] & 1
+    seconds, nanoseconds = struct.unpack_from("<iI" if is_little_endian else ">iI", data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def _yield_leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:

@@ -180,9 +180,8 @@ def backtest(
         starts = range(first, rows, check_count("every", every))
         networks = {row: _call_refit(refit, row, network) for row in starts}
     # The filters of each network, in one order; then the scores of each filter over the rows of all networks.
-    origins = [
-        _find_start_of_forecasts(fitted, record, measurements, inputs, time, truth) for fitted in networks.values()
-    ]
+    data = (measurements, inputs, time, truth)
+    origins = [_find_start_of_forecasts(fitted, record, *data) for fitted in networks.values()]
     scores = list[Score]()
     for of_filter in zip(*(list_targets(origin) for origin in origins), strict=True):
         if (of_filter[0].node, of_filter[0].filter) in list_single_filters(network):

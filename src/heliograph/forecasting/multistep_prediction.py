@@ -107,7 +107,7 @@ class MultistepPredictor(Module):
             signal, weights = self.filter.prior_signals(prior, k)
             covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
             return Moments(weights=weights, means=signal.mean, covariances=covariances)
-        plant, start = at(self.plant, k), second_moments_at_start(self.plant)
+        plant, initial_moments = at(self.plant, k), second_moments_at_start(self.plant)
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
         if isinstance(prior, Diffuse):
@@ -117,23 +117,22 @@ class MultistepPredictor(Module):
             return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
         # The sensor's noise, as it was learned where the filter learns it.
-        learned: WeightedColumns | None = None
+        learned_noise: WeightedColumns | None = None
         if isinstance(self.filter, AdaptiveFilter):
-            learned = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
+            learned_noise = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
 
-        def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return the mean and covariance of the outputs, under one part of the mixture of states.
+        def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return mean and covariance of the outputs, from those of the states, one component of the mixture.
 
-            `plant`, `sensor`: those of step k; `start`: the plant's second moments at the start; `learned`:
-            the sensor's noise where the filter learns it, else None; `transform`: how moments pass a
-            function that is not linear.
+            By the plant and the sensor of step k, and the rule by which moments pass a function that is not linear
+            (`self.transform`). `initial_moments`: second moments of the plant's initial law; `learned_noise`: the
+            sensor's noise as the filter has learned it, None where it does not.
             """
-            signal = find_signal_moments(
-                plant, sensor, self.transform, from_covariance(mean, covariance), start, learned
-            )
+            states_law = from_covariance(mean, covariance)
+            signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_moments, learned_noise)
             return signal.mean, signal.covariance
 
-        means, covariances = jax.vmap(of_part)(states.means, states.covariances)
+        means, covariances = jax.vmap(predict_outputs)(states.means, states.covariances)
         # Student's law of at most two degrees has no variance.
         if isinstance(sensor.noise, StudentT):
             endless = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)

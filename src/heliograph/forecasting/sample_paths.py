@@ -220,8 +220,14 @@ def _draw_paths_from_states(
         learned: deviations of the sensor's noise in units of its own (m,), where a filter learned them; else None.
     """
 
-    def move(before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[Any, Any]:
-        """Return state and mode after row k, and state and output there."""
+    def draw_row(
+        before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[Any, Any]:
+        """Draw row k of a path; return state and mode there, which the next row begins with, and state and output.
+
+        `plant` and `sensor` are the models of all rows, `switching` is how their modes move, `step` the number of the
+        first row, and `learned` the deviations of the sensor's noise in units of its own.
+        """
         (x, mode), (u_k, k) = before, row
         key_of_row = jax.random.fold_in(key, k)
         key_of_plant, key_of_sensor = jax.random.split(key_of_row)
@@ -241,13 +247,12 @@ def _draw_paths_from_states(
         return (x, mode), (x, y)
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the states (rows, n) and outputs (rows, m) of one path.
+        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from a state and a mode.
 
-        `start`: state and mode; `u`: inputs of the rows ahead; `step`: number of the first of them; `move`: a
-        step of a path.
+        `u`: inputs of the rows; `step`: number of the first row.
         """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-        path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: move(before, row, key), start, rows)[1]
+        path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: draw_row(before, row, key), start, rows)[1]
         return path
 
     paths: tuple[jax.Array, jax.Array] = jax.vmap(draw_path)(jax.tree.map(jnp.asarray, starts), keys)

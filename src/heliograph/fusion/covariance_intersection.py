@@ -123,14 +123,15 @@ def _take_newton_step(point: _PointWithDerivatives) -> tuple[jax.Array, jax.Arra
     for_ones = root * solve(root[:, None])[:, 0]  # the solution for a right side of ones
 
     def find_moves(target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the moves of w and of s towards w s = target; m is such that the moves of w sum to 0.
+        """Return dw and ds, the moves of the weights w and of their multipliers s (`slack`) towards w s = target.
 
-        Closed over: weights w, their multipliers s (`slack`) and the trace's `gradient`; `root`, `solve`: scaling and
-        solution of Newton's equations, `for_ones` that for a target of ones, m the multiplier of the sum.
+        (H + diag(s / w)) dw = target / w - gradient - m 1 is solved by `solve`, in units of `root` = w^1/2. The
+        solution for the right side 1 is `for_ones`; m is such that the dw sum to 0.
         """
-        solved = root * solve((target / root - root * gradient)[:, None])[:, 0]
-        move = solved - jnp.sum(solved) / jnp.sum(for_ones) * for_ones
-        return move, (target - slack * move) / w - slack
+        without_sum = root * solve((target / root - root * gradient)[:, None])[:, 0]  # for m = 0
+        m = jnp.sum(without_sum) / jnp.sum(for_ones)
+        weight_moves = without_sum - m * for_ones
+        return weight_moves, (target - slack * weight_moves) / w - slack
 
     # Predictor: the step with target 0, and the mean of w s before it and where it would end.
     before = jnp.mean(w * slack)

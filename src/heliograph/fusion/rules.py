@@ -203,6 +203,7 @@ class FixedIntersection(AbstractIntersection):
     weights: Float[Array, "count"]
 
     def __init__(self, weights: Float[ArrayLike, " count"]):
+        """Check and hold the weight of each estimate; they are not negative, and their sum is 1."""
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:
@@ -232,6 +233,7 @@ class WeightedFusion(AbstractFusion):
     weights: Float[Array, "count"]
 
     def __init__(self, weights: Float[ArrayLike, " count"]):
+        """Check and hold the weight c_i of each estimate; they are not negative, and their sum is 1."""
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:

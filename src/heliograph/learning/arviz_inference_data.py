@@ -66,12 +66,11 @@ def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndar
 
 
 def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
-    """Return the free numbers of the table by name at points of the line (draws, p), as a dataset.
+    """Return the free numbers of the table by name at draws of their unbounded coordinates (draws, p), as a dataset.
 
-    The line: unbounded coordinates of the free numbers, such as logarithms of variances. All draws are one chain,
-    axis 0.
+    These are, for instance, logarithms of variances. All draws are one chain, axis 0.
     """
-    values = np.stack([solution.parameters.entries_at(x) for x in points])
+    values = np.stack([solution.parameters.entries_at(x) for x in points])  # (draws, entries)
     names = [entry.name for entry in solution.parameters.entries]
     return _make_dataset({name: (("chain", "draw"), values[None, :, i]) for i, name in enumerate(names)})
 
@@ -91,13 +90,10 @@ def _make_total_likelihood_dataset(density: np.ndarray) -> "xr.Dataset":
     return _make_dataset({"lp": (("chain", "draw"), density.sum(axis=1)[None])})
 
 
-def _make_dataset(content: dict[str, Any], more: dict[str, Any] | None = None) -> "xr.Dataset":
-    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}, with one chain numbered 0.
-
-    `more`: further coordinates.
-    """
-
+def _make_dataset(content: dict[str, Any], further_coordinates: dict[str, Any] | None = None) -> "xr.Dataset":
+    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}, with one chain numbered 0."""
     import xarray as xr
 
-    draws = next(iter(content.values()))[1].shape[1]
-    return xr.Dataset(content, {"chain": [0], "draw": np.arange(draws), **(more or {})})
+    _axes, values = next(iter(content.values()))
+    coordinates = {"chain": [0], "draw": np.arange(values.shape[1])}
+    return xr.Dataset(content, coordinates | (further_coordinates or {}))

@@ -156,18 +156,17 @@ class Solution:
     @cached_property
     def rank(self) -> InformationRank:
         """Directions of active coordinates on which the data say nothing at the maximum (flat): as many as `ridges`."""
-        return find_rank_of_late_rows(
-            self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges
-        )
+        late_information = self.surface.evaluations(self.top.x[None]).late[0]
+        return find_rank_of_late_rows(late_information[np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the r identified directions (`basis`); the information where it is not positive."""
-        observed = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
-        reduced = self._project_on_identified(observed)
-        least_eigenvalue = np.linalg.eigvalsh(reduced)[:1].sum()  # 0 where there is no direction
+        hessian_of_active = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
+        hessian = self._project_on_identified(hessian_of_active)
+        least_eigenvalue = np.linalg.eigvalsh(hessian)[:1].sum()  # 0 where there is no direction
         if least_eigenvalue > 0:
-            return reduced
+            return hessian
         information = self.surface.evaluations(self.top.x[None]).information[0]
         return self._project_on_identified(information[np.ix_(self.active, self.active)])
 
@@ -326,9 +325,9 @@ class Solution:
 
         `slopes`: its derivatives by the active coordinates (active,), of which a share ALONG may lie on a ridge.
         """
-        along = self.rank.unit * slopes
-        size = np.linalg.norm(along)
-        return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
+        scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
+        size = np.linalg.norm(scaled_slopes)
+        return bool(size > 0 and np.linalg.norm(scaled_slopes @ self.rank.flat) <= ALONG * size)
 
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Return both ends of an interval, relative to the estimate, by DRAWS sums of blocks of scores drawn anew.
@@ -336,8 +335,9 @@ class Solution:
         `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
         the sum.
         """
-        drawn = np.linalg.solve(self.hessian, bootstrap_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
-        return np.asarray(np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2]))
+        sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=DRAWS, seed=0)
+        moves = slopes @ self.basis @ np.linalg.solve(self.hessian, sums.T)
+        return np.asarray(np.quantile(moves, [(1 - level) / 2, (1 + level) / 2]))
 
     def _make_boundary_row(self, entry: TableEntry, value: float, level: float) -> Row:
         """Return the row of a number at an end of its domain: the interval is from there to where the profile fell.

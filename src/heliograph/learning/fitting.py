@@ -220,12 +220,11 @@ class Fit:
 
     def __str__(self) -> str:
         """Return the table of estimates: with intervals if `rows` computed them, else with cheap standard errors."""
-        delay_lines = [f"{node}: {found}" for node, found in self.delays.items()]
+        delay_lines = [f"{node}: {delays}" for node, delays in self.delays.items()]
         if not self.best.has_rows:
-            sentences = (
-                *describe_unfinished_climbs(self.solutions, self.ends, self.stopped),
-                *self.identified.sentences,
-            )  # those that need no interval
+            # Sentences that need no interval.
+            sentences = describe_unfinished_climbs(self.solutions, self.ends, self.stopped)
+            sentences = [*sentences, *self.identified.sentences]
             return "\n".join([*self.best.describe_with_cheap_errors(), *delay_lines, *sentences, CHEAP_ERRORS])
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
@@ -340,19 +339,19 @@ def _maximise_forms(
 
 def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
     """Return recordings with tables of events turned into rows, and {node: law of its delays} of these tables."""
-    several = recording if isinstance(recording, list) else [recording]
+    recordings = recording if isinstance(recording, list) else [recording]
     # Tables of events alone know how late each message came.
-    tables = [table for table in several if hasattr(table, "lateness")]
+    tables = [table for table in recordings if hasattr(table, "lateness")]
     if not tables:
         return recording, {}
     # Of several tables the measurements of a node are counted together, in steps of the first that has any.
-    steps = {name: law.step for table in reversed(tables) for name, law in table.delays().items()}
-    by_table = [table.lateness() for table in tables]  # seconds by node
+    step_of_node = {name: law.step for table in reversed(tables) for name, law in table.delays().items()}
+    lateness_of_tables = [table.lateness() for table in tables]  # of each, seconds by node
     delays = {}
-    for name, step in steps.items():
-        lateness = [by_node[name] for by_node in by_table if name in by_node]
+    for name, step in step_of_node.items():
+        lateness = [lateness_by_node[name] for lateness_by_node in lateness_of_tables if name in lateness_by_node]
         delays[name] = learn_delays(np.concatenate(lateness), step)
-    return [table.recording() if table in tables else table for table in several], delays
+    return [table.recording() if table in tables else table for table in recordings], delays
 
 
 def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
@@ -392,8 +391,9 @@ def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[
     """Return the function that reports, after each step of a search, how many climbs are done and how high they are."""
     form = surface.objective.form
 
-    def report(now: ClimbEnds) -> None:
-        best = np.nanmax(now.total)
-        say(f"{form}: step {now.steps}, {int(now.converged.sum())} of {len(now.x)} starts done, {best:.6g}")
+    def report(climbs: ClimbEnds) -> None:
+        """Say which step the climbs are at, how many have converged, and the highest log-likelihood so far."""
+        best, done = np.nanmax(climbs.total), int(climbs.converged.sum())
+        say(f"{form}: step {climbs.steps}, {done} of {len(climbs.x)} starts done, {best:.6g}")
 
     return report

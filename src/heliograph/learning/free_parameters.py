@@ -123,9 +123,9 @@ class Parameters:
         """Return the numbers of the table, in order."""
         results, begin = [], 0
         for parameter in self.every:
-            has_own = parameter.domain.kind == "interval"  # then each entry has a coordinate of its own
+            has_own_coordinates = parameter.domain.kind == "interval"  # one for each entry
             for i, (name, domain) in enumerate(zip(parameter.entry_names, parameter.entry_domains, strict=True)):
-                results.append(TableEntry(name, domain, begin + i if has_own else None))
+                results.append(TableEntry(name, domain, begin + i if has_own_coordinates else None))
             begin += parameter.size
         return tuple(results)
 
@@ -175,9 +175,9 @@ class Parameters:
         On the line an entry is its logarithm or logit where its domain has ends. No warnings: at an end the
         derivative may be infinite.
         """
-        pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
+        entries = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
-            return np.stack([slope_to_line(entry.domain, value) * row for entry, value, row in pairs])
+            return np.stack([slope_to_line(entry.domain, value) * dv_dx for entry, value, dv_dx in entries])
 
 
 def to_plain_number(value: Array) -> float | np.ndarray:

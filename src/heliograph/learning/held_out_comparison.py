@@ -144,8 +144,8 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
 
     Those of gain and noise. None where they have no nodes to sum over, vary over time, or remember.
     """
-    parts = (network.plant, node.sensor, node.channel)
-    if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
+    models = (network.plant, node.sensor, node.channel)
+    if any(isinstance(model, OverTime) for model in models) or first(node.channel).remembers:
         return None
     try:
         return predictive(network.plant, node.sensor, first(node.channel), z, inputs).pit
@@ -156,14 +156,14 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
 def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> PredictedRows:
     """Return a filter's predictions of the rows from `cut` on, by measurements z and inputs u of all rows.
 
-    `likelihood`: log density of each row; `white`: innovations over their predicted deviations, which are white
-    noise if the filter is right. They are tested for correlation over LAGS rows at most, or not where they are too
-    few (None).
+    They are the log density of each row; its innovation over its predicted deviation, white noise if the filter is
+    right; and a test of these for correlation over at most LAGS rows, None where they are too few.
     """
-    likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
-    lags = min(LAGS, len(white) // 10)
-    has_enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
-    return PredictedRows(likelihood, white, MemoryTest.of(white, lags, claimed=True) if has_enough else None)
+    log_density, whitened = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
+    lags = min(LAGS, len(whitened) // 10)
+    has_enough = lags > 0 and np.count_nonzero(~np.isnan(whitened)) > LAGS
+    test = MemoryTest.of(whitened, lags, claimed=True) if has_enough else None
+    return PredictedRows(log_density, whitened, test)
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:

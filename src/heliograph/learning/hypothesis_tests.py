@@ -75,16 +75,16 @@ def wald_test(
     Raises:
         ValueError: no values, an unknown name, a number that is at a boundary or not identified.
     """
-    asked = table("values", values, "numbers")
-    if not asked or set(asked) - set(estimates):
-        raise fail("values", f"numbers for some of {list(estimates)}", list(asked))
-    places = [list(estimates).index(name) for name in asked]
+    given = table("values", values, "numbers")
+    if not given or set(given) - set(estimates):
+        raise fail("values", f"numbers for some of {list(estimates)}", list(given))
+    indices = [list(estimates).index(name) for name in given]
     # Numbers at a boundary, or not identified, have NaN as covariance.
-    inner = covariance[np.ix_(places, places)]
-    if not np.isfinite(inner).all():
-        raise fail("values", "numbers that are identified and not at a boundary", list(asked))
-    distance = np.array([estimates[name] - float(scalar(f"value of {name!r}", value)) for name, value in asked.items()])
-    return chi_square_test(float(distance @ np.linalg.solve(inner, distance)), len(places))
+    C = covariance[np.ix_(indices, indices)]
+    if not np.isfinite(C).all():
+        raise fail("values", "numbers that are identified and not at a boundary", list(given))
+    d = np.array([estimates[name] - float(scalar(f"value of {name!r}", value)) for name, value in given.items()])
+    return chi_square_test(float(d @ np.linalg.solve(C, d)), freedom=len(indices))
 
 
 class InformationCriteria(NamedTuple):
@@ -105,9 +105,9 @@ def compute_criteria(log_likelihood: float, free: int, observations: int) -> Inf
     """
     check_count("observations", observations)
     aic = 2 * free - 2 * log_likelihood
-    left = observations - free - 1
+    remaining = observations - free - 1
     return InformationCriteria(
         aic=aic,
-        aicc=aic + 2 * free * (free + 1) / left if left > 0 else float("inf"),
+        aicc=aic + 2 * free * (free + 1) / remaining if remaining > 0 else float("inf"),
         bic=free * float(np.log(observations)) - 2 * log_likelihood,
     )

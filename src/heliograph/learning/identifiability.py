@@ -114,11 +114,11 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
     """
     points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
-    sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
-    if not sound:
-        points, late, sound = [start], surface.evaluations(start[None]).late, [0]
-    ranks = [find_information_rank(late[i]) for i in sound]
-    return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
+    finite = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
+    if not finite:
+        points, late, finite = [start], surface.evaluations(start[None]).late, [0]
+    ranks = [find_information_rank(late[i]) for i in finite]
+    return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in finite], ranks)
 
 
 def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
@@ -323,13 +323,13 @@ def _compute_link_moments(sensor: AbstractSensor, link: AbstractRandomAffine) ->
     Of each output the gain is that of the measured value of which it has most. The noise is that of sensor and channel
     together: the diagonal of M R M' + spread of the constant part, with the mean gain M and the sensor's covariance R.
     """
-    moments, r = second_order(link), jnp.asarray(sensor.noise.covariance)
-    mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
+    moments, R = second_order(link), jnp.asarray(sensor.noise.covariance)
+    M, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
     # Covariances [i, j, a, b] of entries (i, a) and (j, b) of (gain, constant part), the constant part last.
     spread = jnp.asarray(moments.nominal.center)
-    whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
-    noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))
+    second_of_noise_and_one = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(R).at[p, p].set(1.0)
+    noise = jnp.diagonal(M @ R @ M.T + contract(spread, second_of_noise_and_one))
     # Of each output the gain of the measured value that it has most of.
-    strongest = jnp.argmax(jnp.abs(mean), axis=1)
-    rows = jnp.arange(len(mean))
-    return jnp.stack([mean[rows, strongest], spread[rows, rows, strongest, strongest], noise], axis=1)
+    strongest = jnp.argmax(jnp.abs(M), axis=1)
+    rows = jnp.arange(len(M))
+    return jnp.stack([M[rows, strongest], spread[rows, rows, strongest, strongest], noise], axis=1)

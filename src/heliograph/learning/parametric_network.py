@@ -132,6 +132,7 @@ class FreeNumberCollector:
     """Reader that collects the free numbers, each at its start; checks of their places report their domains."""
 
     def __init__(self) -> None:
+        """Begin without free numbers; `marks` will hold each in the order in which it is read."""
         self.marks: list[_MarkedNumber] = []
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
@@ -143,9 +144,8 @@ class FreeNumberCollector:
         for mark in self.marks:
             if name is not None and mark.given == name:
                 if not np.array_equal(mark.start, start):
-                    raise fail(
-                        f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
-                    )
+                    expected = f"one start in all places, {mark.start.tolist()}"
+                    raise fail(f"free number {name!r}", expected, start.tolist())
                 return mark_checked(start, mark.report)
         self.marks.append(_MarkedNumber(start, name, kind))
         return mark_checked(start, self.marks[-1].report)
@@ -167,8 +167,15 @@ class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
+        """Hold values by the names of parameters, and the order of the names that the user did not give.
+
+        Args:
+            parameters: all free numbers, in the order of their places.
+            named: of each whether the user gave it a name; the others are found by that order.
+            values: the value of each parameter, by its name.
+        """
         self.values = values
-        self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
+        self.unnamed = iter([p.name for p, is_named in zip(parameters.every, named, strict=True) if not is_named])
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the value of this name, or of the next number without a name.
@@ -177,9 +184,8 @@ class ValueReader:
         """
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
-            raise fail(
-                "network", "the same free numbers each time it is built", "another one" if name is None else name
-            )
+            got = "another one" if name is None else name
+            raise fail("network", "the same free numbers each time it is built", got)
         return self.values[key]
 
 

@@ -91,10 +91,12 @@ class SenderFit:
     def __str__(self) -> str:
         """Return the table and the sentences."""
         width = max(len(row.name) for row in self.table)
-        lines = [f"{row.name:{width}}  {row.value:>10}" + (f"  ({row.interval})" if row.low == row.low else "")
-                 for row in self.table]  # fmt: skip
-        late = [f"{node}: {delays}" for node, delays in self.delays.items()]
-        return "\n".join([*lines, *late, *self.sentences])
+        lines = []
+        for row in self.table:
+            interval = "" if np.isnan(row.low) else f"  ({row.interval})"
+            lines.append(f"{row.name:{width}}  {row.value:>10}{interval}")
+        delay_lines = [f"{node}: {delays}" for node, delays in self.delays.items()]
+        return "\n".join([*lines, *delay_lines, *self.sentences])
 
 
 def has_deciding_sender(network: Network) -> bool:

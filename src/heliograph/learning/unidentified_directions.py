@@ -87,13 +87,14 @@ def find_confounded(
 
 def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
     """Return dv/dx and d log|v|/dx (p,) of each coordinate that is a number v of the table, at x (p,); 1 of others."""
-    slopes, log = np.ones(len(x)), np.ones(len(x))
-    for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
-        if entry.coordinate is not None:
-            slopes[entry.coordinate] = row[entry.coordinate]
-            log[entry.coordinate] = row[entry.coordinate] / value if value else np.nan
+    slopes, log_slopes = np.ones(len(x)), np.ones(len(x))
+    for entry, dv_dx, v in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
+        i = entry.coordinate
+        if i is not None:
+            slopes[i] = dv_dx[i]
+            log_slopes[i] = dv_dx[i] / v if v else np.nan
     # A number that is 0 has no logarithm: its derivative is put as 0.
-    return slopes, np.nan_to_num(log)
+    return slopes, np.nan_to_num(log_slopes)
 
 
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
@@ -109,11 +110,11 @@ def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...
 
     A group of one coordinate is one that no data tell.
     """
-    # An entry of the projector b b' is not 0 where some flat direction moves both coordinates.
-    joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
-    count, labels = connected_components(joined, directed=False)
+    # An entry of the projector B B' is not 0 where some flat direction moves both coordinates.
+    are_connected = np.max([np.abs(B @ B.T) for B in bases], axis=0) > SAME
+    count, labels = connected_components(are_connected, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
-    return [group for group in groups if joined[group, group].any()]
+    return [group for group in groups if are_connected[group, group].any()]
 
 
 def _make_confounded_numbers(
@@ -147,10 +148,10 @@ def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
 
     SAME: singular value that is rounding.
     """
-    _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
-    rank = int(np.count_nonzero(size > SAME))
+    _, singular_values, right_vectors = np.linalg.svd(np.concatenate(bases, axis=1).T)
+    rank = int(np.count_nonzero(singular_values > SAME))
     # Right singular vectors beyond the rank are orthogonal to all flat directions.
-    return _reduce_to_echelon(right[rank:])
+    return _reduce_to_echelon(right_vectors[rank:])
 
 
 def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
@@ -181,10 +182,10 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
 
 def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
     """Return the text of a product of powers, such as "a * b^2 / c"."""
-    above = [_format_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
-    below = [_format_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
-    top = " * ".join(above) or "1"
-    return " / ".join([top, *below])
+    powers = list(zip(names, exponents, strict=True))
+    factors = [_format_power(name, exponent) for name, exponent in powers if exponent > 0]
+    divisors = [_format_power(name, -exponent) for name, exponent in powers if exponent < 0]
+    return " / ".join([" * ".join(factors) or "1", *divisors])
 
 
 def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:

@@ -52,11 +52,13 @@ class SteadyMomentTest:
     """
 
     def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
+        """Hold the tolerance of a step's change under A = `matrix`; `varies`: whether A or a law changes over time."""
         rate = 1 - spectral_radius(matrix)
         self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate  # negative: moments never come to rest
-        n, places = len(matrix), position(len(matrix) + 1, order)
+        n, index_of_moment = len(matrix), position(len(matrix) + 1, order)
         self._powers = np.array(list_exponents(n + 1, order))[:, :n]  # exponents of x in each moment
-        self._squares = [places[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
+        # Which moments are E[x_i^2]: their exponents are 2 of x_i, and order - 2 of the constant 1.
+        self._squares = [index_of_moment[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
         self._last: Moments | None = None
 
     def is_steady(self, moments: Moments) -> bool:
@@ -122,9 +124,7 @@ def lift_modes(
         roundings.append((EPS * np.kron(law, np.diag(next_second)), rounding_of_noise))
         second, chain = next_second, np.asarray(measurement.transition)
     over_time = Steps(*(repeat_last_step(values, len(plants)) for values in zip(*steps, strict=True)))
-    process_rounding, received_rounding = (
-        repeat_last_step(values, len(plants)) for values in zip(*roundings, strict=True)
-    )
+    process_rounding, received_rounding = (repeat_last_step(x, len(plants)) for x in zip(*roundings, strict=True))
     whole = np.tile(projection, (1, modes))  # x is the sum over the modes of x 1{mode}
     return LinearSystem(over_time, mean, start, whole, rounding=process_rounding, received_rounding=received_rounding)
 
@@ -232,9 +232,8 @@ def _lift_chain(
     distinct = {id(r.measurement): r.measurement for r in routes}  # steps share one object where nothing varies
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
     refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
-    projection = np.pad(
-        make_linear_rows(n, degree), ((0, 0), (0, 1))
-    )  # Y ends with the constant 1, which x has no part of
+    # Y ends with the constant 1, of which x has no part.
+    projection = np.pad(make_linear_rows(n, degree), ((0, 0), (0, 1)))
     chains = [modes_by_id[id(r.measurement)] for r in routes]
     return lift_modes([r.plant for r in routes], chains, degree, moments, projection)
 
@@ -277,9 +276,7 @@ def _lift_steps(
         steps.append(Steps(transition, drift, process, output, offset, noise))
         roundings.append((rounding_of_process, rounding_of_noise))
     over_time = Steps(*(repeat_last_step(values, len(routes)) for values in zip(*steps, strict=True)))
-    process_rounding, received_rounding = (
-        repeat_last_step(values, len(routes)) for values in zip(*roundings, strict=True)
-    )
+    process_rounding, received_rounding = (repeat_last_step(x, len(routes)) for x in zip(*roundings, strict=True))
     return over_time, process_rounding, received_rounding
 
 
@@ -298,6 +295,7 @@ class LiftedMap:
     """
 
     def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):
+        """Lift the map z = G y + n; `varies`: whether it changes over time, so that `whole` is not kept."""
         self.route, self.degree = route, degree
         self.matrix = np.asarray(route.moments(degree).matrix)
         rows, columns = (count_monomials(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
@@ -305,15 +303,14 @@ class LiftedMap:
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
         # Monomials of z that hold no output of a random gain, and the highest moments of y in Cov(Z_i, Z_j | y).
-        random = ~route.known_gains
-        known = ~np.any(np.array(list_exponents(route.outputs + 1, degree))[:, :-1][:, random], axis=1)
-        lowered = degrees(route.outputs, degree) - known
-        self.highest = lowered[:, None] + lowered
-        self.highest[~known[:, None] & ~known] = 2 * degree
+        exponents = np.array(list_exponents(route.outputs + 1, degree))[:, :-1]
+        has_known_gains = ~np.any(exponents[:, ~route.known_gains], axis=1)
+        lowered_degrees = degrees(route.outputs, degree) - has_known_gains
+        self.highest = lowered_degrees[:, None] + lowered_degrees
+        self.highest[~has_known_gains[:, None] & ~has_known_gains] = 2 * degree
 
     def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
         """Return E[monomials of z] from E[monomials of y], both up to twice the degree."""
-        # `whole` is the matrix between them; None if it was too large to be kept.
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             if self.whole is not None:
                 return np.asarray(self.whole @ np.asarray(moments))
@@ -330,17 +327,17 @@ class LiftedMap:
         of the noise.
         """
         n, m = self.route.inputs + 1, self.route.outputs + 1
-        spread, lost = np.zeros(self.highest.shape), np.zeros(len(self.highest))
-        for highest in range(int(self.highest.max()) + 1):
-            here = self.highest == highest
-            if not here[:-1, :-1].any():
+        K, covariance, rounding = self.matrix, np.zeros(self.highest.shape), np.zeros(len(self.highest))
+        for degree in range(int(self.highest.max()) + 1):
+            entries = self.highest == degree  # those that need moments of y up to this degree
+            if not entries[:-1, :-1].any():
                 continue
-            low = np.where(self.given <= highest, np.asarray(moments), 0.0)
-            after = np.asarray(products_of_monomials(self.push_moments(low), m, self.degree))
-            left = after - self.matrix @ np.asarray(products_of_monomials(low, n, self.degree)) @ self.matrix.T
-            spread = np.where(here, left, spread)
-            lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
-        return spread[:-1, :-1], lost[:-1]
+            needed = np.where(self.given <= degree, np.asarray(moments), 0.0)
+            second_of_y = np.asarray(products_of_monomials(needed, n, self.degree))
+            second_of_z = np.asarray(products_of_monomials(self.push_moments(needed), m, self.degree))
+            covariance = np.where(entries, second_of_z - K @ second_of_y @ K.T, covariance)
+            rounding = np.where(np.diagonal(entries), EPS * np.abs(np.diagonal(second_of_z)), rounding)
+        return covariance[:-1, :-1], rounding[:-1]
 
 
 def mean_and_spread(
@@ -366,10 +363,10 @@ def split_homogeneous(
 def make_linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
     """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
     # Of exponents of (variables, 1): variable i itself has the power 1, and the constant the rest of the degree.
-    places = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
-    rows = np.zeros((variables if expected is None else expected, len(places) - 1))
+    column_of_monomial = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
+    rows = np.zeros((variables if expected is None else expected, len(column_of_monomial) - 1))
     for i, row in enumerate(rows):
-        row[places[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
+        row[column_of_monomial[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
     return rows
 
 

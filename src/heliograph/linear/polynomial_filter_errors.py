@@ -111,11 +111,11 @@ class _MomentCache:
     """Moments of plant and link for the quadratic system, computed again only where the model changes."""
 
     def __init__(self) -> None:
-        # The plant's noise of the last step, and that of (x+, q) made of it; the last measurement, and its moments.
-        self.noise: AbstractNoise | None = None
+        """Begin before the first step: of no plant's noise and of no measurement are moments kept yet."""
+        self.last_plant_noise: AbstractNoise | None = None
         self.joint_noise: AbstractNoise | None = None
-        self.route: AbstractRandomAffine | None = None
-        self.moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
+        self.last_measurement: AbstractRandomAffine | None = None
+        self.measurement_moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
         """Return the map (x, q, z) -> (x+, q) of a plant's step, x and q being n numbers and z, which is dropped, m.
@@ -123,23 +123,26 @@ class _MomentCache:
         The noise of (x+, q), none of it on q, is kept as long as the plant's is the same object.
         """
         n = plant.inputs
-        if self.joint_noise is None or plant.noise is not self.noise:
+        if self.joint_noise is None or plant.noise is not self.last_plant_noise:
             no_noise = Gaussian(np.zeros((n, n)))
-            self.noise, self.joint_noise = plant.noise, TabulatedNoise(Independent([plant.noise, no_noise]), 4)
+            self.last_plant_noise = plant.noise
+            self.joint_noise = TabulatedNoise(Independent([plant.noise, no_noise]), order=4)
         matrix = np.zeros((2 * n, 2 * n + m))
         matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
         return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
 
-    def make_measurement_moments(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
+    def make_measurement_moments(self, measurement: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrices by which (x+, q, z+) has its moments of order 2 and 4 from those of (x+, q).
 
-        `route` is the random map from x+, the first n of these 2 n numbers, to z+. Matrices of the last one are kept.
+        `measurement` is the random map from x+, the first n of these 2 n numbers, to z+. The last one's are kept.
         """
-        if route is not self.route:
-            appended = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
-            self.route = route
-            self.moments = np.asarray(appended.moments(2).matrix), np.asarray(appended.moments(4).matrix)
-        return self.moments
+        if measurement is not self.last_measurement:
+            take_x = known(np.eye(n, 2 * n))
+            keep_and_measure = Stack([known(np.eye(2 * n)), Series([take_x, measurement])])
+            second, fourth = keep_and_measure.moments(2), keep_and_measure.moments(4)
+            self.last_measurement = measurement
+            self.measurement_moments = np.asarray(second.matrix), np.asarray(fourth.matrix)
+        return self.measurement_moments
 
 
 def _make_received_products(n: int, m: int) -> np.ndarray:

@@ -65,8 +65,9 @@ def critical_arrival(
     def certified_gain(arrival: float) -> Float[np.ndarray, "n m"] | None:
         """Return a gain that is certified to keep the error bounded at this probability of arrival, or None.
 
-        a, q, c, r: the plant's A and Cov(w), the sensor's C and Cov(v). `fixed` is a gain that was given, which alone
-        is tried; certified is one under which the radius of the error covariance's step is below 1.
+        a, q: A and Cov(w) of the plant; c, r: C and Cov(v) of the sensor, `no_outputs` the C of a lost packet. `fixed`
+        is the gain that the user gave, which then is the only one tried. A gain is certified if the step of its error
+        covariance has a spectral radius below 1.
         """
         # Independent losses as a chain of two modes with equal rows: mode 0 arrived, mode 1 lost, of no outputs.
         chain = np.array([[arrival, 1 - arrival]] * 2)

@@ -214,6 +214,7 @@ class Schedule(Module):
     )  # what it was made for
 
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
+        """Check and hold the gains of each step, the filter's state before the first, and the claim."""
         instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
         time, n, m = np.shape(gains.gain)

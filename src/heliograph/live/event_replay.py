@@ -111,8 +111,9 @@ class _LaggedSmoother:
         timeline, smoothed = self._timeline, self.smoothed
         while self._waiting and self._waiting[0] + self._lag < arrival:
             moment = heappop(self._waiting)
-            is_done = bool(smoothed) and smoothed[-1][0] == moment  # two nodes measured then
-            if is_done or moment > timeline.now:  # the latter of a wrong clock, whose leap was taken back
+            is_done = bool(smoothed) and smoothed[-1][0] == moment  # two nodes measured at this moment
+            is_of_wrong_clock = moment > timeline.now  # the clock's leap in time was taken back since
+            if is_done or is_of_wrong_clock:
                 continue
             timeline.advance(moment + self._lag)
             lag = min(timeline.now - moment, timeline.window)
@@ -124,35 +125,41 @@ def _arrival_of(event: Event) -> float:
     return event.time if event.arrival is None else event.arrival
 
 
-def _join_records(parts: Sequence[Record]) -> Record:
+def _join_records(records: Sequence[Record]) -> Record:
     """Return one record of several, one after another in time, with the same nodes and filters."""
     estimates = {
         node: {
-            name: _stack_estimates([record.estimates[node][name] for record in parts], np.concatenate)
-            for name in filters
+            filter: _stack_estimates([record.estimates[node][filter] for record in records], np.concatenate)
+            for filter in filters
         }
-        for node, filters in parts[0].estimates.items()
+        for node, filters in records[0].estimates.items()
     }
-    time = np.concatenate([record.time for record in parts])
-    return Record(time=time, states=parts[0].states, truth=None, measurements={}, estimates=estimates)
+    time = np.concatenate([record.time for record in records])
+    return Record(time=time, states=records[0].states, truth=None, measurements={}, estimates=estimates)
 
 
-def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
-    """Return the record of `parts`: (time, estimates then by node and filter), in order of time."""
-    results = [estimates for _, estimates in parts]
+def _make_record(network: Network, moments: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
+    """Return the record of several moments: (time, estimates then by node and filter) of each, in order of time."""
+    filters_by_node = moments[0][1] if moments else {}
     estimates = {
         node: {
-            name: _stack_estimates([estimates_then[node][name] for estimates_then in results], np.stack)
-            for name in filters
+            filter: _stack_estimates([estimates_then[node][filter] for _, estimates_then in moments], np.stack)
+            for filter in filters
         }
-        for node, filters in (results[0] if results else {}).items()
+        for node, filters in filters_by_node.items()
     }
-    time = np.array([time for time, _ in parts])
+    time = np.array([time for time, _ in moments])
     return Record(time=time, states=network.states, truth=None, measurements={}, estimates=estimates)
 
 
-def _stack_estimates(parts: Sequence[Estimate], join: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
-    """Return the estimates of several times as one, joined by `np.stack` or `np.concatenate`; all claim the same."""
-    mean, covariance = (join([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
-    modes = None if parts[0].modes is None else join([np.asarray(e.modes) for e in parts])
-    return Estimate(mean, covariance, parts[0].claim, modes, parts[0].attitude)
+def _stack_estimates(estimates: Sequence[Estimate], join: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
+    """Return one filter's estimates at several times as one estimate, whose arrays have an axis for time.
+
+    `join` is `np.stack` where each is of one time, `np.concatenate` where each has several times already. All have
+    the same claim and the same states that are attitudes.
+    """
+    mean = join([np.asarray(estimate.mean) for estimate in estimates])
+    covariance = join([np.asarray(estimate.covariance) for estimate in estimates])
+    oldest = estimates[0]
+    modes = None if oldest.modes is None else join([np.asarray(estimate.modes) for estimate in estimates])
+    return Estimate(mean, covariance, oldest.claim, modes, oldest.attitude)

@@ -160,14 +160,14 @@ def _judge_step(
         k: step number.
     """
     filter: AbstractFilter = static.with_arrays(numbers)
-    after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
+    state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
     # NaN in z did not arrive; infinite measurements and inputs that are no numbers are refused.
-    unusable = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
-    flagged = unusable | (judgement.reason > 0) | (judgement.input > 0)
-    judged = jnp.stack(judgement)
+    has_unusable_numbers = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
+    is_refused = has_unusable_numbers | (judgement.reason > 0) | (judgement.input > 0)
+    judgement_numbers = jnp.stack(judgement)
     if innovation.weight is not None:
-        judged = jnp.concatenate([judged, innovation.weight])
-    return judged, flagged, jax.tree.leaves(after), jax.tree.leaves(estimate)
+        judgement_numbers = jnp.concatenate([judgement_numbers, innovation.weight])
+    return judgement_numbers, is_refused, jax.tree.leaves(state_after), jax.tree.leaves(estimate)
 
 
 @lru_cache

@@ -13,23 +13,28 @@ class FinalRows:
     """Outputs of final rows, `size` numbers each, in order of time; beyond `most` rows the oldest parts are dropped."""
 
     def __init__(self, most: int, size: int):
+        """Begin without rows; at least the newest `most` rows are kept, of `size` numbers each."""
         self.most, self.size, self._parts = most, size, deque[tuple[np.ndarray, np.ndarray]]()
         self._count = 0  # rows of all parts
 
     def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
-        """Append the outputs of some rows.
+        """Append some rows: their times (row,) and outputs (row, output).
 
-        The oldest parts are dropped as long as `most` rows are left without them.
+        `_parts`: these two arrays of each call, the oldest first; `_count`: how many rows all parts have together.
+        The oldest parts are dropped as long as the others have `most` rows or more.
         """
         self._parts.append((time, rows))
         self._count += len(time)
-        while self._count - len(self._parts[0][0]) >= self.most:
-            self._count -= len(self._parts.popleft()[0])
+        oldest_times, _ = self._parts[0]
+        while self._count - len(oldest_times) >= self.most:
+            self._parts.popleft()
+            self._count -= len(oldest_times)
+            oldest_times, _ = self._parts[0]
 
     def take_all(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
-        """Remove and return all times and rows."""
-        # An empty part first, for where there are no others.
-        times, rows = zip((np.zeros(0), np.zeros((0, self.size))), *self._parts, strict=True)
+        """Remove all rows; return their times (row,) and outputs (row, output), the oldest first."""
+        no_rows = np.zeros(0), np.zeros((0, self.size))  # first, as no list of arrays to join may be empty
+        times, rows = zip(no_rows, *self._parts, strict=True)
         self._parts.clear()
         self._count = 0
         return np.concatenate(times), np.concatenate(rows)
@@ -39,6 +44,7 @@ class GateCounts:
     """Counts of the values that filters left out of rows, by node and filter that weighs what arrives."""
 
     def __init__(self, filters: Iterable[FilterColumns]):
+        """Begin with counts of zero for each filter that weighs; note the columns of its weights in a row."""
         self._columns = {(f.node, f.filter): list(f.weighed.weight) for f in filters if f.weighed is not None}
         self.counts = dict.fromkeys(self._columns, 0)
 

@@ -127,8 +127,7 @@ class Fleet:
         chains = []
         for plant, step in plants:
             before = plant.silence or plant.rows.held[-1]
-            is_there_already = step <= before.key[0]
-            if is_there_already:
+            if step <= before.key[0]:  # it is there already
                 continue
             slot = plant.silence.slot if plant.silence is not None else self.pool.take_slot()
             plant.silence = HeldRow((step, 0, 0), slot, self.width)
@@ -301,17 +300,18 @@ class Fleet:
         plants, results = list(touched), []
         self.step(plants)
         for plant in plants:
-            withdrawn, their_slots = plant.take_withdrawn()
+            withdrawn, slots_of_withdrawn = plant.take_withdrawn()
             watermark = np.inf if all_ else plant.confirmed - self.options.window
-            final, left = plant.finalise_rows(watermark, self.options.leap)
-            newest = plant.rows.held[-1]
-            results.append(FinalisedPlant(plant, final, newest, left=left + their_slots, withdrawn=withdrawn))
+            final_rows, slots_of_dropped = plant.finalise_rows(watermark, self.options.leap)
+            newest, slots = plant.rows.held[-1], slots_of_dropped + slots_of_withdrawn
+            results.append(FinalisedPlant(plant, final_rows, newest, left=slots, withdrawn=withdrawn))
         return results
 
     def step(self, plants: Iterable[PlantState]) -> None:
         """Step the rows that have changed, and all after them, for all plants at once; write them into the table."""
-        chains = [chain for plant in plants if (chain := plant.take_dirty_rows())]
-        if rows := [row for chain in chains for row in chain]:
+        chains = list(filter(None, [plant.take_dirty_rows() for plant in plants]))
+        rows = [row for chain in chains for row in chain]
+        if rows:
             numbers = np.array([number for row in rows for number in row.numbers]).reshape(len(rows), -1)
             self.pool.table[[row.slot for row in rows], self.pool.numbers] = numbers
         self._step_chains(chains)
@@ -319,15 +319,16 @@ class Fleet:
     def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
         """Step from the first row of each chain into the second, and so on; their numbers stand in the table."""
         by_steps, endless = self.program.dt is None, self.end_step == np.inf
-        walks = [cut_chain_into_legs(chain, by_steps, endless) for chain in chains]
-        # All chains up to their first long gap at once, over these one by one, and so on.
-        while walks:
-            for steps in group_by_turn(legs[0].steps for legs in walks):
+        # All chains up to their first long gap at once (their first legs), over these one by one, and so on.
+        legs_of_chains = [cut_chain_into_legs(chain, by_steps, endless) for chain in chains]
+        while legs_of_chains:
+            for steps in group_by_turn(legs[0].steps for legs in legs_of_chains):
                 self.pool.step_slots_in_place(*map(np.array, zip(*steps, strict=True)))
-            for legs in walks:
-                if len(legs) > 1:  # a long gap follows the leg
-                    self.pool.pass_long_gap(legs[0].steps[-1][1], legs[0].jump)
-            walks = [legs[1:] for legs in walks if len(legs) > 1]
+            legs_of_chains = [legs for legs in legs_of_chains if len(legs) > 1]  # a long gap follows the first leg
+            for legs in legs_of_chains:
+                _, slot_before_gap, _ = legs[0].steps[-1]
+                self.pool.pass_long_gap(slot_before_gap, to=legs[0].jump)
+            legs_of_chains = [legs[1:] for legs in legs_of_chains]
 
     def step_row(self, before: HeldRow, row: HeldRow) -> None:
         """Step from the row `before` into `row`, which is none of a plant's, and write it into the table."""
@@ -363,8 +364,7 @@ class Fleet:
         by_steps, watermark = self.program.dt is None, plant.confirmed - self.options.window
         final = ceil(max(watermark, -1.0)) - 1 if by_steps else max(watermark, plant.begun)
         now = floor(min(now, self.end_step)) if by_steps else now
-        by_dates = plant.origin is not None  # dates are seconds apart
-        unit = name_timeout_unit(self.network.inputs) or "s" * by_dates
+        unit = name_timeout_unit(self.network.inputs) or ("" if plant.origin is None else "s")  # s between dates
         statuses = {}
         for name, rule in self.watched.items():
             # When the newest value was measured that was used; no step is below 0.

@@ -18,21 +18,24 @@ class RemarkWatch:
     """
 
     def __init__(self, fleet: Fleet):
+        """Begin with counts of zero for each filter of the fleet that can remark on its state."""
         self._pool, self._steps = fleet.pool, fleet.program.step_rows
         self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
 
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
         """Yield the name of a plant and a line for each filter that has something new to say.
 
-        `said.times`: how often the filter has had it to say; `remarked`: how often that was passed on.
+        `remark.times`: how often the filter has had this to say so far; `remarked`: how often a plant has passed it on;
+        `counts`: how often all plants have.
         """
         for plant in plants if self.counts else ():
-            for place, said in self._read_remarks(plant.rows.held[-1]).items():
-                new = said.times - plant.remarked.get(place, 0)
-                if new > 0:
-                    self.counts[place] += new
-                    plant.remarked[place] = said.times
-                    yield plant.name, f"{place[0]}/{place[1]}: {said.words}"
+            newest_row = plant.rows.held[-1]
+            for (node, filter), remark in self._read_remarks(newest_row).items():
+                count_of_new = remark.times - plant.remarked.get((node, filter), 0)
+                if count_of_new > 0:
+                    self.counts[node, filter] += count_of_new
+                    plant.remarked[node, filter] = remark.times
+                    yield plant.name, f"{node}/{filter}: {remark.words}"
 
     def note_said(self, plant: PlantState) -> None:
         """Note that all remarks on a plant were made before it was stored, so that none is made again."""
@@ -52,6 +55,7 @@ class FleetRepeatWatch:
     """Watch for outputs that repeat for longer than their noise allows; each is said once, of one plant."""
 
     def __init__(self, fleet: Fleet):
+        """Hold the watches of all plants' outputs, of which none was warned of yet."""
         self._watches, self._nodes = fleet.held_watches, fleet.network.nodes
         self._said = set[tuple[str, int]]()  # node and output
 
@@ -63,9 +67,10 @@ class FleetRepeatWatch:
         """
         for plant in plants if self._watches else ():
             for node, link in plant.links.items():
-                for output in [i for i, count in enumerate(link.repeats.found) if count]:
+                stuck_outputs = [output for output, count in enumerate(link.repeats.found) if count]
+                for output in stuck_outputs:
                     if (node, output) not in self._said:
                         self._said.add((node, output))
                         name = self._nodes[node].received_names[output]
-                        said = self._watches[node].describe_stuck_output(output, name, link.repeats)
-                        yield plant.name, f"{node}: {said}"
+                        warning = self._watches[node].describe_stuck_output(output, name, link.repeats)
+                        yield plant.name, f"{node}: {warning}"

@@ -47,7 +47,8 @@ def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str,
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
     for columns in program.filter_columns:
         mean = outputs[..., columns.mean : columns.mean + n]
-        covariance = outputs[..., columns.covariance : columns.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
+        covariance_numbers = outputs[..., columns.covariance : columns.covariance + n * n]
+        covariance = covariance_numbers.reshape(*outputs.shape[:-1], n, n)
         modes = columns.probabilities(outputs)
         estimate = Estimate(mean, covariance, columns.claim, modes, attitude=attitude)
         estimates[columns.node][columns.filter] = lower_unsound_claim(estimate)

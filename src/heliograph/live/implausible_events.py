@@ -200,9 +200,10 @@ class JudgementReader:
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
         # Stepped from the row before, judged, and let go.
         self.fleet.step_row(self._find_row_before(candidate), trial)
-        judged = pool.table[trial.slot, pool.outputs][self._judgement_columns[event.node_index]]
+        outputs = pool.table[trial.slot, pool.outputs]
+        judgements = outputs[self._judgement_columns[event.node_index]]
         pool.free_slots([trial.slot])
-        return Judgement.why_values(judged) is None
+        return Judgement.why_values(judgements) is None
 
 
 def _find_largest_number(event: CheckedEvent) -> float:
@@ -264,11 +265,14 @@ def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
     watched = list[WatchedAngles]()
     for columns in fleet.program.filter_columns:
         filter = find_filter_of_columns(fleet, columns)
-        if filter is not None and (angles := WideAngles(filter)).states:
-            # The diagonal of its covariance, (n, n) row by row.
+        if filter is None:
+            continue
+        angles = WideAngles(filter)
+        if angles.states:
+            # Its covariance, (n, n), stands row by row: one entry of the diagonal is n + 1 columns from the next.
             n = len(filter.states)
-            variances = fleet.pool.outputs.start + columns.covariance + np.arange(n) * (n + 1)
-            watched.append(WatchedAngles(f"{columns.node}/{columns.filter}", variances, angles))
+            variance_columns = fleet.pool.outputs.start + columns.covariance + np.arange(n) * (n + 1)
+            watched.append(WatchedAngles(f"{columns.node}/{columns.filter}", variance_columns, angles))
     return watched
 
 
@@ -293,22 +297,28 @@ def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
 
 
 def _list_received(network: Network, node: str) -> dict[int, str]:
-    """Return {column of a row's measurements: name of what is received there} of a node, or of all for `FUSED`."""
+    """Return {column among the measurements of all nodes: name of the output in it}, of a node or of all (`FUSED`).
+
+    `network.rows`: by node, the columns of what it receives.
+    """
     if node != Network.FUSED:
         return dict(zip(network.rows[node], network.nodes[node].received_names, strict=True))
     return {
-        at: f"{name}: {what}"
+        column: f"{name}: {output}"
         for name in network.names
-        for at, what in zip(network.rows[name], network.nodes[name].received_names, strict=True)
+        for column, output in zip(network.rows[name], network.nodes[name].received_names, strict=True)
     }
 
 
-def find_filter_of_columns(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
-    """Return the filter of these columns; None of a fusion rule."""
-    if output.node == Network.FUSED:
-        central = fleet.network.fused[output.filter]
-        return central if isinstance(central, AbstractFilter) else None
-    return fleet.network.nodes[output.node].filters.get(output.filter)
+def find_filter_of_columns(fleet: Fleet, columns: FilterColumns) -> AbstractFilter | None:
+    """Return the filter whose estimate stands in these columns of a row; None if they are those of a fusion rule.
+
+    Under the name FUSED a network has both: central filters, which get all that is received, and fusion rules.
+    """
+    if columns.node == Network.FUSED:
+        filter_or_rule = fleet.network.fused[columns.filter]
+        return filter_or_rule if isinstance(filter_or_rule, AbstractFilter) else None
+    return fleet.network.nodes[columns.node].filters.get(columns.filter)
 
 
 def _takes_measurements(fleet: Fleet, output: FilterColumns) -> bool:

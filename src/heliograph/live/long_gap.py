@@ -34,9 +34,13 @@ def find_factor_places(places: PyTree) -> list[FactorPlaces]:
 
     LOWER, VARIANCES: how the paths of the factors L and D of a covariance end.
     """
-    parts = {path: part.astype(int) for path, part in split_by_path(places).items()}
-    stems = [path.removesuffix(VARIANCES) for path in parts if path.endswith(VARIANCES)]
-    return [FactorPlaces(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
+    places_by_path = {path: leaf.astype(int) for path, leaf in split_by_path(places).items()}
+    stems = [path.removesuffix(VARIANCES) for path in places_by_path if path.endswith(VARIANCES)]
+    return [
+        FactorPlaces(places_by_path[stem + LOWER], places_by_path[stem + VARIANCES])
+        for stem in stems
+        if stem + LOWER in places_by_path
+    ]
 
 
 def convert_to_covariances(
@@ -45,9 +49,9 @@ def convert_to_covariances(
     """Return rows with the entries of L D L' in the places of those of L below its diagonal, and of D."""
     rows = rows.copy()
     for lower, variances in places:
-        root, n = unit_lower(rows[:, lower]), variances.shape[-1]  # L
-        covariance = (root * rows[:, variances][..., None, :]) @ np.swapaxes(root, -1, -2)  # (L D) L'
-        rows[:, lower] = covariance[..., *np.tril_indices(n, -1)]
+        factor, diagonal = unit_lower(rows[:, lower]), rows[:, variances]  # L, and the diagonal of D
+        covariance = (factor * diagonal[..., None, :]) @ np.swapaxes(factor, -1, -2)  # (L D) L'
+        rows[:, lower] = covariance[..., *np.tril_indices(variances.shape[-1], -1)]
         rows[:, variances] = np.diagonal(covariance, axis1=-2, axis2=-1)
     return rows
 
@@ -155,11 +159,12 @@ def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
     with np.errstate(invalid="ignore"):
         last_change, change_before = end - middle, middle - begin
-        even = np.abs(last_change - change_before) <= STEADY * np.abs(change_before)
-        steady = np.isfinite(end) & even & _find_moving(middle, end)
-    moved = end.copy()
-    moved[steady] += last_change[steady] * (count / (quarter * PROBED))
-    return moved
+        changes_are_equal = np.abs(last_change - change_before) <= STEADY * np.abs(change_before)
+        goes_on = np.isfinite(end) & changes_are_equal & _find_moving(middle, end)
+    extrapolated = end.copy()
+    steps_of_change = quarter * PROBED
+    extrapolated[goes_on] += last_change[goes_on] * (count / steps_of_change)
+    return extrapolated
 
 
 def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
@@ -177,8 +182,9 @@ def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, "
     SETTLED: relative change that is rounding.
     """
     with np.errstate(invalid="ignore"):
-        close = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
-    moving: np.ndarray = ~(close | (before == after) | (np.isnan(before) & np.isnan(after)))
+        is_rounding = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
+    is_equal, stays_nan = before == after, np.isnan(before) & np.isnan(after)  # equal: two infinite ones too
+    moving: np.ndarray = ~(is_rounding | is_equal | stays_nan)
     return moving
 
 
@@ -239,14 +245,17 @@ def _measure_affine_map(
     return np.round(matrix / units / LEAST) * LEAST * units, after[0] - state[columns]
 
 
-def _iterate_affine_map(
-    matrix: Float[np.ndarray, "m m"], moved: Float[np.ndarray, " m"], count: int
-) -> Float[np.ndarray, " m"]:
-    """Return d after `count` steps d' = A d + c from d = 0, by squaring the map: A is `matrix`, c is `moved`."""
-    total = np.zeros_like(moved)
-    # Before each turn, (matrix, moved) is the map of 1, 2, 4, ... steps: d' = A (A d + c) + c = A^2 d + (A c + c).
+def _iterate_affine_map(A: Float[np.ndarray, "m m"], c: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " m"]:
+    """Return d after `count` steps d' = A d + c from d = 0, by squaring the map.
+
+    Before turn i of the loop (A, c) is the map of 2^i steps, as two of d' = A d + c are A (A d + c) + c =
+    A^2 d + (A c + c). It is applied where bit i of `count` is 1.
+    """
+    d = np.zeros_like(c)
     while count:
-        if count & 1:
-            total = matrix @ total + moved
-        moved, matrix, count = matrix @ moved + moved, matrix @ matrix, count >> 1
-    return total
+        lowest_bit = count & 1
+        if lowest_bit:
+            d = A @ d + c
+        A, c = A @ A, A @ c + c
+        count >>= 1
+    return d

@@ -205,7 +205,7 @@ class PlantState:
         """Count the events of rows that a leap made as withdrawn, by node; `names`: those of nodes, then inputs."""
         counts: dict[str, int] = {}
         for row in rows:
-            for node, _, _ in row.events:
+            for node, _running_count, _time in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
             # `moments`: times of the node's counts before the leap.
@@ -350,10 +350,12 @@ class PlantState:
         if self.kept is not None and (leap is None or leap.now != self.kept.now):  # it was of another leap
             left, self.kept = [*left, self.kept.row], None
         if leap is not None and self.kept is None:
-            before = [row for row in left if row.key[0] < leap.time - longest_gap]
-            if before and self.rows.held[0].key[0] >= leap.time - longest_gap:  # all rows held are after the leap
-                self.kept = RowBeforeLeap(before[-1], leap.now)
-                left = [row for row in left if row is not before[-1]]
+            far_side = leap.time - longest_gap  # rows from then on are after the leap
+            rows_before_leap = [row for row in left if row.key[0] < far_side]
+            if rows_before_leap and self.rows.held[0].key[0] >= far_side:
+                newest = rows_before_leap[-1]
+                self.kept = RowBeforeLeap(newest, leap.now)
+                left = [row for row in left if row is not newest]
         return [row.slot for row in left]
 
     @property

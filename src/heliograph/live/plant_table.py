@@ -79,7 +79,8 @@ class SlotTable:
         """
         dt, table = self.program.dt, self.table
         u = np.where(np.isnan(given), table[before, self.held], given)  # held: the inputs that hold after a row
-        u = u if dt is None else _insert_time_step(u, dt, np.ones(len(u)))
+        if dt is not None:
+            u = _insert_time_step(u, dt, np.ones(len(u)))
         k = np.minimum(table[before, self.at.start] + 1, last)
         nothing = np.full((len(before), self.program.received), np.nan)
         state_and_outputs = self._step_parts(table[before, self.state], nothing, u, k[:, None])
@@ -126,10 +127,13 @@ class SlotTable:
         those that `after` holds.
         """
         dt, table = self.program.dt, self.table
-        u = table[after if dt is None else before, self.held]
-        if dt is not None:
-            u = _insert_time_step(u[None], dt, table[[after], self.numbers.stop - 1] - table[[before], -1])[0]
-        return u, int(table[after, self.at.start])
+        step_number = int(table[after, self.at.start])
+        if dt is None:
+            return table[after, self.held], step_number
+        time_column = self.numbers.stop - 1
+        time_between = table[[after], time_column] - table[[before], time_column]
+        u_without_dt = table[before, self.held]
+        return _insert_time_step(u_without_dt[None], dt, time_between)[0], step_number
 
     def pass_long_gap(self, slot: int, to: int) -> None:
         """Predict the row in a slot, in place, to step number `to` without measurements, in bounded work."""
@@ -139,13 +143,16 @@ class SlotTable:
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
             """Return states (row, state) after step number k without measurements, under the inputs that hold."""
-            rest = np.broadcast_to(np.concatenate([nothing, held, [k]]), (len(states), len(nothing) + len(held) + 1))
-            return self._step_parts(states, rest)[:, : self.step_rows.state.size].copy()
+            same_for_all = np.concatenate([nothing, held, [k]])
+            rows = np.broadcast_to(same_for_all, (len(states), len(same_for_all)))
+            return self._step_parts(states, rows)[:, : self.step_rows.state.size].copy()
 
-        flat = self.step_rows.state
-        places = find_factor_places(flat.tree(np.arange(float(flat.size))))
-        after = pass_long_gap(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
-        self.table[slot, self.state], self.table[slot, self.at.start] = after, to
+        state = self.step_rows.state
+        column_numbers = np.arange(float(state.size))
+        places = find_factor_places(state.tree(column_numbers))
+        state_before = row[self.state].copy()
+        state_after = pass_long_gap(step, self.step_rows.start, state_before, at, count=to - at, places=places)
+        self.table[slot, self.state], self.table[slot, self.at.start] = state_after, to
 
     def gather_history(self, slots: Sequence[int]) -> PyTree:
         """Return the rows in these slots, in order, as a smoother takes them.

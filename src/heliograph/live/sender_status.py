@@ -72,8 +72,11 @@ class LossChain(NamedTuple):
     def of_channel(channel: Channel) -> "LossChain":
         """Return the losses of a link: in each mode the probability of the outcomes of which nothing arrives."""
         modes = joint_modes(first(channel))
-        loss = [sum(float(o.probability) for o in m.list_outcomes() if not o.arrived.any()) for m in modes.maps]
-        return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
+        loss_probabilities = [
+            sum(float(outcome.probability) for outcome in mode.list_outcomes() if not outcome.arrived.any())
+            for mode in modes.maps
+        ]
+        return LossChain(np.array(loss_probabilities), np.asarray(modes.transition), np.asarray(modes.initial))
 
     def probability_all_lost(self, apart: int, count: int) -> float:
         """Return the probability that `count` transmissions, `apart` steps from one to the next, are all lost.
@@ -82,8 +85,10 @@ class LossChain(NamedTuple):
         """
         if not count:
             return 1.0
-        moved = np.linalg.matrix_power(self.transition, apart)
-        return float((self.initial * self.loss @ np.linalg.matrix_power(moved * self.loss, count - 1)).sum())
+        transition_between = np.linalg.matrix_power(self.transition, apart)  # T^apart
+        first_is_lost = self.initial * self.loss  # p diag(l)
+        all_others_are_lost = np.linalg.matrix_power(transition_between * self.loss, count - 1)
+        return float((first_is_lost @ all_others_are_lost).sum())
 
 
 class SilenceRule(NamedTuple):
@@ -114,14 +119,14 @@ class SilenceRule(NamedTuple):
         `provisional`: silence since the newest final moment, which a late value may still end; `silent`: that
         before it.
         """
-        since = begun if last is None else last
-        silent, provisional = max(final - since, 0), max(now - max(final, since), 0)
+        silence_begin = begun if last is None else last
+        silent, provisional = max(final - silence_begin, 0), max(now - max(final, silence_begin), 0)
         if self.trigger is None or self.losses is None:
             return SenderStatus(last, silent, provisional, missed=0, chance=1.0, timeout=self.timeout)
-        step = None if last is None else int(last)
-        missed = count_missed_heartbeats(self.trigger, step, int(silent), int(final))
-        apart = 1 if self.trigger.heartbeat is None else int(self.trigger.heartbeat)
-        chance = self.losses.probability_all_lost(apart, missed)
+        last_step = None if last is None else int(last)
+        missed = count_missed_heartbeats(self.trigger, last_step, int(silent), int(final))
+        steps_between = 1 if self.trigger.heartbeat is None else int(self.trigger.heartbeat)
+        chance = self.losses.probability_all_lost(steps_between, missed)
         return SenderStatus(last, silent, provisional, missed=missed, chance=chance, timeout=self.timeout)
 
 

@@ -49,6 +49,7 @@ class SortedRows:
     """
 
     def __init__(self, base: HeldRow, joint: bool, columns: list[slice], capacity: int):
+        """Hold the base as the only row; the class says what the arguments are."""
         self.held, self.keys = [base], [base.key]
         self.joint, self.columns_by_node, self.capacity = joint, columns, capacity
 
@@ -115,11 +116,12 @@ class SortedRows:
         del self.keys[index], self.held[index]
 
     def write_event(self, row: HeldRow, event: CheckedEvent) -> None:
-        """Write an event's values into its row; NaN is left out."""
+        """Write an event's values into the columns of its node in a row; a NaN leaves the number that is there."""
         columns, values = self.columns_by_node[event.node_index], event.values
-        if row.events:  # else nothing is there yet
-            # NaN, which is not equal to itself, leaves what is there.
-            values = [there if new != new else new for there, new in zip(row.numbers[columns], values, strict=True)]
+        if row.events:  # of a row without events all numbers are NaN
+            # Only NaN is not equal to itself (np.isnan of a single number takes far longer).
+            present = row.numbers[columns]
+            values = [old if new != new else new for old, new in zip(present, values, strict=True)]
         row.numbers[columns] = values
         row.events[event.name] = event.values
 
@@ -179,9 +181,9 @@ class SortedRows:
 
         The base itself is held on, as the first row.
         """
-        final, left = self.held[1 : base + 1], self.held[:base]
+        final_rows, dropped_rows = self.held[1 : base + 1], self.held[:base]
         del self.held[:base], self.keys[:base]
-        return final, left
+        return final_rows, dropped_rows
 
 
 def list_columns_of_blocks(sizes: Sequence[int]) -> list[slice]:

@@ -172,7 +172,8 @@ class Stream:
         `weight`: of each component, 0 where the filter's gate left it out as too far off.
         """
         estimate: JudgedEstimate = self._compiled.estimate.unflatten([*self._stepper.estimate, nis, arrived])
-        if len(weight := self._stepper.weight):
+        weight = self._stepper.weight  # of no components if the filter does not weigh them
+        if len(weight):
             estimate = replace(estimate, weight=weight)
             self.refused["gate"] += weight == 0
         # What limits refuse depends on the state: no claim stronger than "nominal" holds.
@@ -219,11 +220,12 @@ class Stream:
     def _describe_remark(self) -> list[str]:
         """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none.
 
-        `said.times`: how often the filter has had it to say so far; `_remarked`: how often when last asked.
+        `remark.times`: how often the filter has had this to say so far; `_remarked`: how often when last asked.
         """
-        said, before = self.filter.remark(self._compiled.state.unflatten(self._stepper.state)), self._remarked
-        self._remarked = said.times
-        return [said.words] if said.times > before else []
+        remark = self.filter.remark(self._compiled.state.unflatten(self._stepper.state))
+        is_new = remark.times > self._remarked
+        self._remarked = remark.times
+        return [remark.words] if is_new else []
 
     def _describe_angles(self, z: np.ndarray, k: int) -> list[str]:
         """Return lines on angles known less well than the filter can use, and on received ones in degrees, once."""
@@ -279,10 +281,12 @@ class Stream:
         Raises:
             ValueError: a filter that is none of `event_filter`.
         """
-        if (sender := find_deciding_sender(self.filter)) is None:
+        sender = find_deciding_sender(self.filter)
+        if sender is None:
             raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
-        last, now = None if self._last < 0 else self._last, self.steps - 1
-        return SilenceRule(sender.trigger, LossChain.of_channel(sender.channel), None).find_status(last, -1, now, now)
+        rule = SilenceRule(sender.trigger, LossChain.of_channel(sender.channel), timeout=None)
+        last_arrival, now = None if self._last < 0 else self._last, self.steps - 1
+        return rule.find_status(last_arrival, begun=-1, final=now, now=now)
 
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""

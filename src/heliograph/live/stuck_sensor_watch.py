@@ -40,6 +40,7 @@ class RepeatWatch:
     """
 
     def __init__(self, noises: Sequence[AbstractNoise]):
+        """Hold the sensor's noise laws, one for each that it has over time; no bound p(q) is computed yet."""
         self.noises = noises
         self._bounds = dict[tuple[int, float], float]()  # by output and resolution
 

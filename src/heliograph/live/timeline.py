@@ -231,11 +231,11 @@ class Timeline:
 
     def _slot_now(self) -> tuple[int, float]:
         """Return the slot (table row) of the state at `now`, predicted where nothing came then, and its time."""
-        newest, now = self._plant.rows.held[-1], self.now
-        if self._program.dt is None:
-            now = np.floor(min(now, self._fleet.end_step))
-        if newest.key[1] != BEFORE and now <= newest.key[0]:
-            return newest.slot, float(newest.key[0])
+        newest, by_steps = self._plant.rows.held[-1], self._program.dt is None
+        newest_time, newest_node, _ = newest.key  # the node is BEFORE in the row before all events
+        now = np.floor(min(self.now, self._fleet.end_step)) if by_steps else self.now
+        if newest_node != BEFORE and now <= newest_time:
+            return newest.slot, float(newest_time)
         self._fleet.predict_into(newest, now, self._spare)
         return self._spare, float(now)
 
@@ -388,10 +388,10 @@ class Timeline:
     def _finalise(self) -> None:
         """Make rows that are older than the window final, and read the outputs of those that have data."""
         results = self._fleet.finalise_plants([self._plant])
-        read = [row for row in results[0].final if row.has_data()]
-        if read:
-            outputs = self._outputs_after([row.slot for row in read])
-            self._finals.add(np.array([row.key[0] for row in read]), outputs)
+        with_data = [row for row in results[0].final if row.has_data()]
+        if with_data:
+            outputs = self._outputs_after([row.slot for row in with_data])
+            self._finals.add(np.array([row.key[0] for row in with_data]), outputs)
             self._gates.count_weights_of_zero(outputs)
         self._fleet.free_slots(results)
 

@@ -40,8 +40,8 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
             `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
     """
-    less_reference: Channel = at_each_step(_subtract_reference, channel, reference)
-    return less_reference
+    centred_channel: Channel = at_each_step(_subtract_reference, channel, reference)
+    return centred_channel
 
 
 def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
@@ -52,10 +52,11 @@ def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | Ov
         raise fail("channel less a reference", "neither late nor lossy by itself (put `centred` inside)", what)
     rank("reference", reference)
     r = array("reference", library(reference).atleast_1d(reference), (channel.inputs,))
-    forgets = without_memory(channel)
-    assert isinstance(forgets, AbstractRandomAffine)
-    gain = forgets.moments(1).mean[:-1, :-1]  # E[G], without the offset's row and column
-    return amplify_and_forward([known(np.eye(len(r)), -r), channel, known(np.eye(channel.outputs), gain @ r)])
+    memoryless = without_memory(channel)
+    assert isinstance(memoryless, AbstractRandomAffine)
+    mean_gain = memoryless.moments(1).mean[:-1, :-1]  # E[G], without the offset's row and column
+    subtract, add_back = known(np.eye(len(r)), -r), known(np.eye(channel.outputs), mean_gain @ r)
+    return amplify_and_forward([subtract, channel, add_back])
 
 
 def predict_signal(

@@ -179,9 +179,8 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
     Raises:
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
     """
-    return build_with_told_numbers(
-        lambda links: DelayedLink(links[0], delay, timestamped), check_maps("delayed link", [link])
-    )
+    checked = check_maps("delayed link", [link])
+    return build_with_told_numbers(lambda links: DelayedLink(links[0], delay, timestamped), checked)
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
@@ -199,13 +198,13 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
 
-    # Numbers that the channel tells its receiver beside z are not lost with it.
-    def build(links: Sequence[AbstractRandomAffine]) -> Mixture:
-        """Return the channel of one step: its link with probability p, else silence."""
-        nothing = silent(links[0].outputs, links[0].inputs)
-        return Mixture([links[0], nothing], library(p).stack([p, 1 - p]), radius)
+    def mix_with_silence(links: Sequence[AbstractRandomAffine]) -> Mixture:
+        """Return the only link with probability p, the arrival's, else silence."""
+        (link,) = links
+        return Mixture([link, silent(link.outputs, link.inputs)], library(p).stack([p, 1 - p]), radius)
 
-    return build_with_told_numbers(build, check_maps("dropout", [channel]))
+    # Numbers that the channel tells its receiver beside z are not lost with it.
+    return build_with_told_numbers(mix_with_silence, check_maps("dropout", [channel]))
 
 
 def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
@@ -235,9 +234,8 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     """
     # A memory without a name, such as fading, that stands in both becomes one of each. Numbers that a channel tells its
     # receiver follow its own outputs.
-    return stack_channels_with_told_numbers(
-        _delay_all_like_latest, separate_memories(check_maps("stack", [relayed, direct]))
-    )
+    channels = separate_memories(check_maps("stack", [relayed, direct]))
+    return stack_channels_with_told_numbers(_delay_all_like_latest, channels)
 
 
 def _delay_all_like_latest(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
@@ -255,21 +253,21 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    return stack_channels_with_told_numbers(
-        _select_part_for_each_link, separate_memories(check_maps("parallel channels", channels))
-    )
+    # A memory without a name that stands in several channels becomes one of each.
+    separate = separate_memories(check_maps("parallel channels", channels))
+    return stack_channels_with_told_numbers(_select_part_for_each_link, separate)
 
 
 def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return the links as ones that are all given the whole signal, of which each takes its own part, in turn."""
     # past: by how many steps the latest may be late; all are given as many earlier signals.
-    total, past = sum(signal_size(link) for link in links), max(link.past for link in links)
-    placed = []
-    start = 0  # of the link's part in the signal
+    size, past = sum(signal_size(link) for link in links), max(link.past for link in links)
+    links_of_whole_signal = []
+    start = 0  # the first component of the link's part of the signal
     for link in links:
-        placed.append(place_channel_of_part(link, total, start, past))
+        links_of_whole_signal.append(place_channel_of_part(link, size, start, past))
         start += signal_size(link)
-    return placed
+    return links_of_whole_signal
 
 
 def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool = False) -> Superposed:
@@ -316,8 +314,8 @@ def _check_can_be_added(name: str, link: AbstractRandomAffine) -> None:
 
     `name`: what the link is called in the error.
     """
-    inside = [link, *all_inner_maps(link)]
-    if any(isinstance(m, ModeOutput) or (isinstance(m, DelayedLink) and m.timestamped) for m in inside):
+    maps = [link, *all_inner_maps(link)]
+    if any(isinstance(m, ModeOutput) or (isinstance(m, DelayedLink) and m.timestamped) for m in maps):
         raise fail(name, "one without flags and time stamps, which would be added up", type(link).__name__)
     if link.erases:
         expected = "a loss that the receiver does not see: dropout(link, arrival) inside, erasure(sum, arrival) outside"
@@ -374,14 +372,14 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     plant_0 = first(plant)
-    senses = first(sensor).typical(plant_0.inputs)
-    for model in list_mode_models(senses):
+    sensor_0 = first(sensor).typical(plant_0.inputs)
+    for model in list_mode_models(sensor_0):
         check_turn_invariance(
-            "sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(senses.angles)
+            "sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(sensor_0.angles)
         )
-    steps = unstack(channel) if senses.circular else [first(channel)]
+    steps = unstack(channel) if sensor_0.circular else [first(channel)]
     # For each step, which of the received components are angles; gains other than 1 raise, for they bend an angle.
-    results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
-    if len(results) > 1:
-        raise fail("channel", "the same angles at every step", sorted(results))
-    return results.pop()
+    received_angles: set[Angles] = {step.carry_angles(sensor_0.angles) for step in steps}
+    if len(received_angles) > 1:
+        raise fail("channel", "the same angles at every step", sorted(received_angles))
+    return received_angles.pop()

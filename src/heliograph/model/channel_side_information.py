@@ -57,6 +57,7 @@ class Pilot(Module):
     fresh: bool = eqx.field(static=True)
 
     def __init__(self, noise: "Float[ArrayLike, '']", fresh: bool = True):
+        """Check and hold the variance of a reading's error, and whether each message has a fresh gain."""
         self.noise = scalar("noise of a pilot", noise, np.finfo(float).tiny)
         self.fresh = flag("fresh", fresh)
 
@@ -137,12 +138,12 @@ def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stac
     if known is False:
         return hop
     if isinstance(known, Pilot):
-        return append_told_numbers(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise, known.fresh))
+        reading = FreshReading(hop.law, known.noise)
+        return append_told_numbers(PilotedHop(reading, hop.matrix, hop.noise, known.fresh))
     instance("known", known, bool, "True, False or a Pilot")
-    typical = np.asarray([hop.law.moment(1)])
-    return append_told_numbers(
-        ToldMap(FreshNumbers(hop.law, 1), ToldGainHop(hop.matrix, hop.noise), typical, ("gain",))
-    )
+    gain, hop_of_known_gain = FreshNumbers(hop.law, 1), ToldGainHop(hop.matrix, hop.noise)
+    mean_gain = np.asarray([hop.law.moment(1)])
+    return append_told_numbers(ToldMap(gain, hop_of_known_gain, mean_gain, ("gain",)))
 
 
 def append_told_numbers(link: AbstractRandomAffine) -> Stack:
@@ -200,9 +201,9 @@ def build_with_told_numbers(
     """
     links = [separate_told_numbers(channel).link for channel in channels]
     built = build(links)
-    # A channel that tells nothing is its own link.
-    some_tell = any(link is not channel for link, channel in zip(links, channels, strict=True))
-    return cast(M, append_told_numbers(built)) if some_tell else built
+    # A channel that tells its receiver nothing is its own link.
+    have_told_numbers = any(link is not channel for link, channel in zip(links, channels, strict=True))
+    return cast(M, append_told_numbers(built)) if have_told_numbers else built
 
 
 def stack_channels_with_told_numbers(
@@ -217,11 +218,12 @@ def stack_channels_with_told_numbers(
             other.
         channels: the channels.
     """
-    links = [separate_told_numbers(channel).link for channel in channels]
-    placed, maps = place(links), list[AbstractRandomAffine]()
-    # A channel that tells nothing is its own link; of any other the told numbers follow its outputs.
-    for link, channel, of_all in zip(links, channels, placed, strict=True):
-        maps += [of_all] if link is channel else [of_all, *_list_told_outputs(of_all, of_all.inputs)]
+    links, maps = [separate_told_numbers(channel).link for channel in channels], list[AbstractRandomAffine]()
+    for link, channel, placed_link in zip(links, channels, place(links), strict=True):
+        maps.append(placed_link)
+        # A channel that tells its receiver nothing is its own link; of any other the told numbers follow its outputs.
+        if link is not channel:
+            maps += _list_told_outputs(placed_link, placed_link.inputs)
     return Stack(maps)
 
 
@@ -233,12 +235,16 @@ def name_received_values(outputs: tuple[str, ...], channel: AbstractRandomAffine
         channel: from the sensor to the receiver; told numbers have names of their own.
         more: how many numbers are received beside what the channel delivers.
     """
-    link, values, numbers = separate_told_numbers(channel)  # rows of what is received: of values, of told numbers
-    count = len(values) + more
+    link, rows_of_values, rows_of_told_numbers = separate_told_numbers(channel)
+    count = len(rows_of_values) + more
     names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
-    told_names = [name for affine in list_told_maps(link) for name in affine.names] if numbers else []
-    several = {name for name in told_names if told_names.count(name) > 1}
+    told_names = [name for affine in list_told_maps(link) for name in affine.names] if rows_of_told_numbers else []
+    # Of several told numbers of one name each has a number behind it.
+    distinct = [
+        f"{name}_{told_names[:i].count(name) + 1}" if told_names.count(name) > 1 else name
+        for i, name in enumerate(told_names)
+    ]
     # From the first row to the last, so that each name is inserted at the place that it has in the end.
-    for i, (row, name) in sorted(enumerate(zip(numbers, told_names, strict=True)), key=lambda item: item[1][0]):
-        names.insert(row, f"{name}_{told_names[:i].count(name) + 1}" if name in several else name)
+    for row, name in sorted(zip(rows_of_told_numbers, distinct, strict=True)):
+        names.insert(row, name)
     return tuple(names)

@@ -45,13 +45,14 @@ class DiffuseStart(Module):
         Raises:
             ValueError: a name that is no state, a covariance that is none.
         """
-        chosen = states if self.names is None else self.names
-        if strange := [name for name in chosen if name not in states]:
-            raise fail("states with an unknown start", f"some of {list(states)}", strange[0])
-        unknown = np.array([name in chosen for name in states])
-        known = np.array(covariance("known part of the initial covariance", self.known, len(states)), float)
-        known[unknown, :] = known[:, unknown] = 0.0
-        return UnknownStart(known, tuple(unknown.tolist()))
+        unknown_states = states if self.names is None else self.names
+        for name in unknown_states:
+            if name not in states:
+                raise fail("states with an unknown start", f"some of {list(states)}", name)
+        is_unknown = np.array([name in unknown_states for name in states])
+        known_covariance = np.array(covariance("known part of the initial covariance", self.known, len(states)), float)
+        known_covariance[is_unknown, :] = known_covariance[:, is_unknown] = 0.0
+        return UnknownStart(known_covariance, tuple(is_unknown.tolist()))
 
 
 class UnknownStart(Module):

@@ -140,33 +140,35 @@ def lower_claim_by_noise(claim: Claim, *models: PyTree) -> Claim:
 
 def mask_sound_estimates(estimate: Estimate) -> np.ndarray:
     """Return which of some estimates have a finite mean and, where one is claimed, a covariance (to rounding)."""
-    finite = ~find_not_finite(np.asarray(estimate.mean), 1)
+    has_finite_mean = ~find_not_finite(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
-        return finite
-    return np.asarray(finite & _mask_covariances_over_time(np.asarray(estimate.covariance)))
+        return has_finite_mean
+    return np.asarray(has_finite_mean & _mask_covariances_over_time(np.asarray(estimate.covariance)))
 
 
-def _mask_covariances_over_time(bound: np.ndarray) -> np.ndarray:
+def _mask_covariances_over_time(matrices: np.ndarray) -> np.ndarray:
     """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, equal ones judged once."""
     # In a long recording of a filter that has settled most matrices (time, n, n) are equal to the one before.
-    if bound.ndim == 3 and len(bound) > 2 and np.array_equal(bound[-1], bound[len(bound) // 2]):
-        rows = bound.reshape(len(bound), -1)
-        changes = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))  # cumsum - 1: the last change before each row
-        return np.asarray(_mask_covariances(bound[changes])[np.cumsum(changes) - 1])
-    return _mask_covariances(bound)
+    if matrices.ndim == 3 and len(matrices) > 2 and np.array_equal(matrices[-1], matrices[len(matrices) // 2]):
+        rows = matrices.reshape(len(matrices), -1)
+        is_new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+        number_of_last_new = np.cumsum(is_new) - 1
+        return np.asarray(_mask_covariances(matrices[is_new])[number_of_last_new])
+    return _mask_covariances(matrices)
 
 
-def _mask_covariances(bound: np.ndarray) -> np.ndarray:
+def _mask_covariances(matrices: np.ndarray) -> np.ndarray:
     """Return which matrices (..., n, n) are finite and positive semidefinite to rounding."""
-    finite = ~find_not_finite(bound, 2)
+    is_finite = ~find_not_finite(matrices, 2)
     # The quick test of all at once first; else matrix by matrix, as correlations, whatever the states' units.
-    if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
-        return np.asarray(finite)
-    safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
-    unit = standard_deviations(safe)
-    correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
-    sound: np.ndarray = finite & _is_semidefinite(correlations)
-    return sound
+    if is_finite.all() and _are_definite((matrices + np.swapaxes(matrices, -1, -2)) / 2):
+        return np.asarray(is_finite)
+    finite = np.where(is_finite[..., None, None], matrices, np.eye(matrices.shape[-1]))
+    deviations = standard_deviations(finite)
+    variance_products = deviations[..., :, None] * deviations[..., None, :]
+    correlations = (finite + np.swapaxes(finite, -1, -2)) / (2 * variance_products)
+    are_covariances: np.ndarray = is_finite & _is_semidefinite(correlations)
+    return are_covariances
 
 
 def _are_definite(covariances: np.ndarray) -> bool:
@@ -174,8 +176,8 @@ def _are_definite(covariances: np.ndarray) -> bool:
 
     Then their correlations have no eigenvalue below -tol (DEFINITENESS_TOLERANCE). The matrices are changed in place.
     """
-    places = np.arange(covariances.shape[-1])
-    covariances[..., places, places] *= 1 + DEFINITENESS_TOLERANCE
+    diagonal = np.arange(covariances.shape[-1])
+    covariances[..., diagonal, diagonal] *= 1 + DEFINITENESS_TOLERANCE
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:

@@ -56,7 +56,8 @@ def gilbert_elliott(
     """
     p, q = scalar("fail", fail, 0.0, 1.0), scalar("recover", recover, 0.0, 1.0)
     xp = library(p, q)
-    return Modes(MarkovChain(xp.stack([xp.stack([1 - p, p]), xp.stack([q, 1 - q])]), name=name), [good, bad])
+    transition = xp.stack([xp.stack([1 - p, p]), xp.stack([q, 1 - q])])
+    return Modes(MarkovChain(transition, name=name), [good, bad])
 
 
 def markov_fading(
@@ -177,13 +178,15 @@ def shared(link: Channel, name: str) -> Channel:
     """
     text("name of what is shared", name)
     check_maps("shared link", [first(link)])
-    held = memories(link)
-    if not held:
-        raise fail("shared link", "one with memory, such as gilbert_elliott(...)", "one drawn anew at each step, which "
-                   "nodes share by Network.sharing")  # fmt: skip
-    # Copies of the memories with the name; of several with a number behind it.
-    twins = {key: m.named(name if len(held) == 1 else f"{name} {i}") for i, (key, m) in enumerate(held.items())}
-    return replace_memories(link, twins)
+    memories_of_link = memories(link)
+    if not memories_of_link:
+        got = "one drawn anew at each step, which nodes share by Network.sharing"
+        raise fail("shared link", "one with memory, such as gilbert_elliott(...)", got)
+    named_copies = {}
+    for i, (key, memory) in enumerate(memories_of_link.items()):
+        # Of several memories each has a number behind the name.
+        named_copies[key] = memory.named(name if len(memories_of_link) == 1 else f"{name} {i}")
+    return replace_memories(link, named_copies)
 
 
 def without_memory(channel: Channel) -> Channel:
@@ -202,10 +205,9 @@ def without_memory(channel: Channel) -> Channel:
         return channel
     if not isinstance(channel, OverTime):
         return redraw_modes_each_step(channel)
-    steps = [joint_modes(step, order=2) for step in unstack(channel)]
-    return over_time(
-        [mix_maps_of_modes(step, law) for step, law in zip(steps, mode_laws_over_time(steps), strict=True)]
-    )
+    modes_of_steps = [joint_modes(step, order=2) for step in unstack(channel)]
+    laws_of_steps = mode_laws_over_time(modes_of_steps)
+    return over_time([mix_maps_of_modes(modes, law) for modes, law in zip(modes_of_steps, laws_of_steps, strict=True)])
 
 
 def memory_matters(channel: Channel) -> bool:
@@ -225,10 +227,12 @@ def memory_matters(channel: Channel) -> bool:
         return True
     # The channel as a sum of terms with memories of their own, each as the list of its maps over all steps.
     terms = zip(*(split_terms_without_common_memory(step) for step in unstack(channel)), strict=True)
-    constant = not isinstance(channel, OverTime)
-    return any(
-        not is_memory_irrelevant_for_linear_filter([joint_modes(step) for step in term], constant) for term in terms
-    )
+    is_constant = not isinstance(channel, OverTime)
+    for maps_of_term in terms:
+        modes = [joint_modes(step) for step in maps_of_term]
+        if not is_memory_irrelevant_for_linear_filter(modes, is_constant):
+            return True
+    return False
 
 
 def uncertain_chain(channel: Channel) -> bool:

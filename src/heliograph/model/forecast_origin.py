@@ -49,9 +49,10 @@ class Origin:
 
     def has_form_of(self, state: PyTree) -> bool:
         """Return whether this origin's state has the same tree structure as another state, and arrays of its shapes."""
-        own, other = ((str(form), [np.shape(leaf) for leaf in leaves])
-                      for leaves, form in map(jax.tree.flatten, (self.state, state)))  # fmt: skip
-        return own == other
+        own_leaves, own_structure = jax.tree.flatten(self.state)
+        leaves, structure = jax.tree.flatten(state)
+        has_same_structure = str(own_structure) == str(structure)
+        return has_same_structure and list(map(np.shape, own_leaves)) == list(map(np.shape, leaves))
 
 
 KeptOrigin = TypeAliasType("KeptOrigin", Origin | None)  # None where no state was kept

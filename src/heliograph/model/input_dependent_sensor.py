@@ -48,9 +48,8 @@ class NoiseOfInputs(Module):
 
     def _refuse(self) -> Any:
         """Raise ValueError: what asks for the law's numbers needs a constant one, and this depends on `inputs`."""
-        raise fail(
-            "sensor noise", "a constant one, as what is computed before data needs", f"one of {list(self.inputs)}"
-        )
+        expected = "a constant one, as what is computed before data needs"
+        raise fail("sensor noise", expected, f"one of {list(self.inputs)}")
 
     covariance = mean = columns = dimension = property(_refuse)
 

@@ -42,6 +42,7 @@ class SwitchingRates(Module):
     imaginary: np.ndarray
 
     def __init__(self, rates: ArrayLike):
+        """Check the rates G (modes, modes), and decompose exp(G t) once for all t."""
         G = array("rates", rates, ("modes", "modes"))
         if is_traced(G):
             raise fail("rates", "numbers, which are not free", "traced ones")
@@ -49,9 +50,8 @@ class SwitchingRates(Module):
         off_diagonal = G[~np.eye(len(G), dtype=bool)]
         is_balanced = np.max(np.abs(G.sum(axis=1))) <= SUM * np.max(np.abs(G))
         if len(G) != G.shape[1] or (off_diagonal < 0).any() or not is_balanced:
-            raise fail(
-                "rates", "a square matrix, 0 or more beside its diagonal, of which each row sums to 0", G.tolist()
-            )
+            expected = "a square matrix, 0 or more beside its diagonal, of which each row sums to 0"
+            raise fail("rates", expected, G.tolist())
         values, vectors = np.linalg.eig(G)
         if np.linalg.cond(vectors) > APART:
             raise fail("rates", "as many eigenvectors as modes (change one rate a little)", G.tolist())
@@ -89,15 +89,15 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant], rates: "SwitchingRates | None" = None):
+        """Hold the chain and the plant of each mode; names and initial law are the first one's, as of all."""
         self.memory, self.rates = instance("memory", memory, MarkovChain, "a MarkovChain"), rates
         self.models = _read_mode_models("models of a plant", models, AbstractPlant)
-        start = self.models[0]
-        if start.attitude:
-            raise fail("models of a plant", "ones without an attitude", list(start.attitude))
-        self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
-        self.deviation, self.states, self.inputs, self.circular, self.limits = (
-            start.deviation, start.states, start.inputs, start.circular, start.limits,
-        )  # fmt: skip
+        first_plant = self.models[0]
+        if first_plant.attitude:
+            raise fail("models of a plant", "ones without an attitude", list(first_plant.attitude))
+        self.initial_mean, self.initial_covariance = first_plant.initial_mean, first_plant.initial_covariance
+        self.deviation, self.states, self.inputs = first_plant.deviation, first_plant.states, first_plant.inputs
+        self.circular, self.limits = first_plant.circular, first_plant.limits
 
     @property  # type: ignore[misc]
     def noise(self) -> Any:  # type: ignore[override]
@@ -124,14 +124,13 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         """Return the plant of mode `state`; for a traced one a plant with that mode's numbers, or a choice of them."""
         if isinstance(state, int | np.integer):
             return self.models[state]
-        same_numbers = select_model_of_equal_structure(self.models, jnp.asarray(state))
-        return _ChosenPlant(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
+        chosen = select_model_of_equal_structure(self.models, jnp.asarray(state))
+        return _ChosenPlant(self.models, jnp.asarray(state)) if chosen is None else chosen
 
     def _refuse(self) -> NoReturn:
         """Raise ValueError: what needs one law of motion got several, and SEVERAL_TAKEN_BY says what takes them."""
-        raise fail(
-            "plant", f"one law of motion here ({SEVERAL_TAKEN_BY})", f"a markov_plant of {len(self.models)} modes"
-        )
+        expected = f"one law of motion here ({SEVERAL_TAKEN_BY})"
+        raise fail("plant", expected, f"a markov_plant of {len(self.models)} modes")
 
 
 class _ChosenPlant(AbstractPlant):
@@ -147,12 +146,12 @@ class _ChosenPlant(AbstractPlant):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, models: tuple[AbstractPlant, ...], index: jax.Array):
+        """Hold all plants and the index of the chosen one; names and initial law are the first one's."""
         self.models, self.index, self.noise = models, index, None
-        start = models[0]
-        self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
-        self.deviation, self.states, self.inputs, self.circular, self.limits = (
-            start.deviation, start.states, start.inputs, start.circular, start.limits,
-        )  # fmt: skip
+        first_plant = models[0]
+        self.initial_mean, self.initial_covariance = first_plant.initial_mean, first_plant.initial_covariance
+        self.deviation, self.states, self.inputs = first_plant.deviation, first_plant.states, first_plant.inputs
+        self.circular, self.limits = first_plant.circular, first_plant.limits
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return f(x, u) of the chosen plant."""
@@ -176,6 +175,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractSensor]):
+        """Hold the chain and the sensor of each mode, which have the same outputs."""
         self.memory = instance("memory", memory, MarkovChain, "a MarkovChain")
         self.models = _read_mode_models("models of a sensor", models, AbstractSensor)
         self.outputs, self.circular = self.models[0].outputs, self.models[0].circular
@@ -198,13 +198,13 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
         """Return the sensor of mode `state`; of a traced one a sensor with that mode's numbers, or a choice of them."""
         if isinstance(state, int | np.integer):
             return self.models[state]
-        same_numbers = select_model_of_equal_structure(self.models, jnp.asarray(state))
-        return _ChosenSensor(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
+        chosen = select_model_of_equal_structure(self.models, jnp.asarray(state))
+        return _ChosenSensor(self.models, jnp.asarray(state)) if chosen is None else chosen
 
     def _refuse(self) -> NoReturn:
         """Raise ValueError: what needs one law of what is measured got several."""
-        raise fail("sensor", f"one law of what is measured here ({SEVERAL_TAKEN_BY})",
-                   f"a markov_sensor of {len(self.models)} modes")  # fmt: skip
+        expected = f"one law of what is measured here ({SEVERAL_TAKEN_BY})"
+        raise fail("sensor", expected, f"a markov_sensor of {len(self.models)} modes")
 
 
 class _ChosenNoise(Module):
@@ -231,6 +231,7 @@ class _ChosenSensor(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, models: tuple[AbstractSensor, ...], index: jax.Array):
+        """Hold all sensors, which have the same outputs, and the index of the chosen one."""
         self.models, self.index = models, index
         self.noise = _ChosenNoise(tuple(model.noise for model in models), index)
         self.outputs, self.circular = models[0].outputs, models[0].circular
@@ -379,14 +380,13 @@ def _read_mode_chain(
     """
     # Exactly one of the two says the chain: a transition, or another model whose only memory is a chain.
     if (transition is None) == (modes is None):
-        raise fail("chain of the modes", "transition=, or modes= of a model that has them",
-                   "none" if modes is None else "both")  # fmt: skip
+        got = "none" if modes is None else "both"
+        raise fail("chain of the modes", "transition=, or modes= of a model that has them", got)
     if modes is not None:
         held = list(memories(modes).values())
         if len(held) != 1 or not isinstance(held[0], MarkovChain):
             raise fail("modes", "a plant, sensor or link that has one chain", show_value(modes))
         transition = held[0]
-    # A chain as it is, or one made of probabilities.
     if isinstance(transition, MarkovChain):
         if initial is not None or name is not None:
             raise fail("initial and name", "none beside a chain, which has its own", "one")

@@ -28,7 +28,7 @@ class OverTime(Module):
     values: PyTree
 
     def __init__(self, values: object):
-        # A model's values at all steps: every array inside has the same leading axis, of steps.
+        """Hold an array, or a model whose arrays are all stacked over time, along a leading axis of one length."""
         self.values = jax.tree.map(_convert_leaf, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
         if len(steps) != 1 or None in steps:
@@ -52,14 +52,15 @@ def _list_arrays(tree: object) -> list[PyTree]:
 
 def stack(models: Sequence[T]) -> T:
     """Stack model objects of one structure into one object whose arrays have a new leading axis."""
-    flat = [jax.tree.flatten(model) for model in models]  # of each: its leaves, and its structure
-    if len({_describe_structure(*parts) for parts in flat}) != 1:
+    leaves_and_structures = [jax.tree.flatten(model) for model in models]
+    if len({_describe_structure(leaves, structure) for leaves, structure in leaves_and_structures}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
-    pieces = zip(*(leaves for leaves, _ in flat), strict=True)
+    leaf_of_models = zip(*(leaves for leaves, _ in leaves_and_structures), strict=True)
     # What is no array is the same in all of them.
-    stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in pieces]
-    steps_of_parts: T = jax.tree.unflatten(flat[0][1], stacked)
-    return steps_of_parts
+    stacked = [_stack_leaves(*leaves) if eqx.is_array(leaves[0]) else leaves[0] for leaves in leaf_of_models]
+    _leaves, structure = leaves_and_structures[0]
+    stacked_model: T = jax.tree.unflatten(structure, stacked)
+    return stacked_model
 
 
 def structure_key(model: object) -> Hashable:

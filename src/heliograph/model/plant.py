@@ -233,12 +233,12 @@ class Plant(AbstractPlant):
         attitude: Sequence[str] = (),
         limits: StateLimitsLike = (),
     ):
+        """Check and hold x+ = f(x, u) + w: f, the laws of w and x_0, names, angles, attitudes and limits."""
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _read_initial_law(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
-        # The functions of x and u return a state, and a covariance.
         u = np.zeros(len(self.inputs))
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
         if callable(noise):
@@ -296,6 +296,7 @@ class LinearPlant(AbstractPlant):
         circular: "Sequence[str]" = (),
         limits: "StateLimitsLike" = (),
     ):
+        """Check and hold x+ = A x + B u + w: A, B and the noise, which may depend on u, and the law of x_0."""
         self.initial_mean, spread, self.deviation = _read_initial_law(initial_mean, initial_covariance, unknown=True)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
@@ -311,7 +312,6 @@ class LinearPlant(AbstractPlant):
         if not callable(B):
             B = array("input matrix", B, (n, count))
         self.inputs = names("input names", inputs, B.shape[-1] if count is None else count, "u")
-        # A, B and Cov(w), each a constant or a function of u.
         self.matrix = self._read_matrix("plant matrix", matrix, (n, n))
         self.input_matrix = self._read_matrix("input matrix", B, (n, len(self.inputs)))
         if callable(noise):
@@ -344,10 +344,9 @@ class LinearPlant(AbstractPlant):
 
 def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of the states that are rotation vectors, three for each attitude; raise unless they are so."""
-    given = [str(name) for name in items("attitude", attitude, "names")]
-    wrong = len(given) % 3 or len(set(given)) < len(given) or not set(given) <= set(states) - set(circular)
-    if wrong:
-        expected = f"three of {[name for name in states if name not in circular]} for each attitude, each once"
+    given, allowed = [str(name) for name in items("attitude", attitude, "names")], set(states) - set(circular)
+    if len(given) % 3 or len(set(given)) < len(given) or not set(given) <= allowed:
+        expected = f"three of {[name for name in states if name in allowed]} for each attitude, each once"
         raise fail("attitude", expected, given)
     return tuple(given)
 

@@ -93,10 +93,9 @@ class ReadingLimits(Module):
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
     ):
-        # Low and high limits of each of `received` numbers; values that are codes, no readings; and from how many equal
-        # readings in a row a component is stuck (None: runs are not counted).
-        pairs = read_intervals(limits, received)
-        self.low, self.high = pairs[:, 0], pairs[:, 1]
+        """Check and hold which of `received` numbers count as missing; the class says what the arguments are."""
+        intervals = read_intervals(limits, received)
+        self.low, self.high = intervals[:, 0], intervals[:, 1]
         codes = read_numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
             raise fail("invalid values", "a finite number or several", show_value(invalid))
@@ -119,9 +118,9 @@ class ReadingLimits(Module):
         if self.stuck is None:
             return ScreenedReadings(values, refused, before)
         counts, repeats = count_repeats(values, before)
-        stuck = counts >= self.stuck
-        refused = np.where(stuck, number_of_reason("stuck"), refused)
-        return ScreenedReadings(np.where(stuck, np.nan, values), refused, repeats)
+        is_stuck = counts >= self.stuck
+        refused = np.where(is_stuck, number_of_reason("stuck"), refused)
+        return ScreenedReadings(np.where(is_stuck, np.nan, values), refused, repeats)
 
     def find_refusal_reasons(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
         """Return the number of the reason for which each value by itself counts as missing; 0 where it does not.
@@ -129,10 +128,8 @@ class ReadingLimits(Module):
         A code is a value of `invalid` that stands for no reading, such as -999, also where it is beyond the limits
         (`low`, `high`). NaN is missing already.
         """
-        beyond = (z < self.low) | (z > self.high)
-        return np.where(
-            equals_code(z, self.invalid), number_of_reason("code"), np.where(beyond, number_of_reason("limits"), 0)
-        )
+        is_code, is_beyond = equals_code(z, self.invalid), (z < self.low) | (z > self.high)
+        return np.where(is_code, number_of_reason("code"), np.where(is_beyond, number_of_reason("limits"), 0))
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
         """Return True for each number that by itself counts as missing; NaN is not one of them."""
@@ -143,7 +140,7 @@ class ReadingLimits(Module):
 
         `refused`: the number of each one's reason, as `screen` returns it.
         """
-        said = []
+        descriptions = []
         for i in np.flatnonzero(refused).tolist():
             if refused[i] == number_of_reason("code"):
                 reason = "is a code"
@@ -152,8 +149,8 @@ class ReadingLimits(Module):
             else:
                 assert self.stuck is not None
                 reason = f"is stuck: {self.stuck[i]:g} equal readings in a row or more"
-            said.append(f"{names[i]} {z[i]:g} {reason}")
-        return ", ".join(said)
+            descriptions.append(f"{names[i]} {z[i]:g} {reason}")
+        return ", ".join(descriptions)
 
 
 def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
@@ -169,5 +166,5 @@ def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.nda
     with np.errstate(over="ignore"):
         single = codes.astype(np.float32).astype(np.float64)
     rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)
-    near = (np.abs(numbers - codes) <= rounding) | (numbers == single)
-    return np.asarray(near.any(axis=-1))
+    is_code = (np.abs(numbers - codes) <= rounding) | (numbers == single)
+    return np.asarray(is_code.any(axis=-1))

@@ -49,11 +49,12 @@ class RelayNetwork(Module):
     relays: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, plant: AnyPlant, sensor: AnySensor, relays: Sequence[str], slots: Sequence[Slot]):
+        """Check and hold a plant, its sensor, the relays' names, and the links of each slot of the schedule."""
         self.plant, self.sensor = plant, sensor
         self.relays = names("relays", relays, len(items("relays", relays, "names")), "relay")
-        listed = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
-        parts = [{name: table(f"links to {name!r}", links, "links") for name, links in slot.items()} for slot in listed]
-        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in parts)
+        listeners = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
+        read = [{to: table(f"links to {to!r}", links, "links") for to, links in slot.items()} for slot in listeners]
+        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in read)
         _check_linear(first(plant), first(sensor))
         if len({*self.relays, SENSOR, RECEIVER}) != len(self.relays) + 2:
             raise fail("relays", f"distinct names other than {SENSOR!r} and {RECEIVER!r}", list(self.relays))
@@ -176,14 +177,12 @@ class RelaySteps(Module):
         R numbers in all. What is sent, (y, each relay's signal), is predicted from s: y by a step of the plant, a
         relay's signal, which is of a step before, by the sensor alone; `gain` and `offset` are the links' means.
         """
-        relays = len(self.received) - 1
-        predicted = [self.sensing @ self.transition, *[self.sensing] * relays]
-        constant = np.einsum("kmn,kn->km", self.sensing, self.drift) + self.sensor_offset
-        m = self.sensing.shape[1]
-        return (
-            self.gain @ np.concatenate(predicted, axis=1),
-            np.einsum("krm,km->kr", self.gain[:, :, :m], constant) + self.offset,
-        )
+        relays, m = len(self.received) - 1, self.sensing.shape[1]
+        matrix_of_sent = np.concatenate([self.sensing @ self.transition, *[self.sensing] * relays], axis=1)
+        constant_of_y = np.einsum("kmn,kn->km", self.sensing, self.drift) + self.sensor_offset
+        B = self.gain @ matrix_of_sent
+        b = np.einsum("krm,km->kr", self.gain[:, :, :m], constant_of_y) + self.offset
+        return B, b
 
 
 class _SlotMoments(NamedTuple):
@@ -281,9 +280,9 @@ def _check_reached(network: RelayNetwork, name: str) -> None:
 
     A slot maps each receiver to its senders with their links.
     """
-    received = {sender for slot in network.slots for sender in slot.get(name, {})}  # in any slot of the schedule
-    if name == RECEIVER and not received:
+    senders = {sender for slot in network.slots for sender in slot.get(name, {})}  # in any slot of the schedule
+    if name == RECEIVER and not senders:
         raise fail("slots", "one in which somebody transmits to the receiver", "a schedule in which nobody does")
-    if not received - {name}:
-        got = "itself only" if received else "nobody"
+    if not senders - {name}:
+        got = "itself only" if senders else "nobody"
         raise fail(f"relay {name!r}", "to receive the sensor or another relay in some slot", got)

@@ -127,9 +127,10 @@ def _bound_probability_within_step(
     if not isinstance(noise, Gaussian | Contaminated):
         raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
     # A mixture of Gaussians: the logarithms of their shares, and their variances.
-    log_share, _, variance = (np.asarray(part) for part in noise.branches())
+    log_share, _mean, variance = (np.asarray(numbers) for numbers in noise.branches())
     with np.errstate(divide="ignore"):
-        return np.asarray(np.sum(np.exp(log_share) * scipy.special.erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
+        within_step = scipy.special.erf(step[:, None] / np.sqrt(8 * variance))  # of each Gaussian
+    return np.asarray(np.sum(np.exp(log_share) * within_step, axis=1))
 
 
 def longest_run_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:

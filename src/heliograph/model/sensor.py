@@ -146,6 +146,7 @@ class Sensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
+        """Check and hold y = h(x) + v, or h(x, u) + v: h, the law of v, names, angles and resolution."""
         # A function of (x, u), with a noise that may depend on u too.
         self.inputs = read_input_names(inputs)
         if self.inputs:
@@ -208,6 +209,7 @@ class LinearSensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
+        """Check and hold y = C x + v: C and the covariance of v, which may depend on u, names, resolution."""
         self.inputs = read_input_names(inputs)
         if self.inputs:
             count = count_matrix_rows(matrix, self.inputs)  # C has a row for each output

@@ -88,10 +88,10 @@ class AbstractTrigger(Module):
 
     def start(self, outputs: int) -> SenderState:
         """Return a sender that has transmitted nothing yet."""
-        nothing = jnp.zeros(outputs, dtype=int)
+        zeros = jnp.zeros(outputs, dtype=int)
         # Where y is compared with a value sent before, the first value begins.
         begun = jnp.full(outputs, not self.needs_reference)
-        return SenderState(jnp.zeros(outputs), nothing, begun, nothing, nothing)
+        return SenderState(jnp.zeros(outputs), zeros, begun, zeros, zeros)
 
     def reasons(self, sender: SenderState, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
         """Return the reason for which each component of y is sent at step k, (m,), 0 (SILENT) where it is not.
@@ -117,11 +117,13 @@ class AbstractTrigger(Module):
         """
         sent = reason > 0
         arrived = arrived & sent
-        renewed = arrived if self.reference == "acknowledged" else sent
-        reference = jnp.where(renewed, y, sender.reference) if self.needs_reference else sender.reference
-        lost = jnp.where(arrived, 0, sender.lost + (sent & ~arrived))
-        last = jnp.where(sent & ~arrived, -reason, reason)
-        return SenderState(reference, jnp.where(sent, 0, sender.age + 1), sender.begun | renewed, lost, last)
+        is_lost = sent & ~arrived
+        is_new_reference = arrived if self.reference == "acknowledged" else sent
+        reference = jnp.where(is_new_reference, y, sender.reference) if self.needs_reference else sender.reference
+        age = jnp.where(sent, 0, sender.age + 1)
+        lost = jnp.where(arrived, 0, sender.lost + is_lost)
+        signed_reason = jnp.where(is_lost, -reason, reason)
+        return SenderState(reference, age, sender.begun | is_new_reference, lost, signed_reason)
 
     def receive_if_sent(
         self, sender: SenderState, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
@@ -213,7 +215,7 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
-        # The threshold, the rule in words, and after how many silent steps it sends (None: never).
+        """Check and hold the threshold, and the silent steps after which y is sent anyway (None: it is not)."""
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = read_choice("reference", reference, Literal["sent", "acknowledged"])
@@ -242,8 +244,7 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
-        # The threshold, the rule in words, and after how many silent steps it sends (None: never). Both ends
-        # of the link compute the prediction that y is compared with.
+        """Check and hold the threshold, and the silent steps after which y is sent anyway (None: it is not)."""
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = read_choice("losses", losses, Losses), "prediction"
@@ -275,7 +276,7 @@ class StochasticTrigger(AbstractTrigger):
         reference: Literal["zero", "prediction"] = "zero",
         losses: Literal["unknown", "known"] = "unknown",
     ):
-        # The weight of the squared error, by which it is drawn whether to send: a positive number or matrix.
+        """Check and hold the weight W, a positive number or matrix, and what y is compared with."""
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
             raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
@@ -300,9 +301,8 @@ class StochasticTrigger(AbstractTrigger):
     def check_outputs(self, outputs: int) -> None:
         """Raise ValueError unless the weight of the squared error is one number or a matrix of so many components."""
         if np.ndim(self.weight) and len(self.weight) != outputs:
-            raise fail(
-                "weight of the trigger", f"a number, or shape {(outputs, outputs)}", f"shape {self.weight.shape}"
-            )
+            expected = f"a number, or shape {(outputs, outputs)}"
+            raise fail("weight of the trigger", expected, f"shape {self.weight.shape}")
 
 
 class Periodic(AbstractTrigger):
@@ -320,7 +320,7 @@ class Periodic(AbstractTrigger):
     heartbeat: None = eqx.field(static=True)
 
     def __init__(self, period: int, phase: int = 0):
-        # All of y is sent at steps `phase`, `phase` + `period`, ..., whatever its value: the reference plays no part.
+        """Check and hold period and phase; y is sent whatever its value, so that its reference plays no part."""
         if check_count("phase", phase, 0) >= check_count("period", period):
             raise fail("phase", f"a whole number below the period {period}", phase)
         self.period, self.phase = np.asarray(period), np.asarray(phase)

@@ -45,6 +45,7 @@ class LocalPlane(Module):
     height: float = eqx.field(static=True)
 
     def __init__(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike = 0.0):
+        """Check and hold the origin: latitude and longitude in degrees, and metres above the ellipsoid."""
         self.latitude = float(scalar("latitude of a local plane", latitude, -90.0, 90.0))
         self.longitude = float(scalar("longitude of a local plane", longitude, -360.0, 360.0))
         self.height = float(scalar("height of a local plane", height, -1e4, 1e9))

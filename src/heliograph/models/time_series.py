@@ -38,11 +38,12 @@ class Component(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']", inputs: Sequence[str] = ()):
-        # One input for each state, which weighs it, or none.
+        """Check and hold the name, the plant, the weights of its states and, of a regression, its inputs."""
+
         self.name = text("name of a component", name)
         self.plant = instance("plant of a component", plant, LinearPlant, "a LinearPlant")
         self.loading = array("loading of a component", loading, (len(plant.states),))
-        self.inputs = tuple(str(given) for given in items("inputs of a component", inputs, "names"))
+        self.inputs = tuple(str(name) for name in items("inputs of a component", inputs, "names"))
         if self.inputs and (len(self.inputs) != len(self.loading) or set(self.inputs) - set(plant.inputs)):
             expected = f"one of {list(plant.inputs)} for each of {len(self.loading)} states"
             raise fail("inputs of a component", expected, list(self.inputs))

@@ -24,19 +24,19 @@ def read_angles(name: str, circular: Sequence[str], names: Sequence[str]) -> tup
         circular: names of angles.
         names: all names, in the order of the components.
     """
-    given = [str(angle) for angle in items(name, circular, "names")]
-    unknown = [angle for angle in given if angle not in names]
-    if unknown or len(set(given)) < len(given):
-        raise fail(name, f"some of {list(names)}, each once", given)
-    return tuple(single for single in names if single in given)
+    angles = [str(angle) for angle in items(name, circular, "names")]
+    unknown = [angle for angle in angles if angle not in names]
+    if unknown or len(set(angles)) < len(angles):
+        raise fail(name, f"some of {list(names)}, each once", angles)
+    return tuple(component for component in names if component in angles)
 
 
 def angles_at(angles: object, size: int) -> Angles:
-    """Return the places of angles among `size` components, from a user's list of them, checked."""
-    places = array("angles", items("angles", angles, "places"), (None,)).tolist()
-    if not set(places) <= set(range(size)):
-        raise fail("angles", f"places from 0 to {size - 1}", places)
-    return tuple(map(int, places))
+    """Return the indices of angles among `size` components, from a user's list of them; ValueError of other numbers."""
+    indices = array("angles", items("angles", angles, "places"), (None,)).tolist()
+    if not set(indices) <= set(range(size)):
+        raise fail("angles", f"places from 0 to {size - 1}", indices)
+    return tuple(map(int, indices))
 
 
 def wrap_near(value: A, reference: Array, angles: Angles) -> A:
@@ -48,8 +48,8 @@ def wrap_near(value: A, reference: Array, angles: Angles) -> A:
         return value
     xp = library(value, reference)
     turns = xp.round((value - reference) / TURN)  # TURN: 2 pi
-    chosen = np.isin(np.arange(np.shape(value)[-1]), angles) & ~xp.isnan(turns)
-    unwrapped: A = xp.where(chosen, value - TURN * turns, value)
+    is_angle = np.isin(np.arange(np.shape(value)[-1]), angles)
+    unwrapped: A = xp.where(is_angle & ~xp.isnan(turns), value - TURN * turns, value)
     return unwrapped
 
 
@@ -69,9 +69,10 @@ def continue_angles(
     """
     if not angles:
         return function
-    start, size = function(center), center.shape[0]
-    turns = jnp.zeros((*start.shape, size))
+    value_at_center, size = function(center), center.shape[0]
+    D = jnp.zeros((*value_at_center.shape, size))
     for i in given:
-        slope = jax.jvp(function, (center,), (jnp.zeros_like(center).at[i].set(1.0),))[1]
-        turns = turns.at[:, i].set(jnp.round(slope))
-    return lambda x: wrap_near(function(x), start + turns @ (x - center), angles)
+        direction = jnp.zeros_like(center).at[i].set(1.0)
+        slope = jax.jvp(function, (center,), (direction,))[1]
+        D = D.at[:, i].set(jnp.round(slope))
+    return lambda x: wrap_near(function(x), value_at_center + D @ (x - center), angles)

@@ -60,10 +60,10 @@ def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
     @wraps(make, updated=())
     def share_or_make(source: S) -> T:
         """Return what was made of this object and is still in use (somebody holds it), else make it."""
-        made = in_use.get(id(source))
-        if made is None:
-            made = in_use[id(source)] = make(source)
-        return made
+        result = in_use.get(id(source))
+        if result is None:
+            result = in_use[id(source)] = make(source)
+        return result
 
     return share_or_make
 
@@ -75,15 +75,15 @@ def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
     after one in single precision the same array is single in a double one, or an index of another type than the length
     it meets.
     """
-    known = cast(Callable[P, T], cache(function))
+    cached = cast(Callable[P, T], cache(function))
 
     @wraps(function)
-    def copy_known(*args: P.args, **kwargs: P.kwargs) -> T:
+    def copy_cached(*args: P.args, **kwargs: P.kwargs) -> T:
         """Return a copy of the result for these arguments, which is computed once."""
-        arrays: T = jax.tree.map(np.copy, known(*args, **kwargs))
+        arrays: T = jax.tree.map(np.copy, cached(*args, **kwargs))
         return arrays
 
-    return copy_known
+    return copy_cached
 
 
 def _make_read_only(leaf: Any) -> None:

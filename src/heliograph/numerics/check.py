@@ -129,8 +129,8 @@ def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str
     """Return a shape in words, with an example of a table where something else came."""
     if shape == (None,):
         return "a list of numbers, such as [1, 0]"
-    free = ("rows", "columns") if len(shape) == 2 else ("any",) * len(shape)
-    lengths = ", ".join(str(free[i] if length is None else length) for i, length in enumerate(shape))
+    words = ("rows", "columns") if len(shape) == 2 else ("any",) * len(shape)  # for lengths that are free
+    lengths = ", ".join(word if length is None else str(length) for length, word in zip(shape, words, strict=True))
     example = ", such as [[1, 0]]" if len(shape) == 2 and dimensions < 2 else ""
     return f"shape ({lengths}){example}"
 
@@ -140,13 +140,14 @@ def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
 
     Names are texts; an array, or a table whose columns have numbers, has none.
     """
-    columns = getattr(table, "columns", None)
-    shown = [] if columns is None or callable(columns) else [c for c in columns if isinstance(c, str)]
-    twice = next((c for c in shown if shown.count(c) > 1), None)
-    if twice is not None:
-        raise fail(name, "distinct columns", f"{twice!r} more than once")
-    if shown != list(names) and sorted(shown) == sorted(names):
-        raise fail(name, f"columns in the order {', '.join(names)}", ", ".join(shown))
+    columns: Any = getattr(table, "columns", None)
+    is_table = columns is not None and not callable(columns)
+    texts = [column for column in columns if isinstance(column, str)] if is_table else []
+    repeated = next((column for column in texts if texts.count(column) > 1), None)
+    if repeated is not None:
+        raise fail(name, "distinct columns", f"{repeated!r} more than once")
+    if texts != list(names) and sorted(texts) == sorted(names):
+        raise fail(name, f"columns in the order {', '.join(names)}", ", ".join(texts))
 
 
 def _read_numbers(name: str, value: ArrayLike) -> Any:
@@ -337,10 +338,11 @@ def standard_deviations(matrix: np.ndarray) -> np.ndarray:
 
     A component of variance zero has the least deviation that its off-diagonal entries allow, 1 if all are zero.
     """
-    diagonal = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
-    others = np.where(diagonal > 0, diagonal, np.inf)
-    largest = np.max(np.abs(matrix) / others[..., None, :], axis=-1, initial=0.0)
-    return np.asarray(np.where(diagonal > 0, diagonal, np.where(largest > 0, largest, 1.0)))
+    deviations = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
+    divisors = np.where(deviations > 0, deviations, np.inf)  # an entry over inf is 0, and allows any deviation
+    least_allowed = np.max(np.abs(matrix) / divisors[..., None, :], axis=-1, initial=0.0)
+    of_zero_variance = np.where(least_allowed > 0, least_allowed, 1.0)
+    return np.asarray(np.where(deviations > 0, deviations, of_zero_variance))
 
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
@@ -378,14 +380,14 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
 
 def name_list(name: str, value: Names) -> list[str]:
     """Return names as a list, none of them blank; of a mapping (name to unit) its keys, each marked with its unit."""
-    listed: list[str]
+    names: list[str]
     if isinstance(value, Mapping):
-        listed = [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
+        names = [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
     else:
-        listed = [v if isinstance(v, NameWithUnit) else str(v) for v in items(name, value, "names")]
-    if not all(each.strip() for each in listed):
-        raise fail(name, "names that are not blank", show_value(list(map(str, listed))))
-    return listed
+        names = [item if isinstance(item, NameWithUnit) else str(item) for item in items(name, value, "names")]
+    if any(not single.strip() for single in names):
+        raise fail(name, "names that are not blank", show_value(list(map(str, names))))
+    return names
 
 
 def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ floating-point technique for extending the available precision (1971), for the e
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
+from math import prod
 from typing import Any, NamedTuple
 
 import jax
@@ -36,8 +37,9 @@ def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
     Source: Knuth, The art of computer programming, volume 2, theorem B of section 4.2.2.
     """
     total = a + b
-    back = total - a
-    return Compensated(total, (a - (total - back)) + (b - back))
+    b_in_total = total - a
+    a_in_total = total - b_in_total
+    return Compensated(total, (a - a_in_total) + (b - b_in_total))
 
 
 def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Callable[[Compensated], Compensated]:
@@ -68,6 +70,7 @@ class _CompensatedEvaluation:
     """Evaluation of a traced program in numbers that are high + low."""
 
     def __init__(self, unit: float):
+        """Choose splitter, type and operations for numbers of the rounding `unit`, 2^-53 of doubles."""
         bits = 1 - round(np.log2(unit))  # of a number's fraction: 24 of single precision, 53 of double
         self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # times which a number is split into halves of its digits
         self.stored = np.float32 if bits <= 24 else np.float64
@@ -96,10 +99,10 @@ class _CompensatedEvaluation:
         """Split a known real number into what the precision holds of it and the rest; others have no rest (None)."""
         if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
             return Compensated(number)
-        whole = np.asarray(number, np.float64)
-        high = whole.astype(self.stored).astype(np.float64)
-        rest = np.subtract(whole, high, out=np.zeros_like(whole), where=np.isfinite(high))
-        return Compensated(high, rest if np.any(rest) else None)
+        exact = np.asarray(number, np.float64)
+        high = exact.astype(self.stored).astype(np.float64)
+        low = np.subtract(exact, high, out=np.zeros_like(exact), where=np.isfinite(high))
+        return Compensated(high, low if np.any(low) else None)
 
     def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
         """Return the results of one operation f; of one without a rule in `rules`, f(high) + f'(high) low.
@@ -107,7 +110,8 @@ class _CompensatedEvaluation:
         A call of a program and a branch are evaluated inside.
         """
         name, params = equation.primitive.name, equation.params
-        if (program := called_program(equation)) is not None:
+        program = called_program(equation)
+        if program is not None:
             return self.evaluate_program(program, inputs)
         if name == "cond":
             return self._apply_branches(inputs, params["branches"])
@@ -121,10 +125,10 @@ class _CompensatedEvaluation:
         def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
             """Return its results; each real one gets a low part, be it 0, as all branches need the same structure."""
             results = self.evaluate_program(branch, given)
-            real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
+            are_real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
             return [
                 Compensated(jnp.asarray(x.high), _or_zero(x.low) + jnp.zeros_like(x.high)) if is_real else x
-                for x, is_real in zip(results, real, strict=True)
+                for x, is_real in zip(results, are_real, strict=True)
             ]
 
         index = jnp.asarray(inputs[0].high, np.int32)
@@ -150,19 +154,19 @@ class _CompensatedEvaluation:
     def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
         """Return q = fl(a / b) and its low part: the remainder a - q b, with the low parts of a and b, over b.
 
-        The product q b, too, is rounded: `back` is fl(q b), and its error is taken off.
+        The product q b is rounded, too: its error is taken off.
         """
         quotient = a.high / b.high
-        back = quotient * b.high
-        lost = None if b.low is None else -quotient * b.low
-        rest = _sum_terms_present((a.high - back) - _or_zero(self._find_product_error(quotient, b.high)), a.low, lost)
-        return Compensated(quotient, rest / b.high)
+        rounded_product = quotient * b.high
+        by_low_of_b = None if b.low is None else -quotient * b.low
+        remainder = (a.high - rounded_product) - _or_zero(self._find_product_error(quotient, b.high))
+        return Compensated(quotient, _sum_terms_present(remainder, a.low, by_low_of_b) / b.high)
 
     def _take_root(self, a: Compensated, **_: Any) -> Compensated:
         """Return r = fl(sqrt(a)) and its low part: the remainder a - r^2, with the low part of a, over 2 r."""
         root = jnp.sqrt(a.high)
-        rest = _sum_terms_present((a.high - root * root) - _or_zero(self._find_product_error(root, root)), a.low)
-        return Compensated(root, rest / (2 * root))
+        remainder = (a.high - root * root) - _or_zero(self._find_product_error(root, root))
+        return Compensated(root, _sum_terms_present(remainder, a.low) / (2 * root))
 
     def _square(self, a: Compensated, **_: Any) -> Compensated:
         """Multiply a number by itself."""
@@ -170,27 +174,29 @@ class _CompensatedEvaluation:
 
     def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
         """Return a^y as y - 1 products; the reciprocal of a^-y for y < 0, 1 for y = 0."""
-        if y < 1:
-            return self._divide(Compensated(np.ones(())), self._raise_to_integer(a, y=-y)) if y else _one_like(a)
+        if y == 0:
+            return _one_like(a)
+        if y < 0:
+            return self._divide(Compensated(np.ones(())), self._raise_to_integer(a, y=-y))
         return reduce(self._multiply, [a] * y)
 
     def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
         """Add the entries along axes, one after another, with what rounding loses; of no entries the sum is 0."""
         for axis in sorted(axes, reverse=True):
-            parts = _split_along_axis(a, axis)
-            a = reduce(self._add, parts) if parts else Compensated(jnp.sum(a.high, axis=axis))
+            entries = _split_along_axis(a, axis)
+            a = reduce(self._add, entries) if entries else Compensated(jnp.sum(a.high, axis=axis))
         return a
 
     def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
         """Return the running sums along an axis, from its first entry on or from its last, with what rounding loses."""
-        parts = _split_along_axis(a, axis)
+        sums = _split_along_axis(a, axis)  # the entries at first
         if reverse:
-            for i in reversed(range(len(parts) - 1)):
-                parts[i] = self._add(parts[i + 1], parts[i])
+            for i in reversed(range(len(sums) - 1)):
+                sums[i] = self._add(sums[i + 1], sums[i])
         else:
-            for i in range(1, len(parts)):
-                parts[i] = self._add(parts[i - 1], parts[i])
-        highs, lows = [p.high for p in parts], [_or_zero(p.low) + jnp.zeros_like(p.high) for p in parts]
+            for i in range(1, len(sums)):
+                sums[i] = self._add(sums[i - 1], sums[i])
+        highs, lows = [s.high for s in sums], [_or_zero(s.low) + jnp.zeros_like(s.high) for s in sums]
         return Compensated(jnp.stack(highs, axis), jnp.stack(lows, axis))
 
     def _multiply_matrices(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
@@ -228,14 +234,14 @@ class _CompensatedEvaluation:
 
         Source: Dekker, A floating-point technique for extending the available precision (1971).
         """
-        if not isinstance(a, jax.Array):
-            whole: Any = np.asarray(a, self.stored)
-            far = whole * self.stored(self.splitter)
-            high = far - (far - whole)
-            return high.astype(np.float64), (whole - high).astype(np.float64)
-        far = a * self.splitter
-        high = far - (far - a)
-        return high, a - high
+        if isinstance(a, jax.Array):
+            far = a * self.splitter
+            upper_half = far - (far - a)
+            return upper_half, a - upper_half
+        known: Any = np.asarray(a, self.stored)
+        far = known * self.stored(self.splitter)
+        upper_half = far - (far - known)
+        return upper_half.astype(np.float64), (known - upper_half).astype(np.float64)
 
 
 def _apply_unchanged(equation: JaxprEqn, *arguments: Any) -> Any:
@@ -258,10 +264,10 @@ def _apply_to_first_order(
     """
     with_low = [i for i, x in enumerate(inputs) if x.low is not None]
 
-    def call_with(*replaced: Any) -> Any:
-        """Return f (`function`) of the high parts, with these values for the inputs that have a low part."""
+    def call_with(*values: Any) -> Any:
+        """Return f (`function`) of the high parts, with these values in place of those that have a low part."""
         arguments = [x.high for x in inputs]
-        for i, value in zip(with_low, replaced, strict=True):
+        for i, value in zip(with_low, values, strict=True):
             arguments[i] = value
         return function(*arguments)
 
@@ -290,15 +296,16 @@ def _scales_without_rounding(a: Any) -> bool:
     """
     if isinstance(a, jax.Array | jax.core.Tracer):
         return False
-    # frexp's mantissa is from 0.5 to 1, and 0.5 of a power of two.
-    return bool(np.all((np.abs(np.frexp(a)[0]) == 0.5) | (np.asarray(a) == 0)))
+    mantissa, _ = np.frexp(a)  # from 0.5 to 1, and 0.5 of a power of two
+    return bool(np.all((np.abs(mantissa) == 0.5) | (np.asarray(a) == 0)))
 
 
 def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
     """Return the entries along an axis, each with its low part, or None if there is none of the whole."""
     count = jnp.shape(a.high)[axis]
-    parts = [[None] * count if x is None else [_take(x, i, axis) for i in range(count)] for x in a]
-    return [Compensated(high, low) for high, low in zip(*parts, strict=True)]
+    highs = [_take(a.high, i, axis) for i in range(count)]
+    lows = [None if a.low is None else _take(a.low, i, axis) for i in range(count)]
+    return [Compensated(high, low) for high, low in zip(highs, lows, strict=True)]
 
 
 def _take(x: Any, i: int, axis: int) -> Any:
@@ -313,12 +320,12 @@ def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int],
     are its axes of these kinds; of each kind the axes become one.
     """
     shape = jnp.shape(a.high)
-    rest = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
-    sizes = [int(np.prod([shape[axis] for axis in axes], dtype=int)) for axes in (batch, summed, rest)]
-    sizes = [*sizes, 1] if left else [*sizes[:2], 1, sizes[2]]
-    order = [*batch, *summed, *rest]
-    parts = [None if x is None else x.transpose(order).reshape(sizes) for x in map(_as_array, a)]
-    return Compensated(*parts)
+    others = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]  # rows, or columns
+    batch_size, summed_size, size = (prod(shape[axis] for axis in axes) for axes in (batch, summed, others))
+    new_shape = (batch_size, summed_size, size, 1) if left else (batch_size, summed_size, 1, size)
+    order = [*batch, *summed, *others]
+    high, low = (None if x is None else x.transpose(order).reshape(new_shape) for x in map(_as_array, a))
+    return Compensated(high, low)
 
 
 def _as_array(x: Any) -> Any:

@@ -33,12 +33,13 @@ def wilson(hits: float, of: float) -> Share:
     """
     if not of:
         return Share(float("nan"), 0.0, 1.0)
-    z = float(scipy.special.ndtri(0.975))  # 1.96
-    p = hits / of
-    middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
-    half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
+    n, z = of, float(scipy.special.ndtri(0.975))  # z = 1.96
+    p = hits / n
+    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half_width = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     # The ends are exactly 0 of no hits and 1 of hits alone, which rounding would miss.
-    low, high = 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half)
+    low = 0.0 if hits == 0 else float(middle - half_width)
+    high = 1.0 if hits == n else float(middle + half_width)
     return Share(estimate=p, low=low, high=high)
 
 
@@ -47,10 +48,12 @@ def count_independent(values: Float[np.ndarray, " time"]) -> float:
 
     A negative correlation counts as none, so that it is never more than N; nor is it less than 1.
     """
-    deviations = values - np.mean(values)
-    power = float(np.sum(deviations**2))
-    a = np.clip(np.sum(deviations[1:] * deviations[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0
-    return max(float(len(values) * (1 - a) / (1 + a)), 1.0)
+    deviations, count = values - np.mean(values), len(values)
+    sum_of_squares = float(np.sum(deviations**2))
+    a = 0.0
+    if sum_of_squares and count > 2:
+        a = np.clip(np.sum(deviations[1:] * deviations[:-1]) / sum_of_squares, 0.0, 0.999)
+    return max(float(count * (1 - a) / (1 + a)), 1.0)
 
 
 def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
@@ -73,5 +76,7 @@ def round_to(value: float, error: float) -> str:
     """Return a number as text to two digits of its standard error, to four digits where there is no error above 0."""
     if not (np.isfinite(value) and 0 < error < np.inf):
         return f"{value:.4g}"
-    places = 1 - int(np.floor(np.log10(error)))  # behind the point; negative: tens, hundreds
-    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
+    decimals = 1 - int(np.floor(np.log10(error)))  # digits behind the point; below 0 tens or hundreds are rounded to
+    if not -6 <= decimals <= 9:
+        return f"{value:.4g}"
+    return f"{round(value, decimals):.{max(decimals, 0)}f}"

@@ -110,7 +110,8 @@ def to_numpy(tree: PyTree) -> PyTree:
         """Return one leaf: a known array of numbers as NumPy's, anything else (a traced one, random keys) as it is."""
         if isinstance(leaf, jax.core.Tracer) or not isinstance(leaf, jax.Array):
             return leaf
-        return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.extended) else np.asarray(leaf)
+        holds_random_keys = jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
+        return leaf if holds_random_keys else np.asarray(leaf)
 
     return jax.tree.map(convert, tree)
 
@@ -151,11 +152,11 @@ def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
     if kind.__module__.split(".")[0] == __name__.split(".")[0]:
         return
     for name in names:
-        written = vars(kind).get(name)
-        if isinstance(written, property) and written.fget is not None:
-            type.__setattr__(kind, name, property(_compute_known_in_float64(written.fget), doc=written.__doc__))
-        elif callable(written):
-            type.__setattr__(kind, name, _compute_known_in_float64(written))
+        member = vars(kind).get(name)
+        if isinstance(member, property) and member.fget is not None:
+            type.__setattr__(kind, name, property(_compute_known_in_float64(member.fget), doc=member.__doc__))
+        elif callable(member):
+            type.__setattr__(kind, name, _compute_known_in_float64(member))
 
 
 def _compute_known_in_float64(function: Callable[P, R]) -> Callable[P, R]:

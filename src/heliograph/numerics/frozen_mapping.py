@@ -11,6 +11,7 @@ class FrozenMapping(Mapping[K, V], Generic[K, V]):
     """A mapping with a hash, of hashable keys and values; equal to any mapping with the same items."""
 
     def __init__(self, items: Mapping[K, V]):
+        """Hold a copy of these items, which nothing changes."""
         self._items = dict(items)
 
     def __getitem__(self, key: K) -> V:

@@ -34,10 +34,11 @@ def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
     scale = xp.where(deviation > 0, 1 / xp.where(deviation > 0, deviation, 1.0), 0.0)  # 1 / deviation, 0 for rows of 0
     # A^+ = D V L^+ V' D of the correlation matrix D A D = V L V', D the scale.
     correlation = scale[:, None] * a * scale
-    values, vectors = np.linalg.eigh(correlation) if xp is np else eigh(correlation)
-    used = values > tolerance * values[-1]
-    scaled_vectors = scale[:, None] * vectors
-    solution: A = (scaled_vectors * xp.where(used, 1 / xp.where(used, values, 1.0), 0.0)) @ (scaled_vectors.T @ b)
+    eigenvalues, vectors = np.linalg.eigh(correlation) if xp is np else eigh(correlation)
+    is_used = eigenvalues > tolerance * eigenvalues[-1]
+    scaled_vectors = scale[:, None] * vectors  # D V
+    inverse_eigenvalues = xp.where(is_used, 1 / xp.where(is_used, eigenvalues, 1.0), 0.0)
+    solution: A = (scaled_vectors * inverse_eigenvalues) @ (scaled_vectors.T @ b)
     return solution
 
 

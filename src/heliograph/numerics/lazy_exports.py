@@ -25,16 +25,16 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
 
     A name's module is imported when the name is first asked for.
     """
-    load, listed, names = lazy_loader.attach_stub(package, file)
+    load, list_names, names = lazy_loader.attach_stub(package, file)
 
-    def attribute(name: str) -> object:
+    def load_attribute(name: str) -> object:
         """Return the object of a public name, imported; raise with the names most like it where there is none."""
         if name in names or name.startswith("_"):
             with pause_collector():
                 return load(name)
         raise AttributeError(f"{package} has no attribute {name!r}{suggest_names(name, _list_public(package, names))}")
 
-    return attribute, listed, names
+    return load_attribute, list_names, names
 
 
 def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | None = None) -> NoReturn:
@@ -67,15 +67,17 @@ def list_closest_names(name: str, known: Mapping[str, str]) -> list[str]:
     First the one that others call so (MEANT), then those alike by their letters (ALIKE is the least likeness of
     difflib's), then those that contain it.
     """
-    plain: dict[str, str] = {}
-    for public, shown in known.items():
-        plain.setdefault(_strip_name(public), shown)
+    by_stripped_name: dict[str, str] = {}
+    for public_name, shown_name in known.items():
+        by_stripped_name.setdefault(_strip_name(public_name), shown_name)
     stripped = _strip_name(name)
-    meant = [candidate for candidate in plain if candidate == MEANT.get(stripped)]
-    alike = get_close_matches(stripped, plain, MOST, ALIKE)
-    is_long_enough = len(name) > 2  # one or two letters are in many names
-    containing = [candidate for candidate in plain if is_long_enough and stripped in candidate]  # kalman: kalman_filter
-    return [plain[candidate] for candidate in dict.fromkeys([*meant, *alike, *containing])][:MOST]
+    synonyms = [candidate for candidate in by_stripped_name if candidate == MEANT.get(stripped)]
+    alike = get_close_matches(stripped, by_stripped_name, n=MOST, cutoff=ALIKE)
+    containing = []  # as kalman_filter contains kalman
+    if len(name) > 2:  # one or two letters are in many names
+        containing = [candidate for candidate in by_stripped_name if stripped in candidate]
+    each_once = dict.fromkeys([*synonyms, *alike, *containing])
+    return [by_stripped_name[candidate] for candidate in each_once][:MOST]
 
 
 def _strip_name(name: str) -> str:

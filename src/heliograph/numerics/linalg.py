@@ -67,17 +67,17 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     that is 0. A pivot is judged by the component's own diagonal entry: units do not decide what is singular. More than
     WRITTEN columns are a loop, so that the program stays short.
     """
-    n, left, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
+    n, remainder, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
     if not 0 < n <= WRITTEN:
         return _factor_in_loop(a)
     growth = jnp.zeros((), a.dtype)  # the largest ratio so far of a diagonal entry of A to its pivot
     for j in range(n):
-        scales.append(compute_pivot_reciprocal_root(left[0, 0], a[j, j], growth))
+        scales.append(compute_pivot_reciprocal_root(remainder[0, 0], a[j, j], growth))
         growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
-        column = left[:, 0] * scales[j]
+        column = remainder[:, 0] * scales[j]
         columns.append(jnp.concatenate([jnp.zeros(j, a.dtype), column]))
         # The Schur complement of the pivot.
-        left = left[1:, 1:] - outer(column[1:], column[1:])
+        remainder = remainder[1:, 1:] - outer(column[1:], column[1:])
     return jnp.stack(columns, axis=1), jnp.stack(scales)
 
 
@@ -91,13 +91,13 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         `whole` is the matrix's diagonal, by which a pivot is judged, a scale the reciprocal root of a pivot, and
         `growth` the largest ratio so far of an entry of `whole` to its pivot.
         """
-        left, lower, scales, growth = carry
-        scale = compute_pivot_reciprocal_root(left[j, j], whole[j], growth)
-        column = jnp.where(np.arange(n) >= j, left[:, j] * scale, 0.0)
+        remainder, lower, scales, growth = carry
+        scale = compute_pivot_reciprocal_root(remainder[j, j], whole[j], growth)
+        column = jnp.where(np.arange(n) >= j, remainder[:, j] * scale, 0.0)
         growth = jnp.maximum(growth, whole[j] * scale * scale)
-        here = np.arange(n) == j
-        lower, scales = jnp.where(here, column[:, None], lower), jnp.where(here, scale, scales)
-        return left - outer(column, column), lower, scales, growth
+        is_column_j = np.arange(n) == j
+        lower, scales = jnp.where(is_column_j, column[:, None], lower), jnp.where(is_column_j, scale, scales)
+        return remainder - outer(column, column), lower, scales, growth
 
     start = a, jnp.zeros_like(a), jnp.zeros_like(whole), jnp.zeros((), a.dtype)
     _, lower, scales, _ = lax.fori_loop(0, n, eliminate, start) if n else start
@@ -113,7 +113,8 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
     """
     is_zero_or_more = pivot >= -negative_tolerance(pivot, growth) * whole
     if_not_positive = jnp.where(is_zero_or_more, jnp.inf, jnp.nan)
-    return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, if_not_positive))
+    is_positive = pivot > rounding(PIVOT_TOLERANCE, pivot) * whole
+    return 1 / jnp.sqrt(jnp.where(is_positive, pivot, if_not_positive))
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
@@ -154,8 +155,8 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
         # L Y = B, then L' X = Y. L' is upper; with its rows and columns in reverse order it is lower, as Y and X then
         # are upside down.
         y = _substitute(lower, scales, jnp.asarray(b)) * scales[:, None]
-        upside_down = _substitute(lower.T[::-1, ::-1], scales[::-1], y[::-1])
-        return jnp.asarray(upside_down[::-1] * scales[:, None])
+        reversed_numerators = _substitute(lower.T[::-1, ::-1], scales[::-1], y[::-1])
+        return jnp.asarray(reversed_numerators[::-1] * scales[:, None])
 
     return solve
 
@@ -166,17 +167,18 @@ def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
 
     Y_i is numerator i times `scales`, the reciprocals of L's diagonal (n,). Above WRITTEN rows it is a loop.
     """
-    n, left, numerators = len(b), b, list[jax.Array]()
+    n, remainder, numerators = len(b), b, list[jax.Array]()
 
-    def take_off(j: jax.Array, rest: jax.Array) -> jax.Array:
-        """Take row j of Y, times its entries of L, off the rows below it."""
-        return jnp.where((np.arange(n) > j)[:, None], rest - outer(lower[:, j], rest[j] * scales[j]), rest)
+    def take_off(j: jax.Array, rows: jax.Array) -> jax.Array:
+        """Take row j of Y, which is `rows[j] * scales[j]`, times its entries of L, off the rows below it."""
+        is_below = (np.arange(n) > j)[:, None]
+        return jnp.where(is_below, rows - outer(lower[:, j], rows[j] * scales[j]), rows)
 
     if not 0 < n <= WRITTEN:
         return jnp.asarray(lax.fori_loop(0, n, take_off, b) if n else b)
     for j in range(n):
-        numerators.append(left[0])
-        left = left[1:] - outer(lower[j + 1 :, j], left[0] * scales[j])
+        numerators.append(remainder[0])
+        remainder = remainder[1:] - outer(lower[j + 1 :, j], remainder[0] * scales[j])
     return jnp.stack(numerators)
 
 
@@ -226,5 +228,6 @@ def find_not_finite(values: np.ndarray, axes: int) -> np.ndarray:
     with np.errstate(all="ignore"):
         if np.isfinite(np.sum(values)):
             return np.zeros(values.shape[: values.ndim - axes], dtype=bool)
-    lost: np.ndarray = ~np.isfinite(values).all(axis=tuple(range(-axes, 0)))
-    return lost
+    last_axes = tuple(range(-axes, 0))
+    not_finite: np.ndarray = ~np.isfinite(values).all(axis=last_axes)
+    return not_finite

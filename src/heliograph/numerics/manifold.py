@@ -47,14 +47,14 @@ class Manifold(NamedTuple):
         `rotations` are the places of their components, three after three.
         """
         for i in range(0, len(self.rotations), 3):
-            places = np.array(self.rotations[i : i + 3])  # of one rotation vector
+            columns = np.array(self.rotations[i : i + 3])  # of one rotation vector
             x, y = (v if np.shape(v) == np.shape(whole) else v + np.zeros(np.shape(whole)) for v in (x, y))
-            vector = make(x[..., places], y[..., places])
+            vector = make(x[..., columns], y[..., columns])
             if isinstance(whole, jax.Array) or isinstance(vector, jax.Array):
-                whole = jnp.asarray(whole).at[..., places].set(vector)
+                whole = jnp.asarray(whole).at[..., columns].set(vector)
             else:
                 whole = whole.copy()
-                whole[..., places] = vector
+                whole[..., columns] = vector
         return whole
 
     def near(self, x: A, reference: Array) -> A:
@@ -81,8 +81,9 @@ class Manifold(NamedTuple):
         continued = continue_angles(function, center, self.angles, self.angles)
         if not self.rotations:
             return continued
-        inside, m = self.chart(continued, center), function(center) if middle is None else middle
-        return lambda x: self.unsettle(m, inside(x))
+        in_chart = self.chart(continued, center)
+        m = function(center) if middle is None else middle
+        return lambda x: self.unsettle(m, in_chart(x))
 
     def settle(self, center: Array, x: Array) -> Any:
         """Return the state whose change from `center` is x - center, (..., n); angles stay as they are."""
@@ -102,8 +103,8 @@ class Manifold(NamedTuple):
             return None
         matrix = jnp.eye(len(change), dtype=change.dtype)
         for i in range(0, len(self.rotations), 3):
-            places = np.array(self.rotations[i : i + 3])  # of one rotation vector
-            turned = change[places]
-            block = jax.jacfwd(lambda d, turned=turned: turn_between(d, turned))(turned)
-            matrix = matrix.at[places[:, None], places].set(block)
+            columns = np.array(self.rotations[i : i + 3])  # of one rotation vector
+            rotation = change[columns]
+            block = jax.jacfwd(lambda d, rotation=rotation: turn_between(d, rotation))(rotation)
+            matrix = matrix.at[columns[:, None], columns].set(block)
         return matrix

@@ -13,10 +13,10 @@ def fill_masked(value: Any) -> Any:
     in columns of tables.
     """
     if isinstance(value, list | tuple):
-        if any(isinstance(part, np.ma.MaskedArray) for part in value):
-            value = np.ma.array([np.nan if part is np.ma.masked else part for part in value])
-        elif all(is_absent(part) or isinstance(part, Real) for part in value):
-            return [np.nan if is_absent(part) else part for part in value]
+        if any(isinstance(item, np.ma.MaskedArray) for item in value):
+            value = np.ma.array([np.nan if item is np.ma.masked else item for item in value])
+        elif all(is_absent(item) or isinstance(item, Real) for item in value):
+            return [np.nan if is_absent(item) else item for item in value]
     if isinstance(value, np.ma.MaskedArray):
         return _fill_array(np.asarray(value), np.ma.getmaskarray(value))
     if hasattr(value, "to_numpy"):  # a column of a table, or several
@@ -33,9 +33,10 @@ def _fill_array(numbers: np.ndarray, masked: np.ndarray) -> np.ndarray:
     if kind == "M":  # dates
         return np.where(masked, np.array("NaT", numbers.dtype), numbers)
     if kind == "O":  # any objects: numbers if all that is not absent are
-        absent = np.array([is_absent(part) for part in numbers.flat], dtype=bool)
+        absent = np.array([is_absent(entry) for entry in numbers.flat], dtype=bool)
         filled = np.where(masked | absent.reshape(numbers.shape), np.nan, numbers)
-        return filled.astype(np.float64) if all(isinstance(part, Real) for part in filled.flat) else filled
+        holds_numbers_alone = all(isinstance(entry, Real) for entry in filled.flat)
+        return filled.astype(np.float64) if holds_numbers_alone else filled
     if kind not in "fiub" or not masked.any():  # no real numbers, or none masked
         return numbers
     return np.where(masked, np.nan, numbers.astype(np.float64))

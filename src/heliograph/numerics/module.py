@@ -117,13 +117,14 @@ def _write_repr(self: object) -> str:
 
     A part is an entry or a field; DEPTH is how far parts of parts are shown.
     """
-    whole = format_on_one_line(self, DEPTH)
-    if len(whole) <= WIDTH:
-        return whole
-    parts = [f"  {name}={format_on_one_line(value, DEPTH - 1)}" for name, value in islice(_list_parts(self), LINES - 2)]
-    left = sum(1 for _ in _list_parts(self)) - len(parts)
-    more = [f"  … {left} more"] if left else []
-    return "\n".join([f"{type(self).__name__}(", *(cut(text) for text in (*parts, *more)), ")"])
+    one_line = format_on_one_line(self, DEPTH)
+    if len(one_line) <= WIDTH:
+        return one_line
+    parts = list(_list_parts(self))
+    lines = [f"  {name}={format_on_one_line(value, DEPTH - 1)}" for name, value in parts[: LINES - 2]]
+    if len(parts) > len(lines):
+        lines.append(f"  … {len(parts) - len(lines)} more")
+    return "\n".join([f"{type(self).__name__}(", *map(cut, lines), ")"])
 
 
 def _html(self: object) -> str:
@@ -186,10 +187,11 @@ def _list_parts(value: object) -> Iterable[tuple[str, object]]:
     if isinstance(value, Mapping):
         return ((repr(key), entry) for key, entry in value.items())
     if is_dataclass(value):
-        named = ((field.name, getattr(value, field.name, None)) for field in fields(value) if field.repr)
+        attributes = ((field.name, getattr(value, field.name, None)) for field in fields(value) if field.repr)
     else:
-        named = ((name, getattr(value, name)) for name in getattr(value, "_fields", getattr(value, "__dict__", {})))
-    return ((name, entry) for name, entry in named if not name.startswith("_"))
+        names = getattr(value, "_fields", getattr(value, "__dict__", {}))  # of a named tuple, or of any object
+        attributes = ((name, getattr(value, name)) for name in names)
+    return ((name, entry) for name, entry in attributes if not name.startswith("_"))
 
 
 def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
@@ -234,11 +236,11 @@ def _format_table(value: object, depth: int) -> str:
 
 def _list_entries(value: object) -> Iterable[tuple[str, object]]:
     """Yield the first LARGE parts (entries or fields) of an object by name, and how many more there are."""
-    entries = _list_parts(value)
+    entries = iter(_list_parts(value))
     yield from islice(entries, LARGE)
-    left = sum(1 for _ in entries)
-    if left:
-        yield "…", f"{left} more"
+    remaining_count = sum(1 for _ in entries)
+    if remaining_count:
+        yield "…", f"{remaining_count} more"
 
 
 def _format_cell(value: object, depth: int) -> str:
@@ -247,5 +249,7 @@ def _format_cell(value: object, depth: int) -> str:
     Not below the last depth (0).
     """
     text = escape(cut(format_on_one_line(value, depth)))
-    opens = _is_ours(value) or (isinstance(value, Mapping) and value)
-    return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>" if opens and depth > 0 else text
+    has_parts = _is_ours(value) or (isinstance(value, Mapping) and value)
+    if not has_parts or depth <= 0:
+        return text
+    return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>"

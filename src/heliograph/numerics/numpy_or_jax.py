@@ -45,13 +45,16 @@ def find_rounded_to_single(value: object) -> tuple[float, float] | None:
         return None
     finite = numbers[np.isfinite(numbers)].astype(float)
     with np.errstate(over="ignore", under="ignore"):
-        single = finite.astype(np.float32)
-    meant = single.astype(str).astype(float)  # by way of the shortest decimal
+        as_single = finite.astype(np.float32)
+    as_written = as_single.astype(str).astype(float)  # the shortest decimal that single precision takes for it
     # A number has more than MEANT_BITS bits if its mantissa, times 2 to that power, is no whole number.
-    scaled_mantissa = np.frexp(finite)[0] * 2.0**MEANT_BITS
-    has_many_bits = scaled_mantissa != np.floor(scaled_mantissa)
-    (rounded,) = np.nonzero((single == finite) & (meant != finite) & has_many_bits)
-    return (float(meant[rounded[0]]), float(finite[rounded[0]])) if len(rounded) else None
+    mantissa, _ = np.frexp(finite)
+    has_many_bits = mantissa * 2.0**MEANT_BITS != np.floor(mantissa * 2.0**MEANT_BITS)
+    (indices,) = np.nonzero((as_single == finite) & (as_written != finite) & has_many_bits)
+    if not len(indices):
+        return None
+    first = indices[0]
+    return float(as_written[first]), float(finite[first])
 
 
 def warn_of_single(name: str, value: object) -> None:
@@ -81,15 +84,15 @@ def _warn_once(text: str) -> None:
 def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[Any], tuple[int, ...]]:
     """Trace a function in double precision; return the arrays that it holds as constants, and its result's shape."""
     with jax.enable_x64(True):
-        made = jax.make_jaxpr(lambda *values: as_real(function(*values)))(*arguments)
-    shape: tuple[int, ...] = made.out_avals[0].shape
-    return list(made.consts), shape
+        program = jax.make_jaxpr(lambda *values: as_real(function(*values)))(*arguments)
+    shape: tuple[int, ...] = program.out_avals[0].shape
+    return list(program.consts), shape
 
 
 def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
     """Return the shape of a function's result, traced in double precision; warn of arrays it holds in single one."""
-    held, shape = constants(function, *arguments)
-    for constant in held:
+    constants_of_function, shape = constants(function, *arguments)
+    for constant in constants_of_function:
         if isinstance(constant, jax.Array):
             warn_of_single(name, constant)
     return shape
@@ -154,11 +157,13 @@ def block_diagonal(blocks: Sequence[Any]) -> Any:
     """
     if is_traced(blocks):
         return jax.scipy.linalg.block_diag(*blocks)
-    rows, columns = (np.cumsum([0, *(block.shape[axis] for block in blocks)]) for axis in (0, 1))
-    whole = np.zeros((rows[-1], columns[-1]))
-    for block, top, left in zip(blocks, rows, columns, strict=False):
-        whole[top : top + block.shape[0], left : left + block.shape[1]] = block
-    return whole
+    # The first row and column of each block, and behind them the size of the whole.
+    *tops, height = np.cumsum([0, *(block.shape[0] for block in blocks)])
+    *lefts, width = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    matrix = np.zeros((height, width))
+    for block, top, left in zip(blocks, tops, lefts, strict=True):
+        matrix[top : top + block.shape[0], left : left + block.shape[1]] = block
+    return matrix
 
 
 def is_zero(value: Any) -> bool:

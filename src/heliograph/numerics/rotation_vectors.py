@@ -36,11 +36,13 @@ def quaternion_of(r: Array) -> Any:
     """
     xp = _library(r)
     s = xp.sum(r * r, axis=-1, keepdims=True)  # |r|^2
-    near = s < SMALL
-    half = xp.sqrt(xp.where(near, 1.0, s)) / 2
-    cosine = xp.where(near, 1 - s / 8 * (1 - s / 48 * (1 - s / 120)), xp.cos(half))
-    share = xp.where(near, (1 - s / 24 * (1 - s / 80 * (1 - s / 168))) / 2, xp.sin(half) / (2 * half))
-    return xp.concatenate([cosine, share * r], axis=-1)
+    is_small = s < SMALL
+    half_angle = xp.sqrt(xp.where(is_small, 1.0, s)) / 2
+    cosine_by_series = 1 - s / 8 * (1 - s / 48 * (1 - s / 120))
+    cosine = xp.where(is_small, cosine_by_series, xp.cos(half_angle))
+    factor_by_series = (1 - s / 24 * (1 - s / 80 * (1 - s / 168))) / 2
+    factor = xp.where(is_small, factor_by_series, xp.sin(half_angle) / (2 * half_angle))  # sin(|r| / 2) / |r|
+    return xp.concatenate([cosine, factor * r], axis=-1)
 
 
 def rotation_vector_of(q: Array) -> Any:
@@ -51,13 +53,13 @@ def rotation_vector_of(q: Array) -> Any:
     xp = _library(q)
     q = xp.where(q[..., :1] < 0, -q, q)
     w, v = q[..., :1], q[..., 1:]
-    s = xp.sum(v * v, axis=-1, keepdims=True)
-    near = s < SMALL * w * w
-    # r = 2 atan2(|v|, w) v / |v|, by the series of atan(t) / t with t = |v| / w where t is small.
-    size, along = xp.sqrt(xp.where(near, 1.0, s)), xp.where(near, w, 1.0)
-    t = xp.where(near, s, 0.0) / (along * along)
-    series = (1 - t * (1 / 3 - t * (1 / 5 - t * (1 / 7 - t / 9)))) / along
-    return 2 * v * xp.where(near, series, xp.arctan2(size, w) / size)
+    s = xp.sum(v * v, axis=-1, keepdims=True)  # |v|^2
+    is_small = s < SMALL * w * w
+    # r = 2 atan2(|v|, w) v / |v|; where t = (|v| / w)^2 is small, by the series of the arc tangent, over w.
+    length, w_if_small = xp.sqrt(xp.where(is_small, 1.0, s)), xp.where(is_small, w, 1.0)
+    t = xp.where(is_small, s, 0.0) / (w_if_small * w_if_small)
+    series = (1 - t * (1 / 3 - t * (1 / 5 - t * (1 / 7 - t / 9)))) / w_if_small
+    return 2 * v * xp.where(is_small, series, xp.arctan2(length, w) / length)
 
 
 def multiply_quaternions(q: Array, p: Array) -> Any:

@@ -157,15 +157,15 @@ def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, "
     """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j, X before them."""
     # Words of no bits inform of nothing, and have no finite noise 1 / j.
     sends = j > 0
-    a, q, c = senders.transition, senders.process, senders.rows[sends]
+    A, Q, C = senders.transition, senders.process, senders.rows[sends]
     if not sends.any():
-        open_loop: np.ndarray = solve_discrete_lyapunov(a, q)
+        open_loop: np.ndarray = solve_discrete_lyapunov(A, Q)
         return open_loop
-    noise = np.diag(1 / j[sends])
-    before = solve_discrete_are(a.T, c.T, q, noise)
-    gain = np.linalg.solve(c @ before @ c.T + noise, c @ before).T
-    after: np.ndarray = before - gain @ c @ before
-    symmetric: np.ndarray = (after + after.T) / 2
+    R = np.diag(1 / j[sends])
+    X = solve_discrete_are(A.T, C.T, Q, R)
+    gain = np.linalg.solve(C @ X @ C.T + R, C @ X).T
+    P: np.ndarray = X - gain @ C @ X
+    symmetric: np.ndarray = (P + P.T) / 2
     return symmetric
 
 
@@ -180,12 +180,13 @@ def _compute_error_slopes(senders: _PlantAndSenders, j: Float[np.ndarray, " send
     P is the covariance after the words and M = (I - K C) A = P X^-1 A moves the error of one step to the next, X being
     the covariance before the words.
     """
-    p = _compute_steady_covariance(senders, j)
-    before = senders.transition @ p @ senders.transition.T + senders.process
-    m = p @ np.linalg.pinv(before) @ senders.transition
-    y = solve_discrete_lyapunov(m.T, np.eye(len(m)))
-    # Row i of `rows @ p` is c_i' P, so that the sum is (c_i' P) Y (P c_i).
-    slopes: np.ndarray = -np.einsum("in,nk,im,mk->i", senders.rows @ p, y, senders.rows @ p, np.eye(len(p)))
+    A, Q = senders.transition, senders.process
+    P = _compute_steady_covariance(senders, j)
+    X = A @ P @ A.T + Q
+    M = P @ np.linalg.pinv(X) @ A
+    Y = solve_discrete_lyapunov(M.T, np.eye(len(M)))
+    rows_of_P = senders.rows @ P  # row i is c_i' P
+    slopes: np.ndarray = -np.einsum("in,nk,ik->i", rows_of_P, Y, rows_of_P)
     return slopes
 
 
@@ -224,10 +225,10 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
     j, bound = np.zeros(len(hulls)), -np.inf
     for k in range(STEPS):
         slopes, error = _compute_error_slopes(senders, j), _compute_steady_error(senders, j)
-        best = _spend_bits(hulls, -slopes, total)
-        gap = float(slopes @ (j - best))
-        bound = max(bound, error - gap)
-        j = j + 2 / (k + 2) * (best - j)
+        best_on_tangent = _spend_bits(hulls, -slopes, total)
+        least_on_tangent = error - float(slopes @ (j - best_on_tangent))
+        bound = max(bound, least_on_tangent)
+        j = j + 2 / (k + 2) * (best_on_tangent - j)
     return bound
 
 

@@ -224,9 +224,10 @@ def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> 
     """
 
     def insert_into_hop(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractRandomAffine:
-        """Return the two halves of the hop called `name`, any other hop as it is.
+        """Return the hop called `name` as a chain of two, with a relay halfway; any other hop as it is.
 
-        `exponent`: of the path loss, by which half the distance multiplies E g^k by 2^(exponent k / 2).
+        Both halves have the noise of the whole. `exponent`: of the path loss, by which half the distance multiplies E
+        g^k by 2^(exponent k / 2).
         """
         if hop_name != name or not isinstance(hop, GainAndNoise):
             return hop

@@ -48,6 +48,7 @@ class Error(Module):
         at_end: bool = False,
         period: int = 1,
     ):
+        """Check and hold which number is made of the covariance P, and of which steps."""
         if isinstance(weight, Mapping):
             self.weight = dict(weight)
         else:
@@ -141,9 +142,10 @@ class Criterion(NamedTuple):
         """
         if self.sharpness is None:
             return self
-        weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_find_root(self.weight))
-        size = np.trace(root @ weights @ root, axis1=1, axis2=2)
-        return self._replace(weight=weights / size[:, None, None], sharpness=None)
+        _, derivative = self._differentiate_steps(p)
+        inverse_root = np.linalg.pinv(_find_root(self.weight))  # W^-1/2
+        traces = np.trace(inverse_root @ derivative @ inverse_root, axis1=1, axis2=2)
+        return self._replace(weight=derivative / traces[:, None, None], sharpness=None)
 
     def list_from_smoothest(self) -> "list[Criterion]":
         """Return the criteria from the smoothest to this one, by which a search begins: only this one for a trace."""
@@ -157,17 +159,19 @@ class Criterion(NamedTuple):
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.
-        root = _find_root(self.weight)
-        values, vectors = np.linalg.eigh(root @ p @ root)
-        relative = np.maximum(values / values[:, -1:], 0.0)
-        total = (relative**self.sharpness).sum(axis=1)
-        share = relative ** (self.sharpness - 1) * (total ** (1 / self.sharpness - 1))[:, None]
-        turned = root @ vectors
-        return values[:, -1] * total ** (1 / self.sharpness), (turned * share[:, None]) @ np.swapaxes(turned, 1, 2)
+        q, root = self.sharpness, _find_root(self.weight)
+        eigenvalues, vectors = np.linalg.eigh(root @ p @ root)
+        largest = eigenvalues[:, -1]
+        relative = np.maximum(eigenvalues / largest[:, None], 0.0)
+        trace = (relative**q).sum(axis=1)
+        slopes = relative ** (q - 1) * (trace ** (1 / q - 1))[:, None]  # of the smoothed value by each eigenvalue
+        root_times_vectors = root @ vectors
+        derivative = (root_times_vectors * slopes[:, None]) @ np.swapaxes(root_times_vectors, 1, 2)
+        return largest * trace ** (1 / q), derivative
 
 
 def _find_root(weight: Matrices) -> Matrices:
     """Return the symmetric root W^1/2 of each matrix W (time, n, n)."""
-    values, vectors = np.linalg.eigh(weight)
-    scale = np.sqrt(np.maximum(values, 0.0))
-    return np.asarray((vectors * scale[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+    eigenvalues, vectors = np.linalg.eigh(weight)
+    root_eigenvalues = np.sqrt(np.maximum(eigenvalues, 0.0))  # what is below 0 is rounding
+    return np.asarray((vectors * root_eigenvalues[:, None, :]) @ np.swapaxes(vectors, 1, 2))

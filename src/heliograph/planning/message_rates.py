@@ -192,9 +192,8 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
     Raises:
         ValueError: as `prediction_error_rate`; a rate that is not between 0 and 1.
     """
-    delta = _find_threshold(
-        rate, lambda d: prediction_error_rate(plant, sensor, d, loss).rate, _require_scalar_system(plant, sensor)
-    )
+    system = _require_scalar_system(plant, sensor)
+    delta = _find_threshold(rate, lambda delta: prediction_error_rate(plant, sensor, delta, loss).rate, system)
     return float(prediction_error_rate(plant, sensor, delta, loss).error[0])
 
 
@@ -227,15 +226,16 @@ def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
 
     `system`: x+ = a x + w and z = c x + v, with the variances q of w and r of v.
     """
-    a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
-    if not abs(a) < 1:
-        raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
-    # The rectangle rule next to the cut at delta is wrong by a multiple of h^2: of two grids that is taken off.
-    (coarse, h), (fine, half) = (
-        _compute_rate_on_grid(system._replace(c=1.0, r=r), delta, share) for share in (0.8, 0.5)
-    )
-    # Where nothing is ever sent both grids are one, and say 0.
-    return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
+    if not abs(system.a) < 1:
+        raise fail("plant", "a stable one, which has a rate in the long run", f"a = {system.a:g}")
+    # In units of the state: c is 1.
+    delta, system = delta / abs(system.c), system._replace(c=1.0, r=system.r / system.c**2)
+    coarse_rate, coarse_cell = _compute_rate_on_grid(system, delta, share=0.8)
+    fine_rate, fine_cell = _compute_rate_on_grid(system, delta, share=0.5)
+    if fine_rate == coarse_rate:  # where nothing is ever sent both grids are one, and say 0
+        return fine_rate
+    # The rectangle rule next to the cut at delta is wrong by a multiple of the cell's size squared: that is taken off.
+    return float(fine_rate + (fine_rate - coarse_rate) * fine_cell**2 / (coarse_cell**2 - fine_cell**2))
 
 
 def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _CellGrid:
@@ -272,30 +272,34 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     """
     a, q, r = system.a, system.q, system.r
     cells = _choose_cells(system, delta, share)
-    # Probabilities of a cell given the middle of another: move[new, old] of x after a step, noise[x, z] of z given x.
+    # Probabilities of a cell given the middle of another: T[new, old] of x after a step, noise[x, z] of z given x.
     x = np.arange(-cells.each_side, cells.each_side + 1) * cells.length
-    move, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
-    # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
-    quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
+    T, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
+    # silence[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
+    silence = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
     size = len(x)
 
-    def move_and_send(vector: np.ndarray) -> np.ndarray:
-        """Return the law after a step, from that before it, each (size^2,): x moves, then is sent or not."""
-        f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
+    def step_law(vector: np.ndarray) -> np.ndarray:
+        """Return the law (size^2,) of (x, value sent last) after a step: x moves by T, then is sent or not.
+
+        Without a message (probability `silence`) the value sent last stays; with one it is what was measured, x + v,
+        whose probabilities given x are `noise`.
+        """
+        f = T @ vector.reshape(size, size)
+        return np.asarray(f * silence + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
     deviation = np.sqrt(q / (1 - a * a))
     start = _compute_cell_probabilities(x, np.zeros(1), deviation).T * noise
-    operator = LinearOperator((size**2, size**2), matvec=move_and_send, dtype=np.float64)
+    operator = LinearOperator((size**2, size**2), matvec=step_law, dtype=np.float64)
     most_iterations = int(PRODUCTS / size**3 / PRODUCTS_OF_ITERATION) + 2
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=most_iterations, tol=1e-9)
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(_compute_law_after_message(move @ f, noise, cells.of_delta).sum()), cells.length
+    return float(_compute_law_after_message(T @ f, noise, cells.of_delta).sum()), cells.length
 
 
 def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
@@ -306,14 +310,15 @@ def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta:
         noise: [i, z] = P(measured in cell z | x in cell i).
         cells_of_delta: number of cells on either side of a measured one that are no further than delta from it.
     """
-    # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
+    # So many cells have values more than delta above them; as many, at the other end, have such values below.
     size = len(f)
-    beyond = max(size - cells_of_delta - 1, 0)  # measured cells that have any such value above them, or below
-    sums = np.cumsum(f, axis=1)
-    far = np.zeros_like(f)
-    far[:, :beyond] = sums[:, -1:] - sums[:, size - beyond - 1 : -1]
-    far[:, size - beyond :] += sums[:, :beyond]
-    return np.asarray(far * noise)
+    count = max(size - cells_of_delta - 1, 0)
+    mass_up_to = np.cumsum(f, axis=1)  # [i, j] = P(x in cell i, last sent in cell j or below)
+    # [i, z] = P(x in cell i, last sent more than delta from cell z): above it, then below.
+    mass_beyond_delta = np.zeros_like(f)
+    mass_beyond_delta[:, :count] = mass_up_to[:, -1:] - mass_up_to[:, size - count - 1 : -1]
+    mass_beyond_delta[:, size - count :] += mass_up_to[:, :count]
+    return np.asarray(mass_beyond_delta * noise)
 
 
 def _compute_cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
@@ -374,15 +379,19 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
 
 
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss-Legendre nodes and weights over the line between `edges`, cut to parts of at most 8 units."""
+    """Return Gauss-Legendre nodes and weights on a line that is cut at `edges`, and into intervals of 8 units at most.
+
+    On these NODES nodes suffice, as the integrand changes over a unit or more.
+    """
+    intervals: list[tuple[float, float]] = []
+    for begin, end in pairwise(edges):
+        count = int(np.ceil((end - begin) / (8 * unit)))
+        intervals += pairwise(np.linspace(begin, end, count + 1))
+    # Nodes and weights of the interval from -1 to 1, moved to each of these.
     x, w = np.polynomial.legendre.leggauss(NODES)
-    parts = []
-    for a, b in pairwise(edges):
-        # In parts of few units NODES nodes suffice, as the integrand changes over a unit or more.
-        cuts = np.linspace(a, b, int(np.ceil((b - a) / (8 * unit))) + 1)
-        parts += list(pairwise(cuts))
-    nodes = np.concatenate([(a + b) / 2 + (b - a) / 2 * x for a, b in parts])
-    return nodes, np.concatenate([(b - a) / 2 * w for a, b in parts])
+    nodes = np.concatenate([(a + b) / 2 + (b - a) / 2 * x for a, b in intervals])
+    weights = np.concatenate([(b - a) / 2 * w for a, b in intervals])
+    return nodes, weights
 
 
 def _normal_density(e: np.ndarray, variance: float) -> np.ndarray:

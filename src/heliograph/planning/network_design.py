@@ -1,5 +1,7 @@
 """`hg.design`: powers, relays, or other numbers, for a small error, or the least power for a target error."""
 
+from math import ceil
+
 import numpy as np
 
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
@@ -202,8 +204,8 @@ def _find_relay_power_limits(problem: DesignProblem) -> float | None:
 def _make_relay_network(relays: RelayNetwork, gains: Gains) -> Network:
     """Return a network of the relays with these gains and the best receiver behind them, for COVERED steps or more."""
     slots, n = len(relays.slots), len(relays.states)
-    # Slots of a period, repeated until COVERED steps are reached: rounded up.
-    times = -(-COVERED // slots)
+    # The slots of a period are repeated until COVERED steps are reached.
+    times = ceil(COVERED / slots)
     over_time = {name: np.tile(gain, (times, 1, 1)) for name, gain in gains.items()}
     # A design has gains of the receiver too; its schedule is dropped for that of the best one.
     receiver_gains = {RECEIVER: np.zeros((times * slots, n, relays.received[-1]))}

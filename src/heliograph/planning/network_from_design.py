@@ -1,6 +1,7 @@
 """A design as a network that runs: channels with the powers of the design, and the best linear filters of them."""
 
 from collections.abc import Mapping, Sequence
+from math import ceil
 from typing import TypeVar
 
 import jax
@@ -81,9 +82,9 @@ def repeat_network(network: Network) -> Network:
         """Return an OverTime repeated for COVERED steps or more, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
-        # COVERED: steps for which what is periodic is written down; the division rounds up.
-        times = -(-COVERED // leaf.steps)
-        return OverTime(jax.tree.map(lambda v: np.tile(v, (times, *[1] * (np.ndim(v) - 1))), leaf.values))
+        # COVERED: steps for which what is periodic is written down.
+        times = ceil(COVERED / leaf.steps)
+        return OverTime(jax.tree.map(lambda over_steps: np.concatenate([over_steps] * times), leaf.values))
 
     # An OverTime holds arrays with a leading axis over steps.
     covered: Network = jax.tree.map(repeat, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
@@ -94,7 +95,8 @@ def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict
     """Return the powers (steps,) by transmitter; ValueError of unknown transmitters, other shapes, negative powers."""
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
-    if unknown := sorted(set(given) - known):
+    unknown = sorted(set(given) - known)
+    if unknown:
         raise fail("powers of a network", f"names of transmitters {sorted(known)}", unknown)
     return {
         name: require_at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))

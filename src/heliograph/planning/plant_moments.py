@@ -23,7 +23,8 @@ EPS = float(np.finfo(np.float64).eps)
 
 def check_stable(transition: Float[np.ndarray, "n n"]) -> None:
     """Raise ValueError where the second moments of a plant with this transition grow without limit."""
-    if (radius := spectral_radius(transition)) >= 1:
+    radius = spectral_radius(transition)
+    if radius >= 1:
         expected = "a stable plant, or a horizon, or feedback: what is sent of an unstable plant grows without limit"
         raise fail("steady power", expected, f"spectral radius {radius:.6g}")
 
@@ -132,18 +133,21 @@ def _compute_noise_moments(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -
 
 def measured_moment_with_one(sensor: AnySensor, second: Float[Array, "n1 n1"], step: int = 0) -> Float[Array, "m1 m1"]:
     """Return the second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
-    now = at(sensor, step)
-    c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance
-    rows = _append_shift(c, offset)
-    sensed: Array = rows @ second @ rows.T + library(noise).pad(noise, ((0, 1), (0, 1)))
-    return sensed
+    sensor_now = at(sensor, step)
+    matrix, noise = sensor_now.matrix, sensor_now.noise
+    extended_matrix = _append_shift(matrix, noise.mean)  # from (x, 1) to (y, 1) without noise
+    extended_covariance = library(noise.covariance).pad(noise.covariance, ((0, 1), (0, 1)))  # of (noise, 0)
+    measured: Array = extended_matrix @ second @ extended_matrix.T + extended_covariance
+    return measured
 
 
 def _append_shift(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
     """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1)."""
-    last = np.eye(1, matrix.shape[1] + 1, matrix.shape[1])
+    n = matrix.shape[1]
+    row_of_one = np.eye(1, n + 1, n)  # (0, ..., 0, 1), which keeps the 1
     xp = library(matrix, shift)
-    extended: Array = xp.concatenate([xp.concatenate([matrix, shift[:, None]], axis=1), last])
+    upper_rows = xp.concatenate([matrix, shift[:, None]], axis=1)
+    extended: Array = xp.concatenate([upper_rows, row_of_one])
     return extended
 
 

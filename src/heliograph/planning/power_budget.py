@@ -139,11 +139,12 @@ class PowerLimits(NamedTuple):
         steps, count = self.peak.shape
         # A row for the mean of each transmitter over the steps, then one for that of all together.
         rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
-        most = np.append(self.mean, self.total)
-        rows, most = rows[np.isfinite(most)], most[np.isfinite(most)]
+        limits = np.append(self.mean, self.total)
+        is_finite = np.isfinite(limits)
+        rows, limits = rows[is_finite], limits[is_finite]
         # A limit of 0 cannot be divided by.
-        scale = np.where(most > 0, most, 1.0)
-        return rows / scale[:, None], most / scale
+        unit = np.where(limits > 0, limits, 1.0)
+        return rows / unit[:, None], limits / unit
 
 
 def make_unlimited(steps: int, count: int) -> PowerLimits:

@@ -226,8 +226,8 @@ def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> Abstract
         for node in nodes.values()
     ]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, channels)
-    on_line = not first(plant).circular and not first(sensor).circular
-    return likelihood_filter(plant, sensor, channel, linear=on_line and is_linear(plant, sensor))
+    has_angles = first(plant).circular or first(sensor).circular
+    return likelihood_filter(plant, sensor, channel, linear=not has_angles and is_linear(plant, sensor))
 
 
 def _condition_on_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:

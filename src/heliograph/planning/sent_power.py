@@ -140,8 +140,9 @@ def power(
 def _is_exact(network: Network, sources: Sources) -> bool:
     """Return whether second moments are exact without draws: plant and sensors are linear without angles."""
     plant = network.plant
-    linear = all(is_linear(plant, sensor) and not first(sensor).circular for sensor, _ in sources.values())
-    return linear and not first(plant).circular
+    all_are_linear = all(is_linear(plant, sensor) for sensor, _ in sources.values())
+    have_angles = first(plant).circular or any(first(sensor).circular for sensor, _ in sources.values())
+    return all_are_linear and not have_angles
 
 
 def _compute_moments(
@@ -165,11 +166,10 @@ def _compute_hop_powers(
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
     """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
-    return (
-        compute_steady_powers(at(channel, k), moment)
-        if horizon is None
-        else compute_sent_powers(at(channel, k), moment, k)
-    )
+    channel_now = at(channel, k)
+    if horizon is None:
+        return compute_steady_powers(channel_now, moment)
+    return compute_sent_powers(channel_now, moment, step=k)
 
 
 def _list_sources(network: Network) -> Sources:
@@ -273,6 +273,7 @@ def _average_draws(
     """
 
     def draw_trajectory(key: jax.Array) -> dict[str, jax.Array]:
+        """Return (y, 1)(y, 1)' of each sensor at each step of one trajectory of the plant, drawn with this key."""
         return _draw_output_squares(plant, sensors, inputs, key)
 
     squares: dict[str, jax.Array] = jax.vmap(jax.vmap(draw_trajectory))(keys)

@@ -89,10 +89,11 @@ class ScaledProgramme:
 
         z: the point in units of each coordinate; `sharpness`: exponent by which the error is smoothed.
         """
-        key = z.tobytes()
-        if key != self._last[0]:
-            self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
-        return self._last[1]
+        point, (last_point, evaluation) = z.tobytes(), self._last
+        if point != last_point:
+            evaluation = self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
+            self._last = point, evaluation
+        return evaluation
 
     def objective(self, z: Vector) -> tuple[float, Vector]:
         """Return the error, or mean total power where there is a target, over the size, and its derivative by z.
@@ -145,14 +146,14 @@ class ScaledProgramme:
         constraints = []
         if len(self.limit_room(z)):
             constraints = [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
-        before = self.merit(z)
+        # The merit is the objective within the limits and infinite outside.
+        merit_at_start = self.merit(z)
         end = self._minimize(self.objective, z, constraints, tolerance)
         # Neither the start nor the end is within the limits: first back into them, then down again.
-        if np.isinf(before) and not self.is_feasible(end):
-            end = self._minimize(self._compute_squared_excess, end, [], tolerance)
-            return self._minimize(self.objective, end, constraints, tolerance)
-        # The merit is the objective within the limits and infinite outside.
-        return end if self.merit(end) < before else z
+        if np.isinf(merit_at_start) and not self.is_feasible(end):
+            within_limits = self._minimize(self._compute_squared_excess, end, [], tolerance)
+            return self._minimize(self.objective, within_limits, constraints, tolerance)
+        return end if self.merit(end) < merit_at_start else z
 
     def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:
         """Return the squared excess over the limits, and its derivative by z: what a way back into them minimises."""
@@ -173,8 +174,11 @@ class ScaledProgramme:
         optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
                           options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
         end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)
+        if not np.all(np.isfinite(end)):
+            return z
         unit = self.problem.unit
-        return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
+        restored: Vector = self.problem.restore(end * unit) / unit
+        return restored
 
     def polish_by_newton(self, z: Vector) -> Vector:
         """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them.
@@ -244,6 +248,10 @@ class ScaledProgramme:
         """
 
         def lagrangian_gradient(point: Vector) -> Vector:
+            """Return the gradient of value - m' room by the variables `index`, in units of `scale`.
+
+            m are the `multipliers` of the `active` limits.
+            """
             gradient, slopes = self.objective(point)[1], self.limit_room_slope(point)[active]
             return np.asarray((gradient - multipliers @ slopes)[index] * scale)
 

@@ -103,7 +103,11 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
     """
 
     def amplitudes_at(nu: float) -> Vector:
-        # By sizes, as the best amplitude has the sign of its link's gain b.
+        """Return the best amplitudes under the limits of each alone, of D + nu T and N - nu P.
+
+        `variances` is the diagonal of D, `links.unit` T, `links.floor` N, `total` P, `caps` the limits. They are
+        computed by sizes, as the best amplitude has the sign of its link's gain b.
+        """
         sizes = _cap_amplitudes(np.abs(b), variances + nu * links.unit, links.floor - nu * total, caps)
         return np.asarray(np.sign(b) * sizes)
 

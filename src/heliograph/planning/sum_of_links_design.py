@@ -235,10 +235,10 @@ def _find_least_error_amplitudes(task: SumOfLinksTask, total: float) -> tuple[Ve
     if solution is not None:
         error = task.compute_error(solution)
         return solution, Certificate(convex=True, value=error, bound=error, stationarity=0.0, starts=1, unit="error")
-    found = task.search_amplitudes(total, task.starts)
-    error = task.compute_error(found)
+    amplitudes = task.search_amplitudes(total, task.starts)
+    error = task.compute_error(amplitudes)
     bound = min(task.bound_error(min(total, task.largest_total)), error)
-    return found, Certificate(
+    return amplitudes, Certificate(
         convex=False, value=error, bound=bound, stationarity=np.nan, starts=task.starts, unit="error"
     )
 
@@ -270,7 +270,7 @@ def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vec
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
     solution = task.find_amplitudes_by_formula(power)
-    return task.search_amplitudes(power, 1, near) if solution is None else solution
+    return solution if solution is not None else task.search_amplitudes(power, 1, near)
 
 
 def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> float:
@@ -382,11 +382,11 @@ def steady_covariance_with_information(
         process: Cov w.
         information: J, taken as J = H' H, a measurement H x with noise of covariance I; zero where nothing is told.
     """
-    values, vectors = np.linalg.eigh(information)
+    eigenvalues, vectors = np.linalg.eigh(information)
     # ALIKE: share of the largest eigenvalue below which one is rounding.
-    used = values > ALIKE * max(values[-1], 0.0)
-    if not used.any():
+    is_above_rounding = eigenvalues > ALIKE * max(eigenvalues[-1], 0.0)
+    if not is_above_rounding.any():
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
-    h = (vectors[:, used] * np.sqrt(values[used])).T
-    prior = scipy.linalg.solve_discrete_are(matrix.T, h.T, process, np.eye(len(h)))
-    return observe_information(roots_of(prior), information).covariance
+    H = (vectors[:, is_above_rounding] * np.sqrt(eigenvalues[is_above_rounding])).T
+    predicted = scipy.linalg.solve_discrete_are(matrix.T, H.T, process, np.eye(len(H)))
+    return observe_information(roots_of(predicted), information).covariance

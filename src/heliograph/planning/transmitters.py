@@ -60,10 +60,10 @@ def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) 
     """
     chosen_mask = np.zeros(len(names), dtype=bool)
     for choice in chosen:
-        hit = np.array([name == choice or name.startswith(f"{choice}.") for name in names])
-        if not np.any(hit):
+        is_meant = np.array([name == choice or name.startswith(f"{choice}.") for name in names])
+        if not np.any(is_meant):
             raise fail(what, f"names of transmitters {list(names)}", repr(choice))
-        chosen_mask |= hit
+        chosen_mask |= is_meant
     return chosen_mask
 
 
@@ -87,8 +87,9 @@ def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict
     `second`: E (y, 1)(y, 1)' of what goes into the channel.
     """
     joint = joint_modes(channel, order=2)
-    unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
-    return compute_powers_of_law(channel, second, joint.initial if unchanged else find_stationary_law(joint.transition))
+    starts_stationary = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
+    law = joint.initial if starts_stationary else find_stationary_law(joint.transition)
+    return compute_powers_of_law(channel, second, law)
 
 
 def compute_powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
@@ -103,13 +104,13 @@ def compute_powers_of_law(channel: AbstractRandomAffine, second: Second, law: Fl
         law: probability of each mode.
     """
     # By transmitter: the sum of P(mode) power over modes in which it is received, and the sum of their P(mode).
-    weighted_power: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
-    received = dict(weighted_power)
+    sums: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
+    probabilities = dict(sums)
     for probability, mode_map in zip(law, joint_modes(channel, order=2).maps, strict=True):
         for name, power in _list_powers(mode_map, second).items():
-            weighted_power[name] += probability * power
-            received[name] += probability
-    return {name: _divide_by_probability(weighted_power[name], received[name]) for name in weighted_power}
+            sums[name] += probability * power
+            probabilities[name] += probability
+    return {name: _divide_by_probability(sums[name], probabilities[name]) for name in sums}
 
 
 def _list_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Scalar]:
@@ -154,13 +155,14 @@ def set_transmitter_powers(
     """
     for name in transmitter_names(channel):  # in order: a relay receives what those before it send
         if name in powers:
-            now = compute_sent_powers(channel, second, step)[name]
-            if now <= 0 < powers[name]:  # silent so far: it sends what it receives, and is scaled then
+            power_now = compute_sent_powers(channel, second, step)[name]
+            if power_now <= 0 < powers[name]:  # silent so far: it sends what it receives, and is scaled then
                 channel = amplify_transmitter(channel, name, None)
-                now = compute_sent_powers(channel, second, step)[name]
-            if now <= 0 < powers[name]:
+                power_now = compute_sent_powers(channel, second, step)[name]
+            if power_now <= 0 < powers[name]:
                 raise fail(f"transmitter {name!r}", "a signal that can be amplified", "none")
-            channel = amplify_transmitter(channel, name, np.sqrt(powers[name] / now) if now > 0 else 0.0)
+            factor = np.sqrt(powers[name] / power_now) if power_now > 0 else 0.0
+            channel = amplify_transmitter(channel, name, factor)
     return channel
 
 

@@ -60,6 +60,7 @@ class _DenseInverseHessian:
     """Inverse Hessian H as a matrix, first a small multiple of I and then scaled by the first update."""
 
     def __init__(self, gradient: np.ndarray):
+        """Begin with H = I / (10 |gradient|), so that the first step has length 1/10."""
         self.matrix = np.eye(len(gradient)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
         self.is_first_update = True
 
@@ -91,6 +92,7 @@ class _LimitedInverseHessian:
     """Inverse Hessian H by its last updates (s, y): steps and the changes of the gradient over them."""
 
     def __init__(self, memory: int):
+        """Begin without updates; the newest `memory` of them are kept."""
         self.updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=memory)
 
     def times(self, vector: np.ndarray) -> np.ndarray:

@@ -164,7 +164,7 @@ def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arra
         """
 
         def compute_cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return the penalised cost, and beside it the powers."""
+            """Return the penalised cost of the gains `base` + x in units of `unit`, and beside it the slots' powers."""
             trace, converges, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
             return _penalise_power(trace, converges, power, limit, multipliers), power
 

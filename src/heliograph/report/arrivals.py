@@ -70,7 +70,8 @@ class Arrivals:
         if self.declared_period is not None or self.of_messages:
             return None
         rate = find_rate(self.arrived)
-        if rate is None or (pattern := find_pattern(self.arrived)) is None:
+        pattern = None if rate is None else find_pattern(self.arrived)
+        if rate is None or pattern is None:
             return rate
         # In N rows N / period messages are due by the rate: the pattern's D due rows are more than one more than that
         # where D > N / period + 1, or period * D > N + period.
@@ -140,10 +141,10 @@ class Arrivals:
         """Return in words the rows or times in which it is due: each slot (a row, or a period), or a pattern's."""
         if self.slots is None:
             return "not known"
-        some = "" if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
+        some = None if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
         if self.period is None:
-            return f"{some} rows" if some else "each row"
-        return f"{some}, each {self.period:.4g}" if some else f"each {self.period:.4g}"
+            return "each row" if some is None else f"{some} rows"
+        return f"each {self.period:.4g}" if some is None else f"{some}, each {self.period:.4g}"
 
     @property
     def lost_times(self) -> np.ndarray:
@@ -200,8 +201,8 @@ class Arrivals:
         if self.due_slots is None:
             return None
         # As if a message had come before the first and after the last.
-        ends = np.flatnonzero(np.concatenate([[True], self.due_slots, [True]]))
-        return int(np.max(np.diff(ends)) - 1)
+        arrivals = np.flatnonzero(np.concatenate([[True], self.due_slots, [True]]))
+        return int(np.max(np.diff(arrivals)) - 1)
 
 
 def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:

@@ -43,8 +43,8 @@ class ConstantError(NamedTuple):
 
     def __str__(self) -> str:
         """Return the output, or those it may be, and its error with half the 95 % interval: "c: y, of 1.0 ± 0.2"."""
-        half = 1.96 * self.standard_error
-        size = f"{round_to(self.error, self.standard_error)} ± {round_to(half, self.standard_error)}"
+        half_interval = 1.96 * self.standard_error
+        size = f"{round_to(self.error, self.standard_error)} ± {round_to(half_interval, self.standard_error)}"
         return f"{' or '.join(self.outputs)}, of {size}"
 
 
@@ -214,12 +214,12 @@ def _compute_inverse_square_roots(s: Float[np.ndarray, "time m m"], arrived: Flo
     """
     both_arrived = np.asarray(arrived[:, :, None] & arrived[:, None, :])  # components i and j of a row
     # Ones on the diagonal stand for what did not arrive, or is not finite, so that all rows are inverted at once.
-    eye = np.eye(s.shape[1])
-    filled = np.where(both_arrived, s, eye)
+    identity = np.eye(s.shape[1])
+    filled = np.where(both_arrived, s, identity)
     is_finite = np.asarray(np.isfinite(filled).all(axis=(1, 2)))
-    filled = np.where(is_finite[:, None, None], filled, eye)
-    # S = V diag(values) V', so that S^(-1/2) = V diag(values^(-1/2)) V'.
-    values, vectors = np.linalg.eigh(filled)
-    inverse_roots = np.where(values > 0, np.abs(values), np.inf) ** -0.5
-    inverse = np.einsum("tij,tj,tkj->tik", vectors, inverse_roots, vectors)
-    return np.asarray(np.where(both_arrived & is_finite[:, None, None], inverse, 0.0))
+    filled = np.where(is_finite[:, None, None], filled, identity)
+    # S = V diag(eigenvalues) V', so that S^(-1/2) = V diag(eigenvalues^(-1/2)) V'.
+    eigenvalues, vectors = np.linalg.eigh(filled)
+    inverse_roots = np.where(eigenvalues > 0, np.abs(eigenvalues), np.inf) ** -0.5
+    inverse_root_of_s = np.einsum("tij,tj,tkj->tik", vectors, inverse_roots, vectors)
+    return np.asarray(np.where(both_arrived & is_finite[:, None, None], inverse_root_of_s, 0.0))

@@ -56,7 +56,7 @@ def find_constant_error_between_nodes(
 def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilter | None:
     """Return a filter of what all these nodes receive; None behind a link for which no such filter is made."""
     # What was lost is NaN in the data: the links need to say only how what arrives is changed.
-    links = [x.channel.condition_on_arrival() for x in nodes.values() if not isinstance(x.channel, OverTime)]
+    links = [node.channel.condition_on_arrival() for node in nodes.values() if not isinstance(node.channel, OverTime)]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
     is_linear = isinstance(network.plant, LinearPlant) and isinstance(sensor, LinearSensor)
     make_filter = heliograph.linear_filter if is_linear else heliograph.cubature_filter
@@ -72,7 +72,9 @@ def _can_be_joined(node: Node) -> bool:
     Its sensor and link do not change over time, messages come whenever they are due, as they were measured (without an
     encoder), and a filter of its own claims a covariance. No such filter may weigh values by how likely they are.
     """
-    fixed = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
-    sent = node.trigger is None or isinstance(node.trigger, Periodic)
-    claims = [f for f in node.filters.values() if f.received and f.claim != "none"]
-    return fixed and sent and node.encoder is None and bool(claims) and not any(map(weighs, claims))
+    is_constant = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
+    sends_when_due = node.trigger is None or isinstance(node.trigger, Periodic)
+    filters = [filter for filter in node.filters.values() if filter.received and filter.claim != "none"]
+    if not filters or any(weighs(filter) for filter in filters):
+        return False
+    return is_constant and sends_when_due and node.encoder is None

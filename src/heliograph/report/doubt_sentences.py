@@ -39,24 +39,24 @@ def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
     )
 
 
-def say_constant_error(name: str, off: ConstantError) -> str:
+def say_constant_error(name: str, error: ConstantError) -> str:
     """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it.
 
-    `off.explained`: share of what the filter's squared innovations are too large by.
+    `error.explained`: share of what the filter's squared innovations are too large by.
     """
-    if not off.nothing_else:
-        share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
-        return f"{name}: a constant error of {off}, would explain {share}, not all"
+    if not error.nothing_else:
+        share = f"{min(error.explained, 0.99):.0%} of what its squared innovations are too large by"
+        return f"{name}: a constant error of {error}, would explain {share}, not all"
     return (
-        f"{name} is off by a constant error of {off}: it pulls the estimates, and makes innovations of the others "
+        f"{name} is off by a constant error of {error}: it pulls the estimates, and makes innovations of the others "
         "larger too. hg.model.with_bias makes it a state, which the filter then estimates"
     )
 
 
-def say_node_differs(off: ConstantError) -> str:
+def say_node_differs(error: ConstantError) -> str:
     """Return the sentence on the output that differs from what the other nodes say by a constant."""
     return (
-        f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
+        f"nodes disagree: a constant error of {error}, explains it. By itself a node takes it for the state; "
         "hg.model.with_bias makes it a state of its own"
     )
 

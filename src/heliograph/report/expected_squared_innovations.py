@@ -21,9 +21,12 @@ def compute_expected_squares(
     conditioned = filter.given_record()
     if conditioned is filter:
         return np.ones(data.shape)
-    in_run, over_runs = (np.diagonal(one.run(data, inputs).innovation_covariances, axis1=1, axis2=2)
-                         for one in (conditioned, filter))  # fmt: skip
-    return np.where(over_runs > 0, in_run / np.where(over_runs > 0, over_runs, 1.0), 1.0)
+    # Variances of the innovations (steps, m), given this recording and over all runs.
+    in_run, over_runs = (
+        np.diagonal(one.run(data, inputs).innovation_covariances, axis1=1, axis2=2) for one in (conditioned, filter)
+    )
+    is_positive = over_runs > 0
+    return np.where(is_positive, in_run / np.where(is_positive, over_runs, 1.0), 1.0)
 
 
 def compute_ratio_of_squares(
@@ -35,14 +38,14 @@ def compute_ratio_of_squares(
         squares: of innovations in units of their claim, NaN where none is.
         expected: their means, as `compute_expected_squares` returns them; 1 for most filters.
     """
-    there = ~np.isnan(squares) & ~np.isnan(expected)
-    if not there.any() or not expected[there].any():
+    is_known = ~np.isnan(squares) & ~np.isnan(expected)
+    if not is_known.any() or not expected[is_known].any():
         return np.nan, np.nan
-    mean_expected = float(expected[there].mean())
-    ratio = float(squares[there].mean()) / mean_expected
+    mean_expected = float(expected[is_known].mean())
+    ratio = float(squares[is_known].mean()) / mean_expected
     # Of a ratio of means, to first order: the standard error of the mean of (square - ratio expected), over that of
     # expected.
-    _, residual_error = average_correlated(np.where(there, squares - ratio * expected, np.nan))
+    _, residual_error = average_correlated(np.where(is_known, squares - ratio * expected, np.nan))
     return ratio, residual_error / mean_expected
 
 
@@ -55,8 +58,10 @@ def scale_size_to_expected(
     """
     if np.all(expected == 1):
         return test
-    there = ~np.isnan(white)
-    count = np.maximum(there.sum(axis=1), 1)  # of each row, over which both are averaged
-    squares, means = (np.where(there, numbers, 0.0).sum(axis=1) / count for numbers in (white**2, expected))
-    power, error = compute_ratio_of_squares(np.where(there.any(axis=1), squares, np.nan), means)
+    came = ~np.isnan(white)
+    count = np.maximum(came.sum(axis=1), 1)  # in each row, over which both are averaged
+    mean_squares = np.where(came, white**2, 0.0).sum(axis=1) / count
+    mean_expected = np.where(came, expected, 0.0).sum(axis=1) / count
+    mean_squares = np.where(came.any(axis=1), mean_squares, np.nan)
+    power, error = compute_ratio_of_squares(mean_squares, mean_expected)
     return replace(test, power=power, power_error=error)

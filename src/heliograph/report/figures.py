@@ -74,12 +74,12 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
     """
     instance("figure", figure, Figure, "a figure of matplotlib")
     dots_per_inch = check_count("dots per inch", dots_per_inch, 1)
-    buffer, before = BytesIO(), figure.dpi
+    buffer, old_dpi = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     figure.dpi = dots_per_inch
     canvas: Any = FigureCanvasAgg(figure)  # it has no types; it draws once, where savefig lays out and draws twice
     canvas.print_png(buffer)
-    figure.dpi = before
+    figure.dpi = old_dpi
     return buffer.getvalue()
 
 
@@ -96,13 +96,13 @@ def svg(figure: Figure) -> bytes:
         ValueError: what is no figure.
     """
     instance("figure", figure, Figure, "a figure of matplotlib")
-    buffer, before = BytesIO(), figure.dpi
+    buffer, old_dpi = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     _rasterise_dense(figure)
-    figure.dpi = RASTER  # of the parts that are pixels
+    figure.dpi = RASTER  # of lines and bands that are pixels
     canvas: Any = FigureCanvasSVG(figure)
     canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
-    figure.dpi = before
+    figure.dpi = old_dpi
     return buffer.getvalue()
 
 

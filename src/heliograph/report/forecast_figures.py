@@ -82,13 +82,13 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
     predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])
     headers, columns = ["time"], [format_times(forecast.time[rows])]
     for kind, prediction in predictions:
-        claims = prediction.claim != "none"
         # Without a claim the deviation is NaN, by which the cell shows the mean alone.
-        low, high = prediction.interval(BOTH_SIDES) if claims else (prediction.mean, prediction.mean)
-        for i, number in enumerate(prediction.names):
-            headers.append(visible(f"{kind}{number}"))
-            mean, deviation = prediction.mean[:, i], prediction.deviation[:, i]
-            columns.append([_format_mean_and_interval(mean[r], low[r, i], high[r, i], deviation[r]) for r in rows])
+        has_claim = prediction.claim != "none"
+        low, high = prediction.interval(BOTH_SIDES) if has_claim else (prediction.mean, prediction.mean)
+        for i, name_of_number in enumerate(prediction.names):
+            headers.append(visible(f"{kind}{name_of_number}"))
+            numbers = (prediction.mean, low, high, prediction.deviation)
+            columns.append([_format_mean_and_interval(*(values[row, i] for values in numbers)) for row in rows])
     caption = f"**{visible(name)}**: mean, and the interval that holds 95 % of what it predicts."
     return Table(headers, [list(cells) for cells in zip(*columns, strict=True)], caption)
 

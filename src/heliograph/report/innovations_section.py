@@ -202,13 +202,12 @@ def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
     with its interval, "–" where it has none.
     """
     rows = []
-    for of_class in judgement.classes:
-        is_single = of_class.low == of_class.high
-        declared = f"{of_class.low:.3g}" if is_single else f"{of_class.low:.3g} to {of_class.high:.3g}"
-        size = f"{of_class.nis:.3g} ({of_class.nis_low:.2f} to {of_class.nis_high:.2f})"
-        has_scale = of_class.scale_low != of_class.scale_high
-        scale = f"{of_class.scale:.3g} ({of_class.scale_low:.3g} to {of_class.scale_high:.3g})" if has_scale else "–"
-        rows.append([declared, f"{of_class.numbers:,}", size, scale])
+    for one in judgement.classes:
+        variances = f"{one.low:.3g}" if one.low == one.high else f"{one.low:.3g} to {one.high:.3g}"
+        size = f"{one.nis:.3g} ({one.nis_low:.2f} to {one.nis_high:.2f})"
+        has_scale = one.scale_low != one.scale_high
+        scale = f"{one.scale:.3g} ({one.scale_low:.3g} to {one.scale_high:.3g})" if has_scale else "–"
+        rows.append([variances, f"{one.numbers:,}", size, scale])
     return rows
 
 

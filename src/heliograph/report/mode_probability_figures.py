@@ -17,8 +17,11 @@ def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict
 
     Its name is "modes_" (PREFIX), `kind` and the node's number.
     """
-    has_modes = [any(e.modes is not None for e in record.estimates[node].values()) for node in nodes]
-    return {f"{PREFIX}{kind}_{i}": _draw_modes(record, node) for i, node in enumerate(nodes) if has_modes[i]}
+    figures = {}
+    for i, node in enumerate(nodes):
+        if any(estimate.modes is not None for estimate in record.estimates[node].values()):
+            figures[f"{PREFIX}{kind}_{i}"] = _draw_modes(record, node)
+    return figures
 
 
 @matplotlib.rc_context(LOOK)

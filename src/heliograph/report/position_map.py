@@ -23,10 +23,10 @@ def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:
 
     PAIRS are such names, as ("x", "y"); a unit in brackets behind a name does not count.
     """
-    plain = [state.split("(")[0].strip().lower() for state in states]
+    names = [state.split("(")[0].strip().lower() for state in states]
     for first, second in PAIRS:
-        if first in plain and second in plain:
-            return plain.index(first), plain.index(second)
+        if first in names and second in names:
+            return names.index(first), names.index(second)
     return None
 
 
@@ -62,10 +62,12 @@ def _draw_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np
     """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 of centre m and covariance P; nothing if P is not one."""
     if not (np.isfinite(covariance).all() and np.isfinite(center).all()):
         return
-    values, vectors = np.linalg.eigh(covariance)
-    if values[0] < 0:
+    eigenvalues, vectors = np.linalg.eigh(covariance)
+    smaller, larger = eigenvalues
+    if smaller < 0:
         return
-    # Axes are 2 SIGMAS sqrt(eigenvalue) long; the longer one, of the second eigenvector, is the width.
-    width, height = 2 * SIGMAS * np.sqrt(values[::-1])
-    angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+    # Each axis is 2 SIGMAS sqrt(eigenvalue) long; the longer one, along the second eigenvector, is the width.
+    width, height = 2 * SIGMAS * np.sqrt(larger), 2 * SIGMAS * np.sqrt(smaller)
+    x, y = vectors[:, 1]
+    angle = float(np.degrees(np.arctan2(y, x)))
     axes.add_patch(Ellipse((center[0], center[1]), width, height, angle=angle, color=colour, alpha=0.2, linewidth=0))

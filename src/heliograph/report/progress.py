@@ -40,8 +40,9 @@ def progress(stages: int) -> Iterator[Advance]:
             nonlocal stage, begun
             if what != stage:
                 stage, begun = what, begun + 1
-            shown = f"{what}: {done:,} of {total:,}" if total else what
-            bar.update(task, description=shown, completed=begun - 1 + (done / total if total else 0))
+            share = done / total if total else 0.0
+            description = f"{what}: {done:,} of {total:,}" if total else what
+            bar.update(task, description=description, completed=begun - 1 + share)
 
         yield advance
 

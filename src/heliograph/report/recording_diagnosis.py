@@ -212,17 +212,17 @@ class Health:
             if named:  # an only output, or all together, needs no name in the sentence
                 yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
-    def explains_all_innovations(self, health: FilterHealth, off: ConstantError) -> bool:
+    def explains_all_innovations(self, health: FilterHealth, error: ConstantError) -> bool:
         """Return whether innovations without the effect of a constant error are as large as claimed, without memory.
 
-        `off.squares`: these squared, over their variances, NaN where none came; `off.white`: they, over deviations.
+        `error.squares`: these squared, over their variances, NaN where none came; `error.white`: they, over deviations.
         """
-        level = self._level_of_one_test() / off.squares.shape[1]
-        for column in off.squares.T:
-            numbers = int(np.count_nonzero(~np.isnan(column)))
-            if numbers and judge_size(*average_correlated(column), numbers, level):
+        level = self._level_of_one_test() / error.squares.shape[1]
+        for squares_of_output in error.squares.T:
+            count = int(np.count_nonzero(~np.isnan(squares_of_output)))
+            if count and judge_size(*average_correlated(squares_of_output), count, level):
                 return False
-        test = _test_memory(off.white)
+        test = _test_memory(error.white)
         return test is None or not self._has_memory(health, test)
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
@@ -256,9 +256,9 @@ def judge_size(size: float, error: float, numbers: int, level: float) -> int:
     """
     if not (size > 0 and error > 0):
         return 0
-    relative = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
-    least = max(-ndtri(level / 2) * relative, np.log(LEAST_SIZE))
-    return int(np.sign(np.log(size))) if abs(np.log(size)) > least else 0
+    relative_error = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
+    half_width = max(-ndtri(level / 2) * relative_error, np.log(LEAST_SIZE))
+    return int(np.sign(np.log(size))) if abs(np.log(size)) > half_width else 0
 
 
 def examine(
@@ -340,8 +340,9 @@ def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> st
     tested = [judged for judged in health.doubted() if judged.test is not None]
     if not tested:
         return ""
-    one = _find_judged_filter(network, health.record, tested[0])
-    return describe_wrong_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
+    first = _find_judged_filter(network, health.record, tested[0])
+    name = f"{first.node}/{first.name}"
+    return describe_wrong_time_unit(name, first.filter, first.measurements, inputs, network.inputs)
 
 
 def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) -> FilterWithMeasurements:
@@ -356,12 +357,12 @@ def _find_constant_error(
     """Return the constant error of one output that explains all or MOST of what is doubtful in a filter; else None."""
     if judged.test is None:
         return None
-    listener = _find_judged_filter(network, health.record, judged)
-    off = find_constant_error(listener.outputs, listener.filter, listener.measurements, inputs)
-    if off is None:
+    tested = _find_judged_filter(network, health.record, judged)
+    error = find_constant_error(tested.outputs, tested.filter, tested.measurements, inputs)
+    if error is None:
         return None
-    off = off._replace(nothing_else=health.explains_all_innovations(judged, off))
-    return off if off.nothing_else or off.explained > MOST else None
+    error = error._replace(nothing_else=health.explains_all_innovations(judged, error))
+    return error if error.nothing_else or error.explained > MOST else None
 
 
 def _name_time_unit(record: Record) -> str:
@@ -376,7 +377,7 @@ def _check_record(network: Network, record: Record) -> None:
     filters = {node: set(network.nodes[node].filters) for node in network.names}
     if any(not names <= set(record.estimates.get(node, ())) for node, names in filters.items()):
         raise fail("record", "the run of this network", f"one of the nodes {', '.join(record.estimates)}")
-    for estimate in (estimate for named in record.estimates.values() for estimate in named.values()):
+    for estimate in (estimate for of_node in record.estimates.values() for estimate in of_node.values()):
         if estimate.mean.ndim != 2:
             raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")
 

@@ -25,15 +25,17 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
 
     What is due in `due` of each `length` rows leaves the other rows empty for ever. Of the messages that are due some
     may be lost: what arrives in the due rows is looked at again, so that the pattern is the finest that can be told.
-    `rows`: mask of the due rows; `places`: one of a pattern's length, which of the rows looked at are due.
+    `rows`: mask of the due rows; `finer`: mask, of a pattern's length, of those among them that are due after all.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
-    while (places := _find_least_probable_rows(arrived[rows])) is not None:
-        # Of the due rows, `due` in each `length`, only `places` are due: the two patterns together return after `turns`
-        # of the first, as soon as their turns * due rows are a multiple of len(places).
-        turns = len(places) // np.gcd(due, len(places))
-        due, length = int(places.sum()) * due * turns // len(places), length * turns
-        rows[rows] = np.resize(places, int(rows.sum()))
+    finer = _find_least_probable_rows(arrived[rows])
+    while finer is not None:
+        # Of the due rows, `due` in each `length`, only those of `finer` are due: the two patterns together return after
+        # `turns` of the first, as soon as their turns * due rows are a multiple of len(finer).
+        turns = len(finer) // np.gcd(due, len(finer))
+        due, length = int(finer.sum()) * due * turns // len(finer), length * turns
+        rows[rows] = np.resize(finer, int(rows.sum()))
+        finer = _find_least_probable_rows(arrived[rows])
     return None if length == 1 else SendingPattern(due, length, rows)
 
 
@@ -126,12 +128,13 @@ def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, co
     # P(interval = 1) = follows, P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ...; modulo the
     # length the intervals k, k + length, k + 2 length, ... are one move: a geometric series of (1 - ends)^length.
     interval = np.arange(2, length + 2)
-    move: Float[np.ndarray, " length"] = np.zeros(length)
+    move_probabilities: Float[np.ndarray, " length"] = np.zeros(length)
     series = 1 / (1 - (1 - law.ends) ** length)
-    move[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) * series
-    move[1 % length] += law.follows
-    due = np.flatnonzero(places)
-    return _compute_log_row_sum(move[(due[None, :] - due[:, None]) % length], count)
+    move_probabilities[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) * series
+    move_probabilities[1 % length] += law.follows
+    due_rows = np.flatnonzero(places)
+    moves = (due_rows[None, :] - due_rows[:, None]) % length  # from each due row to each
+    return _compute_log_row_sum(move_probabilities[moves], count)
 
 
 def _compute_log_row_sum(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:

@@ -101,9 +101,11 @@ def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     spectrum = np.abs(np.fft.rfft(arrived - np.mean(arrived), size))
     is_peak = (spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])  # without the first and the last
     peaks = 1 + np.flatnonzero(is_peak)
-    largest = peaks[np.argsort(spectrum[peaks])[::-1][:PEAKS]] / size
-    usual = [1 / float(np.median(intervals)), 1 / float(np.mean(intervals))]
-    return [*usual, *(frequency for f in largest.tolist() for frequency in (f, 1 - f))]
+    largest_first = peaks[np.argsort(spectrum[peaks])[::-1]]
+    frequencies = [1 / float(np.median(intervals)), 1 / float(np.mean(intervals))]
+    for f in (largest_first[:PEAKS] / size).tolist():
+        frequencies += [f, 1 - f]
+    return frequencies
 
 
 def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:

@@ -78,9 +78,9 @@ def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[st
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
     errors = {}
-    for (state, size), column in zip(rmse.items(), squares.T, strict=True):
-        mean_square_error = average_correlated(column)[1]
-        errors[state] = mean_square_error / (2 * size) if size > 0 else np.nan
+    for (state, rmse_of_state), squares_of_state in zip(rmse.items(), squares.T, strict=True):
+        _, error_of_mean_square = average_correlated(squares_of_state)
+        errors[state] = error_of_mean_square / (2 * rmse_of_state) if rmse_of_state > 0 else np.nan
     return errors
 
 
@@ -166,8 +166,8 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
     relied_on = {}
     for node, receiver in network.nodes.items():
         strengths = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}
-        strongest = [name for name, strength in strengths.items() if strength == max(strengths.values())]
-        relied_on[node] = fused & set(strengths) or set(strongest[:1])
+        first_of_strongest = {max(strengths, key=lambda name: strengths[name])} if strengths else set()
+        relied_on[node] = fused & set(strengths) or first_of_strongest
     return relied_on
 
 
@@ -314,9 +314,10 @@ def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHe
     """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
     # Without inputs (the empty array): the record has these filters' innovations, so that none is run again.
     outputs: list[OutputHealth] = []
-    for listener in yield_filters_with_measurements(network, record):
-        if listener.name in record.weighed.get(listener.node, {}):
-            outputs += judge_outputs_of_filter(network, listener, record, np.zeros(0))
+    no_inputs = np.zeros(0)
+    for filter in yield_filters_with_measurements(network, record):
+        if filter.name in record.weighed.get(filter.node, {}):
+            outputs += judge_outputs_of_filter(network, filter, record, no_inputs)
     return outputs
 
 

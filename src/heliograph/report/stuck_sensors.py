@@ -148,7 +148,8 @@ def _bound_repetition_probability(readings: Float[np.ndarray, " n"], variance: f
     # Of each branch S - r + r_j - q^2 / 12; where that is not positive, rounding alone explains S, and p is 1.
     unrounded = max(variance - law.total, 0.0) + law.variance - resolution**2 / 12
     with np.errstate(divide="ignore", invalid="ignore"):
-        return float(law.share @ np.where(unrounded > 0, erf(resolution / np.sqrt(8 * np.abs(unrounded))), 1.0))
+        probabilities = np.where(unrounded > 0, erf(resolution / np.sqrt(8 * np.abs(unrounded))), 1.0)
+        return float(law.share @ probabilities)
 
 
 def _compute_shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:

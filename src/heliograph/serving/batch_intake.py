@@ -114,15 +114,16 @@ class BatchIntake:
         Each implausible event is noted in `_refused` with its reason, and its plant is as before the batch again: the
         other events of the plant are to be taken anew.
         """
-        self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
-        restored = set[str]()
+        plants_by_name = {candidate.plant.name: candidate.plant for candidate in self._taken}
+        self.fleet.step(plants_by_name.values())
+        to_restore = set[str]()
         for i, why in self._judges.find_implausible(self._taken).items():
-            taken = self._taken[i]
-            self._refused[taken.number, taken.event.is_inputs] = why
-            restored.add(taken.plant.name)
-        for name in restored:
+            candidate = self._taken[i]
+            self._refused[candidate.number, candidate.event.is_inputs] = why
+            to_restore.add(candidate.plant.name)
+        for name in to_restore:
             self._restore_plant(name)
-        return restored
+        return to_restore
 
     def _take_message(self, number: int, message: Read, wall: datetime) -> MessageOutcome:
         """Give a message to its plant, as far as it was read; return its outcome.

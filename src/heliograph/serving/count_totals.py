@@ -55,19 +55,20 @@ class CountTotals:
     """
 
     def __init__(self) -> None:
+        """Begin with no counts: the sums by node, and by plant and node the counts that are in the sums."""
         self.by_node: dict[str, Counter[str]] = {}
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 
     def add_plant(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
         """Add what has changed in a plant's counts (`links`, by node) since they were added last, to `by_node`."""
         for node, link in links.items():
-            now = tuple(list_counts_of_link(link).values())
-            before = self._seen.get((plant, node), (0,) * len(FIELDS))
-            if now != before:
-                self._seen[plant, node] = now
+            counts = tuple(list_counts_of_link(link).values())
+            counts_before = self._seen.get((plant, node), (0,) * len(FIELDS))
+            if counts != counts_before:
+                self._seen[plant, node] = counts
                 total = self.by_node.setdefault(node, Counter(dict.fromkeys(FIELDS, 0)))
                 # A count that fell is of a plant that began anew; only lost messages may become fewer by themselves.
-                for name, new, old in zip(FIELDS, now, before, strict=True):
+                for name, new, old in zip(FIELDS, counts, counts_before, strict=True):
                     total[name] += new - old if name == "lost" else max(new - old, 0)
 
     def as_table(self) -> dict[str, dict[str, int]]:

@@ -56,14 +56,14 @@ class EstimateWriter:
         numbers. The line is written from a row that has FIRST + its column number in each column: so the number that
         stands at a place (found by COLUMN) tells its column, and without a point that it is written as a whole one.
         """
-        numbered = FIRST + np.arange(float(size))
-        numbered[self._reasons] = 0.0  # nothing is refused
-        written = encode_line(self._write_estimates(numbered.tolist()))
-        filled = COLUMN.findall(written)  # (digits, ".0" or nothing)
-        form = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", written.replace(b"%", b"%%"))
-        order = [int(digits) - FIRST for digits, _ in filled]
-        whole = [i for i, (_, point) in enumerate(filled) if not point]
-        return HEAD + form + b"}", order, whole
+        column_numbers = FIRST + np.arange(float(size))
+        column_numbers[self._reasons] = 0.0  # nothing is refused
+        line = encode_line(self._write_estimates(column_numbers.tolist()))
+        places = COLUMN.findall(line)  # (digits, ".0" or nothing)
+        template = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", line.replace(b"%", b"%%"))
+        column_of_place = [int(digits) - FIRST for digits, _ in places]
+        places_of_integers = [i for i, (_, point) in enumerate(places) if not point]
+        return HEAD + template + b"}", column_of_place, places_of_integers
 
     def write_lines(
         self, kind: bytes, rows: Sequence[tuple[str, float | str]], outputs: Float[np.ndarray, "row outputs"]

@@ -196,10 +196,9 @@ def _describe_payload(payload: bytes) -> str:
         return "brackets nested too deeply"
     except ValueError as error:
         where = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
-        # What looks like a row of a table gets a hint.
-        row = b"," in payload and b"{" not in payload
-        table = "; `heliograph replay` sends the rows of a table as messages" if row else ""
-        return f"{show_value(payload)}, which is no JSON{where}{table}"
+        looks_like_row = b"," in payload and b"{" not in payload
+        hint = "; `heliograph replay` sends the rows of a table as messages" if looks_like_row else ""
+        return f"{show_value(payload)}, which is no JSON{where}{hint}"
 
 
 def convert_time_to_seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
@@ -207,13 +206,13 @@ def convert_time_to_seconds(moment: float | datetime, origin: datetime | None, p
 
     A plant's times are all dates, if it has an origin, or all numbers: ValueError at the other kind.
     """
-    mend = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
+    remedy = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):
         if origin is None:
-            raise fail("message, time", "a number, as this plant's times are", f"{moment.isoformat()}; {mend}")
+            raise fail("message, time", "a number, as this plant's times are", f"{moment.isoformat()}; {remedy}")
         return (moment - origin).total_seconds()
     if origin is not None:
-        raise fail("message, time", "a date, as this plant's times are", f"{moment}; {mend}")
+        raise fail("message, time", "a date, as this plant's times are", f"{moment}; {remedy}")
     return moment
 
 

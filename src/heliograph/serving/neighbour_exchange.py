@@ -26,6 +26,7 @@ class NeighbourMessenger:
     """
 
     def __init__(self, fleet: Fleet, moment: Moment):
+        """Find the filter of the node that the network is, whose messages are made; `moment`: a row's time."""
         self.fleet, self._moment = fleet, moment
         nodes = {name: filter for name, filter in fleet.network.fused.items() if isinstance(filter, NodeFilter)}
         # The filter of the node that this network is; "" and None where it is no single node, which sends nothing.

@@ -73,6 +73,7 @@ class ObservedService:
     """A service whose batches are observed; the loop uses it like the service."""
 
     def __init__(self, service: WatchableService, watch: ServiceObserver):
+        """Hold the service, and the watch that is told of each of its batches."""
         self.service, self.watch = service, watch
 
     def unpublished(self) -> list[Output]:

@@ -23,10 +23,10 @@ def make_refusal_of_message(message: Read, why: str, detail: str) -> Entry:
     """
     if isinstance(message, str):  # nothing was read
         return make_refusal_entry(None, {}, why, detail)
-    read = message.read if isinstance(message, UnreadMessage) else message
-    moment = read.time.isoformat() if isinstance(read.time, datetime) else read.time
-    parts = {"node": read.node, "sequence": read.sequence, "time": moment}
-    return make_refusal_entry(read.plant, parts, why, detail)
+    known = message.read if isinstance(message, UnreadMessage) else message
+    moment = known.time.isoformat() if isinstance(known.time, datetime) else known.time
+    identity = {"node": known.node, "sequence": known.sequence, "time": moment}
+    return make_refusal_entry(known.plant, identity, why, detail)
 
 
 def make_refusal_entry(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:

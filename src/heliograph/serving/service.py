@@ -4,7 +4,6 @@ import gc
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
-from itertools import repeat
 from math import inf
 from time import perf_counter
 from typing import NamedTuple
@@ -216,14 +215,13 @@ class Service:
 
     def published(self, outputs: Sequence[Output]) -> None:
         """Note the largest number of these outputs, which were published; the next commit records it."""
-        self._published = max(
-            (output.number for output in outputs if output.number is not None), default=self._published
-        )
+        numbers = [output.number for output in outputs if output.number is not None]
+        self._published = max(numbers, default=self._published)
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
-        last = list(self.plants.values()) if ended and not self.store.keeps else []  # plants that end here
-        finalised = self.fleet.finalise_plants(last, all_=True)
+        ending_plants = list(self.plants.values()) if ended and not self.store.keeps else []
+        finalised = self.fleet.finalise_plants(ending_plants, all_=True)
         entries = self._write_finals(finalised)
         self.fleet.free_slots(finalised)
         return self._commit({}, entries, 0)
@@ -359,15 +357,15 @@ class Service:
     def _write_finals(self, finalised: Iterable[FinalisedPlant]) -> list[Entry]:
         """Return entries to publish with final estimates: of rows now too old to change, if they have measurements."""
         rows = [(each.plant, row) for each in finalised for row in each.final if row.has_data()]
-        names = (plant.name for plant, _ in rows)
-        return [*map(Entry._make, zip(names, repeat("final"), self._write_estimates(b"final", rows)))]
+        bodies = self._write_estimates(b"final", rows)
+        return [Entry(plant.name, "final", body) for (plant, _), body in zip(rows, bodies, strict=True)]
 
     def _write_withdrawn(self, plant: PlantState, events: Iterable[WithdrawnEvent]) -> Iterator[Entry]:
         """Yield a refusal of each event of a plant that was used before its clock turned out wrong (LEAPT)."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
-            parts = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
-            yield make_refusal_entry(plant.name, parts, "future", LEAPT)
+            identity = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
+            yield make_refusal_entry(plant.name, identity, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""

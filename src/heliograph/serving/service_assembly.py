@@ -19,7 +19,7 @@ from heliograph.serving.brokers.line_reader import LineReader, redirected_file
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
-from heliograph.serving.device_status import DeviceStatusService
+from heliograph.serving.device_status_service import DeviceStatusService
 from heliograph.serving.service import Service
 from heliograph.serving.service_loop import (
     AbandonedError,
@@ -212,12 +212,12 @@ async def _serve_watch_page(settings: ServiceSettings) -> AsyncIterator[WrapServ
     if settings.page is None:
         yield lambda service: service
         return
-    from heliograph.files.sources.sources import Sources
+    from heliograph.files.sources.topic_reader import TopicReader
     from heliograph.serving.observation.page import parse_page_address, serve_page
     from heliograph.serving.observation.service_watch import watch_of
 
     table = settings.sources
-    uncounted = set() if table is None else Sources(table, settings.network).nodes_without_count
+    uncounted = set() if table is None else TopicReader(table, settings.network).nodes_without_count
     watch = watch_of(settings.network, settings.name, uncounted)
     async with serve_page(watch, parse_page_address(settings.page, hosts=settings.hosts)):
         yield watch.wrap
@@ -347,7 +347,11 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap
     checked.close()
 
     async def serve(number: int, stop: asyncio.Event) -> None:
-        """Serve the part with this number until `stop` is set."""
+        """Serve one part of the plants, that of this number among `parts`, until `stop` is set.
+
+        As all parts: with the settings of the service, the network's `program`, `wrap`, which shows it on the page, and
+        the store that was `checked` before.
+        """
         await _serve_part(settings, program, wrap, Part(number, parts), stop, checked)
 
     # Lease parts under a name that is unique to this process.

@@ -24,6 +24,7 @@ class StoppableWork:
     """
 
     def __init__(self, stop: asyncio.Event):
+        """Hold the event that ends the work, and make the one thread in which the service is called."""
         self.stop = stop
         self._thread, self._stopped_at = ThreadPoolExecutor(1), 0.0
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from heliograph.files.sources.json_field import Source
+from heliograph.files.sources.source_description import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Options
 from heliograph.numerics.check import TINY, check_count, fail, scalar
@@ -152,22 +152,25 @@ def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float
     if not isinstance(sources, Mapping):
         return sources, step
     # One source stands for a list of one.
-    by_topic = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in sources.items()}
-    step = next((row.step for rows in by_topic.values() for row in rows if isinstance(row, Source)), step)
+    by_topic = {topic: list(items) if isinstance(items, Sequence) else [items] for topic, items in sources.items()}
+    step = next((source.step for items in by_topic.values() for source in items if isinstance(source, Source)), step)
     measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
-    of_node = {topic: [row for row in rows if _is_for_node(row, node, measures)] for topic, rows in by_topic.items()}
-    return {topic: rows for topic, rows in of_node.items() if rows} or None, step
+    of_node = {
+        topic: [source for source in items if _is_for_node(source, node, measures)] for topic, items in by_topic.items()
+    }
+    return {topic: items for topic, items in of_node.items() if items} or None, step
 
 
-def _is_for_node(row: object, node: str, measures: bool) -> bool:
-    """Return whether a source (a `row`) is for a node: its own, of the inputs, or of a node that the message names.
+def _is_for_node(source: object, node: str, measures: bool) -> bool:
+    """Return whether a source is for a node: its own, of the inputs, or of a node that the message names.
 
     The last, whose `node` is no text but says where in a message the name is, if the node measures something
     (`measures`). What is no Source is refused later.
     """
-    if not isinstance(row, Source) or row.node in (node, INPUTS):
+    if not isinstance(source, Source) or source.node in (node, INPUTS):
         return True
-    return measures and not isinstance(row.node, str)
+    is_named_by_message = not isinstance(source.node, str)
+    return measures and is_named_by_message
 
 
 def _address_below(address: Address, node: str) -> Address:
@@ -181,7 +184,8 @@ def name_of_network(network: str) -> str:
     With `:name` behind, which chooses one of several networks there, "-name" follows. A colon before what is no name,
     as in a path, is part of the file.
     """
-    prefix, _, name = network.rpartition(":")
-    file, name = (prefix, f"-{name}") if name.isidentifier() and prefix else (network, "")
+    file, _, name = network.rpartition(":")
+    if not file or not name.isidentifier():
+        file, name = network, ""
     stem = Path(file).stem if file.endswith(".py") else file.rpartition(".")[2]
-    return f"{stem}{name}"
+    return f"{stem}-{name}" if name else stem

@@ -68,13 +68,13 @@ class SilenceWatch:
         if step is None or not self.fleet.deciding:
             return due
         for plant, origin in self._iterate_dated_plants(plants):
-            passed = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
+            present_step = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
             # The clock also confirms or contradicts a leap in time that no other clock has confirmed so far.
             leap = plant.leap
             has_open_leap = leap is not None and leap.now > -inf and not leap.believed
-            has_new_step = passed > plant.rows.held[-1].key[0]
-            if passed > plant.confirmed and (has_open_leap or has_new_step):
-                due.append((plant, float(passed)))
+            has_new_step = present_step > plant.rows.held[-1].key[0]
+            if present_step > plant.confirmed and (has_open_leap or has_new_step):
+                due.append((plant, float(present_step)))
         return due
 
     def find_plants_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
@@ -85,14 +85,14 @@ class SilenceWatch:
         if self.fleet.shortest_timeout == inf:
             return []
         self._looked = monotonic()
-        step, found = self.fleet.options.step, list[tuple[PlantState, float]]()
+        step, overdue = self.fleet.options.step, list[tuple[PlantState, float]]()
         for plant, origin in self._iterate_dated_plants(plants):
-            at = (now - origin) / timedelta(seconds=step or 1.0)
-            at = at if step is None else min(floor(at), self.fleet.end_step)
-            newly_dead = set(self._dead_senders(plant, at)) - set(self._published_dead_senders(plant))
-            if at > plant.now and newly_dead:
-                found.append((plant, float(at)))
-        return found
+            moment = (now - origin) / timedelta(seconds=step or 1.0)
+            moment = moment if step is None else min(floor(moment), self.fleet.end_step)
+            newly_dead = set(self._dead_senders(plant, moment)) - set(self._published_dead_senders(plant))
+            if moment > plant.now and newly_dead:
+                overdue.append((plant, float(moment)))
+        return overdue
 
     def looks_between_batches(self, lag: float) -> bool:
         """Return whether to look for timeouts after a batch: once in SHORTEST, a second, if messages are in time.
@@ -100,8 +100,9 @@ class SilenceWatch:
         `lag`: age of the batch's oldest message, s. Where messages wait for longer than a timeout (steps, or s), a
         sender only seems silent. Without any timeout (inf) there is nothing to look for.
         """
-        in_time = lag < self.fleet.shortest_timeout * (self.fleet.options.step or 1.0) < inf
-        return in_time and monotonic() > self._looked + SHORTEST
+        timeout = self.fleet.shortest_timeout * (self.fleet.options.step or 1.0)  # seconds
+        are_messages_in_time = lag < timeout < inf
+        return are_messages_in_time and monotonic() > self._looked + SHORTEST
 
     def _iterate_dated_plants(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
         """Yield the plants whose times are dates, with their origins; not those of which messages may wait.

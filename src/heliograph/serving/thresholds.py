@@ -47,13 +47,12 @@ def parse_threshold(text: str) -> Threshold:
     Raises:
         ValueError: what is no name, sign and number.
     """
-    typed = TYPED.fullmatch(text) if isinstance(text, str) else None
+    match = TYPED.fullmatch(text) if isinstance(text, str) else None
     try:
-        return Threshold(typed["name"], float(typed["level"]), typed["sign"] == ">")  # type: ignore[index]
+        return Threshold(match["name"], float(match["level"]), match["sign"] == ">")  # type: ignore[index]
     except (TypeError, ValueError):
-        raise fail(
-            "--threshold", "a state or output and its level, as level>30 or flow<600", show_value(text)
-        ) from None
+        expected = "a state or output and its level, as level>30 or flow<600"
+        raise fail("--threshold", expected, show_value(text)) from None
 
 
 def check_threshold_names(network: Network, thresholds: Thresholds) -> None:

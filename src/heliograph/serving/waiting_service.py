@@ -48,6 +48,7 @@ class WaitingService:
     """
 
     def __init__(self, service: BatchService, stop: asyncio.Event):
+        """Hold the service, whose last commit did not fail, and the event by which waiting ends."""
         self.service, self._stop, self._failed = service, stop, False
 
     def unpublished(self) -> list[Output]:
@@ -63,14 +64,14 @@ class WaitingService:
 
         A store that goes away in a commit may have made it: what it then has was not published.
         """
-        before = self.service.unpublished() if self._failed else []
+        unpublished = self.service.unpublished() if self._failed else []
         try:
             outputs = self.service.take(payloads)
         except AwayError:
             self._failed = True
             raise
         self._failed = False
-        return before + outputs
+        return unpublished + outputs
 
     def published(self, outputs: Sequence[Output]) -> None:
         """Pass on that outputs were published."""

@@ -37,7 +37,7 @@ from heliograph.simulation.covariance_claims import (
     yield_mistaken_beliefs,
 )
 from heliograph.simulation.description.diagram import write_diagram, write_html_table, write_short_diagram
-from heliograph.simulation.mode_flag_check import check_flags
+from heliograph.simulation.filter_flag_check import check_filter_flags
 from heliograph.simulation.network_index import (
     AlikeFilters,
     EstimatePlace,
@@ -185,7 +185,7 @@ class Network(Module):
                 check_type(f"fused {name!r}", fusion, AbstractFilter)
                 check_received(f"fused {name!r}", fusion, sum(node.received for node in self.nodes.values()))
                 links = [first(node.channel) for node in self.nodes.values() if isinstance(node, Node)]
-                check_flags(f"fused {name!r}", fusion, links)
+                check_filter_flags(f"fused {name!r}", fusion, links)
                 check_angles(f"fused {name!r}", fusion, self)
 
     @staticmethod

@@ -27,7 +27,7 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memories_of_channels import drop_names
-from heliograph.simulation.mode_flag_check import check_flags
+from heliograph.simulation.filter_flag_check import check_filter_flags
 from heliograph.simulation.sender_checks import (
     check_encoder,
     check_trigger,
@@ -116,7 +116,7 @@ class Node(Module):
         self.limits = make_limits(self.received, limits, invalid, stuck, self.sensor, self.channel)
         # A channel may deliver a flag of its mode beside the measurement: refused unless the filter's model has it too.
         for name, filter in self.filters.items():
-            check_flags(f"filter {name!r}", filter, [first(channel)])
+            check_filter_flags(f"filter {name!r}", filter, [first(channel)])
         # A sensor with feedback sends what the informed filter did not predict: no other filter could use that.
         receiving = [name for name, filter in self.filters.items() if filter.received]
         if self.informed_by is not None and receiving != [self.informed_by]:

@@ -26,15 +26,13 @@ Scope = dict[Any, str]
 
 
 class SharedSlots:
-    """Layout of numbers that all runs share: one function computes them, the other reads them.
-
-    A number in a loop has a place for each turn.
-    """
+    """Layout of numbers that all runs share, which one function computes and the other reads; all turns of a loop's."""
 
     def __init__(self, size: int):
-        self.size = size  # bytes
-        self.places: dict[Node, int] = {}
-        self.base = ""
+        """Begin the layout at byte `size` of the memory that is shared."""
+        self.size = size  # bytes that are taken
+        self.places: dict[Node, int] = {}  # the first byte of each number
+        self.base = ""  # name of the pointer to the memory, in LLVM's text
 
     def offset_of(self, node: Node) -> int:
         """Return the offset of a shared number in bytes, assigned at its first use: 8 for each turn of its loops."""
@@ -85,12 +83,13 @@ class FunctionWriter:
     """
 
     def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: SharedSlots):
+        """Begin the text of a function, without lines as yet; the class says what the arguments are."""
         self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
-        self.label = "entry"
-        self.count = 0
-        self.called: set[str] = set()
+        self.label = "entry"  # of LLVM's block that is being written
+        self.count = 0  # of names made so far, which are %1, %2, ...
+        self.called: set[str] = set()  # functions that must be declared
         self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}
@@ -117,12 +116,12 @@ class FunctionWriter:
         self.label = label
 
     def write_block(self, block: Block) -> None:
-        """Write a block's operations and statements, in order, as far as they are this function's (`mine`)."""
+        """Write the operations and statements of a block that this function computes (`self.mine`), in order."""
         for statement in block.items:
             if statement not in self.mine:
                 continue
             if isinstance(statement, Node):
-                if statement not in self.products:
+                if statement not in self.products:  # those are written with the sum that they are fused with
                     self._note_name(statement, self._write_node(statement))
             elif isinstance(statement, Store):
                 self._write_store(statement)
@@ -143,8 +142,8 @@ class FunctionWriter:
             return self._write_load(node)
         product = find_fused_product(node, self.products)
         if product is not None:
-            rest = node.args[0] if node.args[1] is product else node.args[1]
-            names = [self.write_operand(n) for n in (*product.args, rest)]
+            addend = node.args[0] if node.args[1] is product else node.args[1]
+            names = [self.write_operand(n) for n in (*product.args, addend)]
             return write_fused(node, product, names, self.add)
         if node.op in CALLED:
             self.called.add(name_called_function(node))
@@ -275,14 +274,15 @@ class FunctionWriter:
     def _write_store(self, store: Store) -> None:
         """Write the store of a number; a sum over runs is added to what is there, but in lanes beyond the last run."""
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
-        entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
+        is_sum = store.buffer in self.sums
+        entry = f"[{self.sums[store.buffer]} x i64]" if is_sum else f"%i{bits}"
         address = self._locate(store.buffer, store.offset, store.strides, store.indices, entry)
-        if store.buffer in self.sums:  # of doubles
+        if is_sum:  # of doubles
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
-            before = self.add(f"load {kind}, ptr {address}, align 8")
-            counted = self.add(f"select %i1 {self.counted_lanes}, {kind} {name}, {kind} zeroinitializer")
-            name = self.add(f"fadd {kind} {before}, {counted}")
+            sum_before = self.add(f"load {kind}, ptr {address}, align 8")
+            addend = self.add(f"select %i1 {self.counted_lanes}, {kind} {name}, {kind} zeroinitializer")
+            name = self.add(f"fadd {kind} {sum_before}, {addend}")
         if store.node.type == "bool":
             name, kind = self.add(f"zext {kind} {name} to %i8"), "%i8"
         self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")

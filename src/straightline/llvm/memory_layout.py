@@ -8,6 +8,7 @@ from straightline.llvm.function_writer import count_turns, list_loops_around
 from straightline.llvm.operations import BITS
 from straightline.nodes import REAL, Buffer, Node, Unsupported
 from straightline.program import Program, SummedOutputs, find_differing_items, list_used_nodes
+from straightline.size_limits import divide_rounded_up
 from straightline.vectors.elementary_functions import FUNCTIONS
 
 LINE = 64  # bytes: where vectors of any width may start
@@ -94,19 +95,19 @@ def split_shared_from_differing(
 
 
 def choose_vector_width(items: Iterable[Any]) -> int:
-    """Return the most runs of a vector: WIDEST, or twice as many where most of what is computed has 32 bits, not 64.
+    """Return how many runs a vector has, one in each lane: WIDEST, or twice as many if most operations have 32 bits.
 
-    An elementary function or a hash (threefry) counts as LONG operations.
+    An elementary function, or a hash (threefry), is as long as LONG others and counts as so many.
 
     A step of a particle filter that hashes two words and makes four normal numbers of floats of them, among 112
     operations on doubles, takes 12 ns a particle with 16 runs and 19 with 8; among 281 it takes 15 and 31.
     """
-    counts = Counter[int]()
+    operations_of_bits = Counter[int]()
     for x in items:
         if isinstance(x, Node):
             bits = 32 if x.op == "threefry" else BITS[x.type]
-            counts[bits] += LONG if x.op == "threefry" or x.op in FUNCTIONS else 1
-    return 2 * WIDEST if counts[32] > counts[64] else WIDEST
+            operations_of_bits[bits] += LONG if x.op == "threefry" or x.op in FUNCTIONS else 1
+    return 2 * WIDEST if operations_of_bits[32] > operations_of_bits[64] else WIDEST
 
 
 class MemoryLayout(NamedTuple):
@@ -129,15 +130,15 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     filled anew in each turn of a loop has a place for each turn. Places are offsets in bytes.
     """
     owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
-    added = set(parts.outputs_summed_in_memory)
-    _check_sums(parts.items, added)
+    sums = set(parts.outputs_summed_in_memory)
+    _check_sums(parts.items, sums)
     used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
-    own = [b for b in owners if b in parts.spread and b not in added and b not in used_in_place]
+    differing = [b for b in owners if b in parts.spread and b not in sums and b not in used_in_place]
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
-    turning = {b for b in common if list_loops_around(b.block)}
+    turning = {b for b in common if list_loops_around(b.block)}  # filled anew in each turn of a loop
     turning &= _find_read_buffers(mine) if turning else turning
-    scratch, in_scratch = _place_buffers(own, parts.width)
-    shared, in_shared = _place_buffers(common, 1, turning)
+    scratch, in_scratch = _place_buffers(differing, parts.width)
+    shared, in_shared = _place_buffers(common, width=1, turning=turning)
     return MemoryLayout(scratch=scratch, in_scratch=in_scratch, shared=shared, in_shared=in_shared, turning=turning)
 
 
@@ -168,6 +169,6 @@ def _place_buffers(
     for buffer in buffers:
         places[buffer] = start
         copies = count_turns(buffer.block) if buffer in turning else 1
-        # Up to the next cache line: -(-a // b) is a / b rounded up.
-        start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
+        bits = buffer.size * copies * width * BITS[buffer.type]
+        start += divide_rounded_up(bits, 8 * LINE) * LINE  # up to the next cache line
     return start, places

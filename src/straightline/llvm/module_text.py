@@ -112,20 +112,20 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
     lowering.graph = program.graph
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
-        must_store = number in last or not isinstance(value, StridedArray)
-        stored = (
-            _store_in_memory(lowering, value) if must_store else _find_whole_buffer_or_copy(lowering, value, results)
-        )
-        results.append(stored.buffer)
+        if number in last or not isinstance(value, StridedArray):
+            array = _store_in_memory(lowering, value)
+        else:
+            array = _find_whole_buffer_or_copy(lowering, value, results)
+        results.append(array.buffer)
     return results
 
 
 def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
     """Return an array as it is if it is all of a buffer that the program fills and no result has taken; else a copy."""
     buffer = value.buffer
-    whole = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
-    alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
-    if whole and alone and value.size == buffer.size:
+    is_contiguous = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
+    is_free = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
+    if is_contiguous and is_free and value.size == buffer.size:
         buffer.shape = value.shape
         return value
     return _store_in_memory(lowering, value) if value.size <= TABLE else copy_in_memory(lowering, value)
@@ -133,11 +133,11 @@ def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: l
 
 def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
     """Return an array of nodes or in memory, constants too, stored entry by entry in new memory."""
-    flat: list[Node] = lowering.nodes(value).ravel().tolist()
-    type: Type = value.type if isinstance(value, StridedArray) else flat[0].type
+    nodes: list[Node] = lowering.nodes(value).ravel().tolist()
+    type: Type = value.type if isinstance(value, StridedArray) else nodes[0].type
     buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
-    for index, node in enumerate(flat):
-        lowering.graph.store(buffer, node, index, (), ())
+    for index, node in enumerate(nodes):
+        lowering.graph.store(buffer, node, offset=index, strides=(), indices=())
     return StridedArray.of_whole_buffer(buffer)
 
 
@@ -296,7 +296,10 @@ def _write_mover_call(
 def _request_rows_ahead(
     writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
-    """Let the longest loop, if any, prefetch memory: of inputs that are taken next, and of outputs to be given."""
+    """Let the longest loop, if any, prefetch memory: of inputs that the next block takes, and of outputs it will give.
+
+    `names` are the pointers to the buffers' memory in LLVM's text; `taken` are the inputs, `given` the outputs.
+    """
     writer.asking_loop = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
     if writer.asking_loop is not None:
         writer.asked_rows = _locate_rows(writer, names, taken, given, parts.width, writer.asking_loop)

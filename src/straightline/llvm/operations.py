@@ -185,9 +185,9 @@ def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
 
     `names` are those of the number and of the shift, `text` is the vector's type; `emit` appends an operation.
     """
-    op, type, (a, b), by = node.op, node.args[0].type, names, node.args[1]
-    instruction = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")
-    if by.op == "constant" and 0 <= by.value < BITS[type]:
+    type, (a, b), shift = node.args[0].type, names, node.args[1]
+    instruction = {"shift_left": "shl", "shift_right": "lshr"}.get(node.op, "ashr")
+    if shift.op == "constant" and 0 <= shift.value < BITS[type]:
         return emit(f"{instruction} {text} {a}, {b}")
     # By at most all bits but one, which leaves the sign; other shifts by more are zero.
     clamped_shift = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")

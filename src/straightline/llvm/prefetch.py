@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from straightline.nodes import Loop, Node
+from straightline.size_limits import divide_rounded_up
 
 LINE = 64  # bytes
 PATIENCE = 8  # operations of vectors, of 0.3 ns, that take as long as a line: at 24 GB/s it is there in 2.7 ns
@@ -34,12 +35,12 @@ def find_longest_loop(items: Iterable[Any]) -> Loop | None:
 
 
 def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
-    """Return how many cache lines a loop prefetches in each of its turns, so that in all it does for rows of W runs.
+    """Return how many cache lines a loop prefetches in each turn, so that all turns do so for the rows of `width` runs.
 
     0 where these take longer than its operations (a line as long as PATIENCE of them): a loop that does little but move
-    numbers hides nothing beside them. `bytes` are those of a row, one run's numbers; `width` is W.
+    numbers hides nothing beside them. `bytes` are those of a row, one run's numbers.
     """
-    lines = -(-bytes * width // ((loop.length or 1) * LINE))
+    lines = divide_rounded_up(bytes * width, (loop.length or 1) * LINE)
     operations = sum(isinstance(x, Node) and x.op != "load" for x in loop.body.items)
     return lines if lines * PATIENCE <= operations else 0
 
@@ -56,8 +57,11 @@ def write_prefetch_requests(
         lanes: text of the number of rows.
         add: appends an operation, and names its result.
     """
-    # This turn's share begins at counter / turns of all bytes.
-    done = add(f"mul i64 {add(f'mul i64 {counter}, {rows.bytes}')}, {lanes}")
-    place = add(f"getelementptr i8, ptr {rows.start}, i64 {add(f'udiv i64 {done}, {turns}')}")
-    lines = [add(f"getelementptr i8, ptr {place}, i64 {LINE * k}") for k in range(rows.lines)]
+    # This turn's share begins at byte counter * bytes * lanes / turns.
+    product = add(f"mul i64 {counter}, {rows.bytes}")
+    product = add(f"mul i64 {product}, {lanes}")
+    first_byte = add(f"udiv i64 {product}, {turns}")
+    start = add(f"getelementptr i8, ptr {rows.start}, i64 {first_byte}")
+    lines = [add(f"getelementptr i8, ptr {start}, i64 {LINE * k}") for k in range(rows.lines)]
+    # To be read or written; of moderate locality (2), and in the cache of data (1).
     return [f"call void @llvm.prefetch.p0(ptr {line}, i32 {int(rows.writes)}, i32 2, i32 1)" for line in lines]

@@ -18,6 +18,7 @@ class TextLines:
     """Text with fresh names."""
 
     def __init__(self) -> None:
+        """Begin a text without lines; `count` is the number of names made so far."""
         self.lines: list[str] = []
         self.count = 0
 
@@ -67,16 +68,15 @@ def write_mover(move: MoverOptions, width: int) -> str:
     side = min(REGISTER // bits if move.squared or move.few else FEW, width)  # runs that are moved together: a group
     if move.few and width > 1:
         _write_register_mover(text, move, side, width)
-    for group in range(0, width, side):
-        rows = _write_row_addresses(text, bits, range(group, group + side))
+    for first_lane in range(0, width, side):
+        rows = _write_row_addresses(text, bits, range(first_lane, first_lane + side))
+        group = _RunsInLanes(text, rows, width, first_lane, bits, move.inwards)
         first_entry = "0"
         # Squares of `side` runs and as many entries, then the remaining entries one by one.
         if move.squared and not move.few:
-            write_square = _make_square_transposer(text, rows, width, group, bits, move.inwards)
-            text.write_loop(f"g{group}", "0", "%size", side, write_square)
+            text.write_loop(f"g{first_lane}", "0", "%size", side, group.write_square)
             first_entry = text.add(f"and i64 %size, {-side}")  # size rounded down to a multiple of side
-        write_entry = _make_entry_mover(text, rows, width, group, bits, move.inwards)
-        text.write_loop(f"h{group}", first_entry, "%size", 1, write_entry)
+        text.write_loop(f"h{first_lane}", first_entry, "%size", 1, group.write_entry)
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
     return f"define internal void @{move.name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}}\n"
@@ -132,56 +132,69 @@ def _write_address(bits: int, start: str, number: int) -> str:
 def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
     """Write the choice of numbers out of registers; return the name of the register that has them, lane by lane.
 
-    By one shuffle for each register: of what was chosen so far and its own numbers, which a mask counts from `side` on.
+    Each lane keeps what was chosen for it so far, or takes its number from the next register: by one shuffle of the
+    two for each register, whose mask counts the second one's numbers from `side` on.
 
-    places: for each lane the number of the register that has its number, and the place there.
+    places: for each lane which register has its number, and in which lane there.
     """
-    chosen, side = "poison", len(places)
-    for number in sorted({register for register, _ in places}):
-        order = [side + place if register == number else lane for lane, (register, place) in enumerate(places)]
+    chosen, side = "poison", len(places)  # a register of which no number is set
+    for second in sorted({register for register, _ in places}):
+        order = [side + place if register == second else lane for lane, (register, place) in enumerate(places)]
         mask = ", ".join(f"i32 {place}" for place in order)
-        pair = f"{vector} {chosen}, {vector} {registers[number]}"
+        pair = f"{vector} {chosen}, {vector} {registers[second]}"
         chosen = text.add(f"shufflevector {pair}, <{side} x i32> <{mask}>")
     return chosen
 
 
-def _make_square_transposer(
-    text: TextLines, rows: list[str], width: int, group: int, bits: int, inwards: bool
-) -> Callable[[str], None]:
-    """Return a function that writes the move of one square: entries i to i + n - 1 of n runs, to lanes or back.
+class _RunsInLanes(NamedTuple):
+    """Some runs that are moved together, from their rows to neighbouring lanes or back.
 
-    A square is n x n numbers, whose rows are runs in a caller's array and entries in lanes.
-
-    Args:
-        text: where it is written.
-        rows: names of the addresses of the n runs' first entries, n a power of two.
-        width: lanes of a vector.
-        group: the lane of the first of these runs.
-        bits: of a number.
-        inwards: whether from runs to lanes.
-
-    Returns:
-        The function of the name of i.
+    `text` takes what is written. `rows`: names of the addresses of the runs' first entries. `width`: lanes of a vector,
+    of which the runs have `first_lane` and those behind it. `bits`: of a number. `inwards`: from rows to lanes.
     """
 
-    def write_square(i: str) -> None:
-        """Write the transposition of one square: load its rows, exchange halves until each is a column, store."""
-        vector = f"<{len(rows)} x i{bits}>"
-        # Entry i of each run; and in lanes, lane `group` of each entry: number (i + k) width + group for entry i + k.
-        in_rows = [text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}") for row in rows]
-        base = text.add(f"mul i64 {i}, {width}")
-        base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
-        in_lanes = [text.add(f"getelementptr i{bits}, ptr {base}, i64 {k * width + group}") for k in range(len(rows))]
-        sources, targets = (in_rows, in_lanes) if inwards else (in_lanes, in_rows)
-        moved = [text.add(f"load {vector}, ptr {address}, align {bits // 8}") for address in sources]
-        # Transposed by halves: exchange the off-diagonal quarters, then those of each quarter, down to single numbers.
-        half = len(rows) // 2
-        while half:
-            moved, half = _exchange_squares(text, moved, half, bits), half // 2
-        for address, column in zip(targets, moved, strict=True):
-            text.lines.append(f"  store {vector} {column}, ptr {address}, align {bits // 8}")
+    text: TextLines
+    rows: list[str]
+    width: int
+    first_lane: int
+    bits: int
+    inwards: bool
 
-    return write_square
+    def write_square(self, i: str) -> None:
+        """Write the transposition of a square, entries i to i + n - 1 of the n runs, n a power of two.
+
+        Its rows (runs in memory, or entries in lanes) are loaded; halves are exchanged until each is a column, stored.
+        """
+        text, bits, side = self.text, self.bits, len(self.rows)
+        vector, alignment = f"<{side} x i{bits}>", f"align {bits // 8}"
+        # Addresses of entry i of each run; and in lanes, of the first lane of entry i + k: number (i + k) width + lane.
+        in_rows = [text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}") for row in self.rows]
+        base = text.add(f"mul i64 {i}, {self.width}")
+        base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
+        offsets = [k * self.width + self.first_lane for k in range(side)]
+        in_lanes = [text.add(f"getelementptr i{bits}, ptr {base}, i64 {offset}") for offset in offsets]
+        sources, targets = (in_rows, in_lanes) if self.inwards else (in_lanes, in_rows)
+        registers = [text.add(f"load {vector}, ptr {address}, {alignment}") for address in sources]
+        # Transposed by halves: exchange the off-diagonal quarters, then those of each quarter, down to single numbers.
+        half = side // 2
+        while half:
+            registers, half = _exchange_squares(text, registers, half, bits), half // 2
+        for address, column in zip(targets, registers, strict=True):
+            text.lines.append(f"  store {vector} {column}, ptr {address}, {alignment}")
+
+    def write_entry(self, i: str) -> None:
+        """Write the move of entry i of each run, one number after another."""
+        text, bits = self.text, self.bits
+        # Entry i of all lanes is a row of `width` numbers, of which these runs have `first_lane` and those behind it.
+        base = text.add(f"mul i64 {i}, {self.width}")
+        base = text.add(f"add i64 {base}, {self.first_lane}")
+        base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
+        for lane, row in enumerate(self.rows):
+            in_row = text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}")
+            in_lane = text.add(f"getelementptr i{bits}, ptr {base}, i64 {lane}")
+            source, target = (in_row, in_lane) if self.inwards else (in_lane, in_row)
+            number = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
+            text.lines.append(f"  store i{bits} {number}, ptr {target}, align {bits // 8}")
 
 
 def _exchange_squares(text: TextLines, rows: list[str], half: int, bits: int) -> list[str]:
@@ -202,26 +215,3 @@ def _exchange_squares(text: TextLines, rows: list[str], half: int, bits: int) ->
             pair = f"<{side} x i{bits}> {rows[i]}, <{side} x i{bits}> {rows[j]}"
             exchanged[row] = text.add(f"shufflevector {pair}, <{side} x i32> <{mask}>")
     return exchanged
-
-
-def _make_entry_mover(
-    text: TextLines, rows: list[str], width: int, group: int, bits: int, inwards: bool
-) -> Callable[[str], None]:
-    """Return a function that writes the move of entry i of each run, to its lane or back; arguments as above."""
-
-    def write_entry(i: str) -> None:
-        """Write the move of entry i of each lane, one after another: from its run to the lanes, or back.
-
-        Entry i of `width` lanes is a row of them, of which these, `group` and on, are moved.
-        """
-        base = text.add(f"mul i64 {i}, {width}")
-        base = text.add(f"add i64 {base}, {group}")
-        base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
-        for lane, row in enumerate(rows):
-            run = text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}")
-            here = text.add(f"getelementptr i{bits}, ptr {base}, i64 {lane}")
-            source, target = (run, here) if inwards else (here, run)
-            number = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
-            text.lines.append(f"  store i{bits} {number}, ptr {target}, align {bits // 8}")
-
-    return write_entry

@@ -3,7 +3,6 @@
 An expensive branch is computed only if some run takes it (a guarded block).
 """
 
-from itertools import pairwise
 from typing import Any
 
 import jax
@@ -93,13 +92,14 @@ def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[No
     """
     graph = lowering.graph
     if which.op == "convert" and which.args[0].type == "bool":
-        which = which.args[0]
+        which = which.args[0]  # the flag that the integer was made of
     if which.type == "bool":
         return [graph.node("not", "bool", which), which]
     # Branch k is taken if the index is at most k, but not at most k - 1.
     at_most = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
-    between = [graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(at_most)]
-    return [at_most[0], *between, graph.node("not", "bool", at_most[-1])]
+    above = [graph.node("not", "bool", flag) for flag in at_most]
+    between = [graph.node("and", "bool", above[k - 1], at_most[k]) for k in range(1, count - 1)]
+    return [at_most[0], *between, above[-1]]
 
 
 def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:

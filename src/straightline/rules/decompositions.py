@@ -134,11 +134,11 @@ def _sort_by_transposition(
 
 def _exchange_if_descending(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
     """Exchange values i and i + 1, and their columns, in the lists, unless they are in ascending order."""
-    wrong = values[i] > values[i + 1]
+    is_descending = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
-    low, high = columns[i], columns[i + 1]
-    columns[i] = [jnp.where(wrong, y, x) for x, y in zip(low, high, strict=True)]
-    columns[i + 1] = [jnp.where(wrong, x, y) for x, y in zip(low, high, strict=True)]
+    pairs = list(zip(columns[i], columns[i + 1], strict=True))
+    columns[i] = [jnp.where(is_descending, second, first) for first, second in pairs]
+    columns[i + 1] = [jnp.where(is_descending, first, second) for first, second in pairs]
 
 
 def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -155,12 +155,15 @@ def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn
 
     The program is written out once for each; its k-th results, entry by entry, become the k-th array.
     """
-    (single,) = program.in_avals
-    leading = matrices.shape[: len(matrices.shape) - len(single.shape)]
-    flat = lowering.nodes(matrices).reshape(math.prod(leading), *single.shape)
-    items = [[lowering.nodes(x) for x in lowering.inline_program(program, [matrix])] for matrix in flat]
-    shapes = [result_shape(equation, k) for k in range(len(equation.outvars))]
-    return [arrange_nodes((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
+    (of_one_matrix,) = program.in_avals
+    leading = matrices.shape[: len(matrices.shape) - len(of_one_matrix.shape)]
+    flat = lowering.nodes(matrices).reshape(math.prod(leading), *of_one_matrix.shape)
+    results = [[lowering.nodes(x) for x in lowering.inline_program(program, [matrix])] for matrix in flat]
+    arrays = []
+    for k in range(len(equation.outvars)):
+        nodes = [node for of_matrix in results for node in of_matrix[k].ravel()]
+        arrays.append(arrange_nodes(nodes, result_shape(equation, k)))
+    return arrays
 
 
 @cache
@@ -252,10 +255,10 @@ def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
     Its inputs are constants of the four programs matvec, vecmat, solve and transpose_solve, then right sides.
     """
     programs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
-    before = lengths.matvec + lengths.vecmat
-    constants = inputs[before : before + lengths.solve]
-    right = inputs[before + lengths.solve + lengths.transpose_solve :]
-    return lowering.inline_program(programs.solve, [*constants, *right])
+    first = lengths.matvec + lengths.vecmat  # the first constant of `solve`
+    constants = inputs[first : first + lengths.solve]
+    right_sides = inputs[first + lengths.solve + lengths.transpose_solve :]
+    return lowering.inline_program(programs.solve, [*constants, *right_sides])
 
 
 IN_MEMORY |= {"lu": _lu, "lu_pivots_to_permutation": _permutation, "custom_linear_solve": _linear_solve}

@@ -39,12 +39,9 @@ def _make_elementwise_rule(op: str) -> Rule:
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return a node of the operation `op` for each entry of the result, of the arguments' entries there."""
-        shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
-        return [
-            arrange_nodes(
-                [node(op, type, *nodes) for nodes in zip(*broadcast_entries(inputs, shape), strict=True)], shape
-            )
-        ]
+        shape, type = result_shape(equation), result_type(equation)
+        arguments_of_entries = zip(*broadcast_entries(inputs, shape), strict=True)
+        return [arrange_nodes([lowering.graph.node(op, type, *nodes) for nodes in arguments_of_entries], shape)]
 
     return rule
 
@@ -89,13 +86,13 @@ def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
 def _raise_to_integer(graph: Graph, type: Type, params: Any, x: Node) -> Node:
     """Return x^n of a whole n, params["y"], by repeated squaring; for n < 0 one over x^-n."""
     exponent = abs(params["y"])
-    factors, square = [], x  # the power of x whose exponent is that of the lowest bit that is left
+    factors, power = [], x  # power: x, x^2, x^4, ..., for each bit of the exponent from the lowest on
     while exponent:
         if exponent % 2:
-            factors.append(square)
+            factors.append(power)
         exponent //= 2
         if exponent:
-            square = graph.node("mul", type, square, square)
+            power = graph.node("mul", type, power, power)
     unit = graph.constant(1.0 if type in REAL else 1, type)
     product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, unit)
     return product if params["y"] >= 0 else graph.node("div", type, unit, product)
@@ -185,11 +182,11 @@ def _make_total_order_rule(op: str) -> Callable[..., Node]:
         # All bits of a negative number are turned round, of others the sign's.
         if x.type not in REAL:
             return x
-        word, last = WORDS[x.type][0], int(x.type[1:]) - 1
+        word, highest = WORDS[x.type][0], int(x.type[1:]) - 1  # the unsigned type of as many bits; the sign's bit
         bits = graph.node("bitcast", word, x)
-        is_negative = graph.node("shift_right", word, bits, graph.constant(last, word))  # 0 or 1
+        is_negative = graph.node("shift_right", word, bits, graph.constant(highest, word))  # 0 or 1
         all_if_negative = graph.node("sub", word, graph.constant(0, word), is_negative)  # -1 has all bits set
-        sign = graph.constant(1 << last, word)
+        sign = graph.constant(1 << highest, word)
         return graph.node("xor", word, bits, graph.node("or", word, all_if_negative, sign))
 
     return lambda graph, type, params, x, y: graph.node(op, type, rank_by_bits(graph, x), rank_by_bits(graph, y))

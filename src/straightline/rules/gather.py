@@ -33,10 +33,11 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     if not fills_outside(equation):
         return [_gather_clipped(equation, lowering, x, indices)]
     indices = convert_to_32_bits(lowering, indices)
-    flags, missing = _is_inside(lowering, equation, x.shape, indices), make_fill_value(lowering, equation)
+    is_inside_by_row, fill_value = _is_inside(lowering, equation, x.shape, indices), make_fill_value(lowering, equation)
     gathered, numbers = _gather_clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
     for entry in np.ndindex(*gathered.shape):
-        gathered[entry] = select(lowering.graph, flags[_find_index_row(entry, numbers)], gathered[entry], missing)
+        is_entry_inside = is_inside_by_row[_find_index_row(entry, numbers)]
+        gathered[entry] = select(lowering.graph, is_entry_inside, gathered[entry], fill_value)
     return [gathered]
 
 
@@ -49,9 +50,9 @@ def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], i
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
     for row in np.ndindex(*flags.shape):
         for axis, start in zip(axes, indices[row], strict=True):
-            here = is_inside(lowering.graph, start, shape[axis] - sizes[axis])
-            before: Any = flags[row]
-            flags[row] = lowering.graph.node("and", "bool", before, here)
+            is_inside_along_axis = is_inside(lowering.graph, start, last=shape[axis] - sizes[axis])
+            so_far: Any = flags[row]
+            flags[row] = lowering.graph.node("and", "bool", so_far, is_inside_along_axis)
     return flags
 
 
@@ -97,15 +98,14 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
     last = x.shape[axis] - sizes[axis]
     if last >= FEW:
         return _gather_from_memory(lowering, equation, x, indices, column)
-    cases = [
-        _gather_clipped(equation, lowering, x, _replace_indices(lowering, indices, column, n)) for n in range(last + 1)
-    ]
+    known_cases = [_replace_indices(lowering, indices, column, place) for place in range(last + 1)]
+    cases = [_gather_clipped(equation, lowering, x, known) for known in known_cases]
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
-        which = indices[(*_find_index_row(entry, numbers), column)]
-        if which.op != "constant":  # where it is known, all cases are the same
+        index = indices[(*_find_index_row(entry, numbers), column)]
+        if index.op != "constant":  # where it is known, all cases are the same
             entry_of_cases = [np.array(case[entry], dtype=object) for case in cases]
-            selected[entry] = select_array(lowering.graph, which, entry_of_cases)[()]
+            selected[entry] = select_array(lowering.graph, index, entry_of_cases)[()]
     return selected
 
 

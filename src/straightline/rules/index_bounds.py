@@ -23,18 +23,18 @@ def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
     graph = lowering.graph
     if start.type[0] == "u":  # an unsigned number may be too large for i64
         start = graph.node("min", start.type, start, graph.constant(last, start.type))
-    wide = graph.node("convert", "i64", start)
-    return graph.node(
-        "min", "i64", graph.node("max", "i64", wide, graph.constant(0, "i64")), graph.constant(last, "i64")
-    )
+    place = graph.node("convert", "i64", start)
+    at_least_zero = graph.node("max", "i64", place, graph.constant(0, "i64"))
+    return graph.node("min", "i64", at_least_zero, graph.constant(last, "i64"))
 
 
 def is_inside(graph: Graph, start: Node, last: int) -> Node:
     """Return the node of whether a place is one of 0 ... last; an unsigned one cannot be below 0."""
-    below = graph.node("le", "bool", start, graph.constant(last, start.type))
+    is_at_most_last = graph.node("le", "bool", start, graph.constant(last, start.type))
     if start.type[0] == "u":
-        return below
-    return graph.node("and", "bool", below, graph.node("ge", "bool", start, graph.constant(0, start.type)))
+        return is_at_most_last
+    is_at_least_zero = graph.node("ge", "bool", start, graph.constant(0, start.type))
+    return graph.node("and", "bool", is_at_most_last, is_at_least_zero)
 
 
 def fills_outside(equation: JaxprEqn) -> bool:

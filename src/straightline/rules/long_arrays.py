@@ -130,8 +130,8 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     Written out are results of one number from arrays of which nodes may be loaded, short arrays, and products by a
     known matrix whose zeros leave few terms.
     """
-    to_number = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
-    if to_number or not is_long(inputs):
+    is_short_scalar_product = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
+    if is_short_scalar_product or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     arrays = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
     if (factors := _find_sparse_product(equation, arrays)) is not None:

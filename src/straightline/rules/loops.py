@@ -3,10 +3,10 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jax.extend.core import JaxprEqn
+from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from straightline.graph import Graph
 from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, list_nodes
@@ -28,14 +28,17 @@ def repeat_turns(
     """
     graph, outer = lowering.graph, lowering.graph.current
 
-    def body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
-        """Return the next carry, and the memory (length, ...), around the loop, in which each turn stores a row."""
+    def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
+        """Lower one of the `length` turns by `turn`; return the next carry, and memory with a row for each turn.
+
+        The memory (length, ...) belongs to the block `outer` around the loop; the turn of row k stores row k of it.
+        """
         loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
         following, stacked = turn(row, carry)
         return following, [_store_row(lowering, length, x, counter, backwards, outer) for x in stacked]
 
-    return _lower_loop(lowering, length, carry, body)
+    return _lower_loop(lowering, length, carry, lower_body)
 
 
 def _lower_loop(
@@ -101,15 +104,15 @@ def _store_row(
 
     The row's number is that of the turn, `counter`, or, `backwards`, counted from the last row back.
     """
-    flat = _list_nodes_of_numbers(value)
-    type: Type = flat[0].type if flat else "f64"
+    nodes = _list_nodes_of_numbers(value)
+    type: Type = nodes[0].type if nodes else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
     # The first place of each node in a row, if some nodes have several: noted from the end on, so that the first stays.
-    size, first_places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
-    buffer.first = [first_places[node] for node in flat] if len(first_places) < size else []
-    start, stride = ((length - 1) * size, -size) if backwards else (0, size)
-    for entry, node in enumerate(flat):
-        lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
+    size, first_places = len(nodes), {node: place for place, node in reversed(list(enumerate(nodes)))}
+    buffer.first = [first_places[node] for node in nodes] if len(first_places) < size else []
+    first_row, stride = ((length - 1) * size, -size) if backwards else (0, size)
+    for place, node in enumerate(nodes):
+        lowering.graph.store(buffer, node, offset=first_row + place, strides=(stride,), indices=(counter,))
     return StridedArray.of_whole_buffer(buffer)
 
 
@@ -175,31 +178,56 @@ def _lower_long_scan(
     arrays, by number: one that the body returns unchanged is a constant of the loop; a long one is carried in memory
     (`in_memory`); all others are carried as numbers (`as_numbers`).
     """
-    program, count = equation.params["jaxpr"], len(carry)
+    params, program = equation.params, equation.params["jaxpr"]
     carried_in, carried_out = program.jaxpr.invars[len(fixed) :], program.jaxpr.outvars
-    changed = [k for k in range(count) if carried_out[k] is not carried_in[k]]
+    changed = [k for k in range(len(carry)) if carried_out[k] is not carried_in[k]]
     in_memory = {k: CarriedMemory(lowering, carry[k]) for k in changed if carry[k].size > WRITTEN_OUT}
     as_numbers = [k for k in changed if k not in in_memory]
-    rows = [put_in_memory(lowering, x) for x in rows]
-
-    def lower_turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Lower the body for one row of the stacked arguments; return the carried arrays as nodes, and what is stacked.
-
-        Of the `count` carried arrays those in `in_memory` are read and filled there, `as_numbers` are nodes.
-        """
-        arrays: dict[int, Value] = dict(zip(as_numbers, numbers, strict=True))
-        arrays |= {k: x.view_in_turn() for k, x in in_memory.items()}
-        whole_carry = [arrays.get(k, carry[k]) for k in range(count)]
-        results = lowering.inline_program(program, [*fixed, *whole_carry, *(x.row(row) for x in rows)])
-        nodes = [x if k in in_memory else lowering.nodes(x) for k, x in enumerate(results)]
-        fill_carried_memory(lowering, [(x, nodes[k]) for k, x in in_memory.items()])
-        return [nodes[k] for k in as_numbers], nodes[count:]
-
+    body = _ScanBody(
+        lowering, program, fixed, carry, as_numbers, in_memory, rows=[put_in_memory(lowering, x) for x in rows]
+    )
     start = [lowering.nodes(carry[k]) for k in as_numbers]
-    finals, stacked = repeat_turns(lowering, equation.params["length"], start, lower_turn, equation.params["reverse"])
+    finals, stacked = repeat_turns(lowering, params["length"], start, body.lower_turn, backwards=params["reverse"])
     after: dict[int, Value] = dict(zip(as_numbers, finals, strict=True))
     after |= {k: x.view_from_here() for k, x in in_memory.items()}
-    return [*(after.get(k, carry[k]) for k in range(count)), *stacked]
+    return [*(after.get(k, initial) for k, initial in enumerate(carry)), *stacked]
+
+
+class _ScanBody(NamedTuple):
+    """The body of a scan that stays a loop, and how its arguments are held.
+
+    Args:
+        lowering: the program that the loop is a part of.
+        program: the body, of the fixed arguments, all carried arrays, and a row of each stacked array.
+        fixed: arguments that are the same in each turn.
+        carry: all carried arrays as they begin; one that is in neither of the next two stays as it is.
+        as_numbers: which of them are carried as nodes, one for each number.
+        in_memory: the memory of the others, by their place in the carry.
+        rows: arrays in memory, of which a turn has one row.
+    """
+
+    lowering: Lowering
+    program: ClosedJaxpr
+    fixed: list[Value]
+    carry: list[Value]
+    as_numbers: list[int]
+    in_memory: "dict[int, CarriedMemory]"
+    rows: list[StridedArray]
+
+    def lower_turn(self, row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Lower one turn of the loop; return the carried nodes after it, and the results that it stacks, as nodes.
+
+        `row` is the row of the stacked arguments that the turn reads; `numbers` are the nodes, before the turn, of the
+        carried arrays `self.as_numbers`. Those in memory are read and filled there.
+        """
+        carried: dict[int, Value] = dict(zip(self.as_numbers, numbers, strict=True))
+        carried |= {k: memory.view_in_turn() for k, memory in self.in_memory.items()}
+        whole_carry = [carried.get(k, initial) for k, initial in enumerate(self.carry)]
+        inputs = [*self.fixed, *whole_carry, *(array.row(row) for array in self.rows)]
+        results = self.lowering.inline_program(self.program, inputs)
+        nodes = [x if k in self.in_memory else self.lowering.nodes(x) for k, x in enumerate(results)]
+        fill_carried_memory(self.lowering, [(memory, nodes[k]) for k, memory in self.in_memory.items()])
+        return [nodes[k] for k in self.as_numbers], nodes[len(self.carry) :]
 
 
 class CarriedMemory:
@@ -238,11 +266,15 @@ def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory
 
     An array that lies in carried memory itself, as where two are exchanged, is copied first.
     """
-    memory = {carried.memory for carried, _ in filled}
-    arrays = [(carried, put_in_memory(lowering, x)) for carried, x in filled]
-    arrays = [(carried, copy_in_memory(lowering, x) if x.buffer.owner[0] in memory else x) for carried, x in arrays]
-    for carried, x in arrays:
-        carried.fill(lowering, x)
+    carried_memory = {target.memory for target, _ in filled}
+    pairs = []
+    for target, value in filled:
+        array = put_in_memory(lowering, value)
+        is_carried = array.buffer.owner[0] in carried_memory
+        pairs.append((target, array, is_carried))
+    arrays = [copy_in_memory(lowering, array) if is_carried else array for _, array, is_carried in pairs]
+    for (target, _, _), array in zip(pairs, arrays, strict=True):
+        target.fill(lowering, array)
 
 
 def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
@@ -311,10 +343,11 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
 
-    def body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
-        """Write the check, then the body; return the next carry, selected by each run's condition, and nothing stacked.
+    def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
+        """Lower the check of the condition, then one turn; return the next carry, and nothing that is stacked.
 
-        The loop goes on while any run's condition holds; a run whose own does not keeps its numbers.
+        `params` are JAX's, with both programs; `of_condition` and `of_body` their arguments beside the carry. The loop
+        goes on while any run's condition holds; a run whose own does not keeps its numbers.
         """
         active = lowering.nodes(lowering.inline_program(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), list_nodes(active))
@@ -322,7 +355,8 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         moved = [lowering.nodes(x) for x in lowering.inline_program(params["body_jaxpr"], [*of_body, *carry])]
         return [_select_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
 
-    return _lower_loop(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
+    start = [lowering.nodes(x) for x in inputs[conditional + fixed :]]
+    return _lower_loop(lowering, None, start, lower_body)[0]
 
 
 def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:

@@ -29,9 +29,10 @@ def _make_reduction_rule(op: str, empty: float) -> Rule:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         # A row of terms for each entry of the result; a sum over nothing has rows of length 0.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
-        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
-        neutral = _replace_not_finite(type, empty)
-        return [arrange_nodes([combine_nodes(lowering.graph, op, type, row, neutral) for row in x.tolist()], shape)]
+        rows = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
+        of_no_entries = _replace_not_finite(type, empty)
+        nodes = [combine_nodes(lowering.graph, op, type, row, of_no_entries) for row in rows.tolist()]
+        return [arrange_nodes(nodes, shape)]
 
     return lower_operation
 
@@ -83,10 +84,13 @@ def _make_extreme_index_rule(op: str) -> Rule:
     """Return the rule of `argmax` (op "gt") or `argmin` ("lt"): along one axis, with the result's other axes."""
 
     def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the index of the greatest (`op` "gt") or least ("lt") entry along the axis, by the other axes."""
+        """Return the index along the axis of the greatest (`op` "gt") or least ("lt") entry, for each place beside it.
+
+        That is argmax, or argmin, of the array's nodes along one axis.
+        """
         axis = equation.params["axes"][0]
-        x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
-        indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in x.tolist()]
+        rows = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
+        indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in rows.tolist()]
         return [arrange_nodes(indices, result_shape(equation))]
 
     return lower_argument_of_extreme
@@ -220,9 +224,9 @@ def _for_each_matrix(function: Any) -> Rule:
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return what `function` makes of the matrices at each place on the axes before the last two, one by one."""
-        flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
-        items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
-        return [arrange_nodes((x for item in items for x in item.ravel().tolist()), result_shape(equation))]
+        stacks = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
+        results = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*stacks, strict=True)]
+        return [arrange_nodes((node for x in results for node in x.ravel().tolist()), result_shape(equation))]
 
     return rule
 

@@ -39,9 +39,9 @@ def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
 
 def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
     """Return the hash of a counter's two words by a key, as a new key: of its upper and lower 32 bits."""
-    both = threefry(graph, key, high, low)
-    shifted = graph.node("shift_right", "u64", both, graph.constant(32, "u64"))
-    return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
+    bits = threefry(graph, key, high, low)
+    upper = graph.node("shift_right", "u64", bits, graph.constant(32, "u64"))
+    return RandomKey(graph.node("convert", "u32", upper), graph.node("convert", "u32", bits))
 
 
 def _make_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -93,15 +93,15 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     _check_key_type(equation.outvars[0])
     graph = lowering.graph
 
-    def words(number: Node) -> RandomKey:
-        """Return the key of a number: its upper 32 bits, 0 for a type of 32 bits, and its lower ones."""
-        if number.type[1:] == "32":
-            return RandomKey(graph.constant(0, "u32"), graph.node("convert", "u32", number))
-        whole = graph.node("convert", "u64", number)
-        shifted = graph.node("shift_right", "u64", whole, graph.constant(32, "u64"))
-        return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", whole))
+    def make_key(seed: Node) -> RandomKey:
+        """Return the key of a seed: its upper 32 bits, 0 for a type of 32 bits, and its lower ones."""
+        if seed.type[1:] == "32":
+            return RandomKey(graph.constant(0, "u32"), graph.node("convert", "u32", seed))
+        bits = graph.node("convert", "u64", seed)
+        upper = graph.node("shift_right", "u64", bits, graph.constant(32, "u64"))
+        return RandomKey(graph.node("convert", "u32", upper), graph.node("convert", "u32", bits))
 
-    return [arrange_nodes(map(words, inputs[0].ravel().tolist()), result_shape(equation))]
+    return [arrange_nodes(map(make_key, inputs[0].ravel().tolist()), result_shape(equation))]
 
 
 def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:

@@ -20,6 +20,7 @@ def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]]
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the nodes of the array as `function` rearranges them."""
         return [function(inputs[0], equation.params, result_shape(equation))]
 
     return rule

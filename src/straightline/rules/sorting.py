@@ -32,11 +32,11 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 def _is_behind(graph: Graph, a: Node, b: Node) -> Node:
     """Return the node of whether a belongs behind b in ascending order: a > b, or a is NaN and b is none."""
-    larger = graph.node("gt", "bool", a, b)
+    is_larger = graph.node("gt", "bool", a, b)
     if a.type not in REAL:
-        return larger
-    number, missing = graph.node("eq", "bool", b, b), graph.node("ne", "bool", a, a)
-    return graph.node("or", "bool", larger, graph.node("and", "bool", missing, number))
+        return is_larger
+    a_is_nan, b_is_number = graph.node("ne", "bool", a, a), graph.node("eq", "bool", b, b)
+    return graph.node("or", "bool", is_larger, graph.node("and", "bool", a_is_nan, b_is_number))
 
 
 RULES |= {"sort": _sort}

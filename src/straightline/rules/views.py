@@ -26,8 +26,11 @@ def _make_view_rule(name: str, view: View) -> Rule:
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        viewed = view(inputs[0], equation.params, result_shape(equation))
-        return [viewed] if viewed is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+        """Return the `view` of an array in memory; where there is none, nodes by the operation's rule (`name`)."""
+        array_view = view(inputs[0], equation.params, result_shape(equation))
+        if array_view is not None:
+            return [array_view]
+        return list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
 
     return rule
 
@@ -76,7 +79,10 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
 
 
 def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower `dynamic_slice` of an array in memory to a view: starts that data decide become moves of its address."""
+    """Lower `dynamic_slice` of an array in memory to a view, which copies nothing.
+
+    A start that is known adds to the view's offset; one that data decide is a move: (stride, node of the start).
+    """
     sizes = equation.params["slice_sizes"]
     x = make_indexable(lowering, inputs[0], inputs[1:])
     if not isinstance(x, StridedArray):
@@ -176,9 +182,8 @@ def _view_window(
 
 def _match_strides(view: StridedArray, shape: tuple[int, ...]) -> list[int]:
     """Return the strides of a view in a shape that differs from its own by axes of length 1 alone: theirs are 0."""
-    rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
-    items = iter(rest)
-    return [next(items) if n != 1 else 0 for n in shape]
+    strides = iter([stride for length, stride in zip(view.shape, view.strides, strict=True) if length != 1])
+    return [next(strides) if length != 1 else 0 for length in shape]
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -221,8 +226,9 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
 def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
     """Return whether an array is all of a buffer that this block fills and that has no place in another buffer."""
     buffer = x.buffer
-    whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous_strides(x.shape)
-    return whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block
+    is_contiguous = not x.moves and x.offset == 0 and x.strides == contiguous_strides(x.shape)
+    is_whole = is_contiguous and x.size == buffer.size
+    return is_whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block
 
 
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
@@ -230,7 +236,7 @@ def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None
     graph = lowering.graph
     if x.size <= TABLE or not isinstance(x, StridedArray):
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
-            graph.store(buffer, node, start + index, (), ())
+            graph.store(buffer, node, offset=start + index, strides=(), indices=())
     else:
         buffer.place_buffer_inside(copy_in_memory(lowering, x).buffer, start)
 

@@ -122,10 +122,10 @@ def erf_inv(x: Vector) -> Vector:
 
     def compute_outer_factor() -> Vector:
         """Return the factor for w = -log(1 - x^2) >= 6.25, which one draw in a thousand needs: by two polynomials."""
-        is_middle, root = w < 16.0, sqrt(w)
-        beyond = polynomial(root - 5, INVERSE[2][::-1])
-        middle = polynomial(root - 3.25, INVERSE[1][::-1])
-        return select(is_middle, middle, beyond)
+        is_below_16, root = w < 16.0, sqrt(w)
+        above = polynomial(root - 5, INVERSE[2][::-1])
+        below = polynomial(root - 3.25, INVERSE[1][::-1])
+        return select(is_below_16, below, above)
 
     # The tables have the highest coefficient first, `polynomial` takes it last.
     inner_factor = polynomial(w - 3.125, INVERSE[0][::-1])

@@ -61,11 +61,11 @@ def find_format(x: Vector) -> PrecisionFormat:
 def exp(x: Vector) -> Vector:
     """Return e^x = 2^n e^r, n the integer nearest to x / ln 2, r = x - n ln 2, e^r = 1 + r + r^2 times a polynomial."""
     form = find_format(x)
-    count, n = round_to_nearest(x * LOG2_E)
-    r = fma(n, -form.ln2[1], fma(n, -form.ln2[0], x))
-    return _limit_result(
-        x, _scale_by_power_of_two(1 + fma(r * r, polynomial(r, form.exp), r), count), form.largest, form.smallest
-    )
+    integer_n, n = round_to_nearest(x * LOG2_E)
+    ln2_high, ln2_low = form.ln2
+    r = fma(n, -ln2_low, fma(n, -ln2_high, x))
+    exp_r = 1 + fma(r * r, polynomial(r, form.exp), r)
+    return _limit_result(x, _scale_by_power_of_two(exp_r, integer_n), form.largest, form.smallest)
 
 
 def exp_of_sum(x: Vector, low: Vector) -> Vector:
@@ -74,15 +74,15 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
     As `exp`, but with r = x + low - n ln 2, and with 1 + r, as sums of two numbers: the second is what rounding loses.
     """
     form = find_format(x)
-    count, n = round_to_nearest(x * LOG2_E)
-    first, rest = _reduce_argument(x, n)
-    r = first + (rest + low)
-    rest = (first - r) + (rest + low)
+    integer_n, n = round_to_nearest(x * LOG2_E)
+    reduced, rounding = _reduce_argument(x, n)
+    r = reduced + (rounding + low)
+    r_low = (reduced - r) + (rounding + low)
     leading = 1 + r
-    small = fma(r * r, polynomial(r, form.exp), fma(r, rest, rest))
-    return _limit_result(
-        x, _scale_by_power_of_two(leading + ((1 - leading + r) + small), count), form.largest, form.smallest
-    )
+    leading_low = 1 - leading + r
+    small = fma(r * r, polynomial(r, form.exp), fma(r, r_low, r_low))
+    exp_r = leading + (leading_low + small)
+    return _limit_result(x, _scale_by_power_of_two(exp_r, integer_n), form.largest, form.smallest)
 
 
 def expm1(x: Vector) -> Vector:
@@ -91,13 +91,13 @@ def expm1(x: Vector) -> Vector:
     n is the integer nearest to x / ln 2, and r = x - n ln 2. Below -50 the result is -1 to the last digit, as at -50.
     """
     form = find_format(x)
-    count, n = round_to_nearest(select(x < -50.0, -50.0, x) * LOG2_E)
+    integer_n, n = round_to_nearest(select(x < -50.0, -50.0, x) * LOG2_E)
     r, low = _reduce_argument(select(x < -50.0, -50.0, x), n)
     # e^(r + low) - 1 = r + low + r low + r^2/2 + ...
-    small = r + fma(r * r, polynomial(r, form.exp), fma(r, low, low))
-    power = _power_of_two(form, count - 1)
-    whole = 2 * fma(power, small, power - 0.5)
-    return _limit_result(x, select(abs(x) < form.negligible, x, whole), form.largest, -math.inf)
+    expm1_r = r + fma(r * r, polynomial(r, form.exp), fma(r, low, low))
+    power = _power_of_two(form, integer_n - 1)
+    result = 2 * fma(power, expm1_r, power - 0.5)
+    return _limit_result(x, select(abs(x) < form.negligible, x, result), form.largest, -math.inf)
 
 
 def log(x: Vector) -> Vector:
@@ -144,11 +144,11 @@ def round_to_nearest(x: Vector) -> tuple[Vector, Vector]:
 
 def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
     """Return x - n ln 2 as the sum of two numbers, the second what rounding takes from the first; ln 2 is a sum too."""
-    high, low = find_format(x).ln2
-    first = fma(n, -high, x)
-    rest = n * low
-    r = first - rest
-    return r, (first - r) - rest
+    ln2_high, ln2_low = find_format(x).ln2
+    first = fma(n, -ln2_high, x)
+    second = n * ln2_low
+    difference = first - second
+    return difference, (first - difference) - second
 
 
 def _power_of_two(form: PrecisionFormat, n: Vector) -> Vector:
@@ -179,8 +179,8 @@ def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
     return (k + form.round_bits).as_type(x.scalar) - form.round, m
 
 
-def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
-    """Return k ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero.
+def _log(k: Vector, f: Vector, low: Vector | float) -> Vector:
+    """Return k ln 2 + log(1 + f) + low, where `low` is small against the rest or the rest is zero.
 
     log(1 + f) = f - f^2 / 2 + s (f^2 / 2 + r), s = f / (2 + f), r a polynomial in s^2; ln 2 is a sum of two numbers.
     """
@@ -189,7 +189,8 @@ def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
     z = s * s
     half = 0.5 * f * f
     r = z * polynomial(z, form.log)
-    return fma(k, form.ln2[0], f - (half - fma(s, half + r, fma(k, form.ln2[1], more))))
+    ln2_high, ln2_low = form.ln2
+    return fma(k, ln2_high, f - (half - fma(s, half + r, fma(k, ln2_low, low))))
 
 
 def _set_log_outside_domain(x: Vector, value: Vector) -> Vector:

@@ -53,28 +53,31 @@ class FormulaBody:
         return self.add(args[0].scalar, f"call {real} @llvm.{intrinsic}({', '.join(f'{real} {a.name}' for a in args)})")
 
 
-def _make_operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
-    """Return the method of an operator of vectors: the instruction `real` on real numbers, `whole` on integers.
+def _make_operator(
+    real_instruction: str, integer_instruction: str, is_reflected: bool = False
+) -> Callable[["Vector", Operand], "Vector"]:
+    """Return the method of an operator of vectors, which writes LLVM's instruction for real numbers or for integers.
 
-    `turned`: whether the other argument is the first one, as in `2 - x`.
+    `is_reflected`: whether the vector is the second operand, as in `2 - x` (Python's __rsub__).
     """
 
     def apply(self: "Vector", other: Operand) -> "Vector":
-        """Return self op other, `turned` other op self: by the instruction `real` of real vectors, else `whole`."""
-        pair = (self, self.like(other))
-        a, b = reversed(pair) if turned else pair
-        return self.body.add(self.scalar, f"{real if self.scalar in REALS else whole} {self.type} {a.name}, {b.name}")
+        """Write the instruction for self and other (for other and self, if `is_reflected`); return its result."""
+        operands = (self, self.like(other))
+        a, b = reversed(operands) if is_reflected else operands
+        instruction = real_instruction if self.scalar in REALS else integer_instruction
+        return self.body.add(self.scalar, f"{instruction} {self.type} {a.name}, {b.name}")
 
     return apply
 
 
-def _make_comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"]:
-    """Return the method that compares vectors: by LLVM's condition `real` on real numbers, `whole` on all others."""
+def _make_comparison(real_condition: str, integer_condition: str) -> Callable[["Vector", Operand], "Vector"]:
+    """Return the method that compares vectors, by LLVM's condition for real numbers or for integers."""
 
     def compare(self: "Vector", other: Operand) -> "Vector":
-        """Return the truth values, lane by lane, of self op other: the condition `real` of real ones, else `whole`."""
-        how = f"fcmp {real}" if self.scalar in REALS else f"icmp {whole}"
-        return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
+        """Write the comparison of self with other; return its truth values, lane by lane."""
+        comparison = f"fcmp {real_condition}" if self.scalar in REALS else f"icmp {integer_condition}"
+        return self.body.add("i1", f"{comparison} {self.type} {self.name}, {self.like(other).name}")
 
     return compare
 
@@ -96,10 +99,10 @@ class Vector:
         """Convert a number to a vector of this type; vectors are returned unchanged."""
         return value if isinstance(value, Vector) else make_constant(self.body, self.scalar, value)
 
-    __add__, __radd__ = _make_operator("fadd", "add"), _make_operator("fadd", "add", turned=True)
-    __sub__, __rsub__ = _make_operator("fsub", "sub"), _make_operator("fsub", "sub", turned=True)
-    __mul__, __rmul__ = _make_operator("fmul", "mul"), _make_operator("fmul", "mul", turned=True)
-    __truediv__, __rtruediv__ = _make_operator("fdiv", "sdiv"), _make_operator("fdiv", "sdiv", turned=True)
+    __add__, __radd__ = _make_operator("fadd", "add"), _make_operator("fadd", "add", is_reflected=True)
+    __sub__, __rsub__ = _make_operator("fsub", "sub"), _make_operator("fsub", "sub", is_reflected=True)
+    __mul__, __rmul__ = _make_operator("fmul", "mul"), _make_operator("fmul", "mul", is_reflected=True)
+    __truediv__, __rtruediv__ = _make_operator("fdiv", "sdiv"), _make_operator("fdiv", "sdiv", is_reflected=True)
     __and__, __or__, __xor__ = _make_operator("and", "and"), _make_operator("or", "or"), _make_operator("xor", "xor")
     __lshift__, __rshift__ = _make_operator("shl", "shl"), _make_operator("ashr", "ashr")  # the second arithmetically
     __lt__, __le__ = _make_comparison("olt", "slt"), _make_comparison("ole", "sle")
@@ -146,10 +149,10 @@ def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
     Of two numbers the result is a vector of doubles.
     """
     body = condition.body
-    model = next((v for v in (yes, no) if isinstance(v, Vector)), make_constant(body, "double", 0.0))
-    a, b = model.like(yes), model.like(no)
+    any_vector = next((v for v in (yes, no) if isinstance(v, Vector)), make_constant(body, "double", 0.0))
+    a, b = any_vector.like(yes), any_vector.like(no)
     text = f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}"
-    return body.add(model.scalar, text)
+    return body.add(any_vector.scalar, text)
 
 
 def fma(a: Operand, b: Operand, c: Operand) -> Vector:
@@ -170,10 +173,10 @@ def copy_sign(magnitude: Vector, sign: Vector) -> Vector:
 
 def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
     """Evaluate c_0 + c_1 x + c_2 x^2 + ... by Horner's rule."""
-    *rest, total = coefficients
-    for c in reversed(rest):
-        total = fma(x, total, c)
-    return x.like(total)
+    *lower, value = coefficients
+    for c in reversed(lower):
+        value = fma(x, value, c)
+    return x.like(value)
 
 
 @cache

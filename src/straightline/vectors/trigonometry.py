@@ -59,7 +59,8 @@ def sin(x: Vector) -> Vector:
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
     value = select((quarter & 2).equals(0), value, -value)
-    return _use_library_where_large(x, select(abs(x) < 2.0 ** -(27 if x.scalar == "double" else 13), x, value), "sin")
+    small = 2.0 ** -(27 if x.scalar == "double" else 13)
+    return _use_library_where_large(x, select(abs(x) < small, x, value), "sin")
 
 
 def cos(x: Vector) -> Vector:
@@ -80,14 +81,14 @@ def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
     pi / 2 is a sum of three, taken off one by one; the first difference is exact.
     """
     quarter, n = round_to_nearest(x * (2 / math.pi))
-    parts = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS
-    first = fma(n, -parts[0], x)
-    # first - n parts[1] as a sum: the product and the difference each with what rounding takes from it.
-    product = n * parts[1]
+    high, middle, low = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS
+    first = fma(n, -high, x)
+    # first - n middle as a sum: the product and the difference each with what rounding takes from it.
+    product = n * middle
     second = first - product
-    taken = second - first
-    lost = (first - (second - taken)) - (product + taken)
-    rest = lost - fma(n, parts[1], -product) - n * parts[2]
+    subtracted = second - first
+    rounding_of_second = (first - (second - subtracted)) - (product + subtracted)
+    rest = rounding_of_second - fma(n, middle, -product) - n * low
     r = second + rest
     return quarter, r, (second - r) + rest
 
@@ -148,13 +149,12 @@ def atan2(y: Vector, x: Vector) -> Vector:
 
     That of |y / x|, taken from pi where x < 0, with the sign of y.
     """
-    ratio = abs(y / x)
-    both = abs(x).equals(abs(y))
-    # 0/0 and infinity/infinity: along an axis, or a diagonal.
-    ratio = select(both, select(y.equals(0.0), y.like(0.0), 1.0), ratio)
+    # Of equal sizes the ratio would be NaN for 0/0 and infinity/infinity: along an axis it is 0, on a diagonal 1.
+    have_equal_sizes = abs(x).equals(abs(y))
+    ratio = select(have_equal_sizes, select(y.equals(0.0), y.like(0.0), 1.0), abs(y / x))
     angle = _atan_of_positive(ratio)
-    behind = x.as_type(find_format(x).word) < 0
-    angle = select(behind, math.pi - (angle - PI_LOW[x.scalar]), angle)
+    is_x_negative = x.as_type(find_format(x).word) < 0  # by its sign bit, so that -0 is too
+    angle = select(is_x_negative, math.pi - (angle - PI_LOW[x.scalar]), angle)
     return copy_sign(select(_is_number(x) & _is_number(y), angle, math.nan), y)
 
 

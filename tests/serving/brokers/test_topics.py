@@ -274,7 +274,7 @@ def test_inspect_lists_the_topics_of_a_broker(server, capsys, kind):
 
 @pytest.mark.parametrize("kind", ["nats", "mqtt"])
 def test_a_broker_that_is_not_there_is_one_line(capsys, monkeypatch, kind):
-    monkeypatch.setattr("heliograph.serving.brokers.listening.WAIT", 1.0)
+    monkeypatch.setattr("heliograph.serving.brokers.broker_inspection.WAIT", 1.0)
     url = f"{kind}://127.0.0.1:{free_port()}"
     assert cli.main(["inspect", url]) == 2
     said = capsys.readouterr().err

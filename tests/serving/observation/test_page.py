@@ -16,7 +16,7 @@ from scipy.stats import chi2
 import heliograph as hg
 
 pytest.importorskip("uvicorn")
-from heliograph.files.sources import Sources
+from heliograph.files.sources import TopicReader
 from heliograph.live import LinkCounts
 from heliograph.serving.observation import parse_page_address, serve_page, watch_of
 from heliograph.serving.observation.running_nis import RunningNis
@@ -185,7 +185,7 @@ def test_what_is_lost_of_messages_without_a_count_is_not_counted():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     node = hg.Node(sensor, hg.perfect(), {"kalman": hg.kalman_filter(plant, sensor)})
     network = hg.Network(plant, {"a": node, "b": node})
-    uncounted = Sources(sources, network).nodes_without_count
+    uncounted = TopicReader(sources, network).nodes_without_count
     assert uncounted == {"a"}
     watch = watch_of(network, "house", uncounted)
     watch.totals.add_plant("", {name: LinkCounts(used=3, lost=0) for name in "ab"})

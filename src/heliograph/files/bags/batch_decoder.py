@@ -8,8 +8,8 @@ import numpy as np
 
 from heliograph.files.event_table import NONE, EventTable
 from heliograph.files.sources.derived_values import Computed
-from heliograph.files.sources.json_field import Source
-from heliograph.files.sources.sources import SECOND, Sources
+from heliograph.files.sources.source_description import Source
+from heliograph.files.sources.topic_reader import SECOND, TopicReader
 from heliograph.numerics.check import InputError
 
 if TYPE_CHECKING:
@@ -61,19 +61,21 @@ class MessageLayout:
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
         self._note_length(0)
-        end = self._locate_message_numbers(4, kind, "")
-        if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
-            raise LayoutNotFixedError  # a message is filled up to four bytes at most
+        end = self._locate_message_numbers(begin=4, kind=kind, prefix="")
+        has_padding_alone_behind = 0 <= len(data) - end < 4  # a message is filled up to a multiple of four bytes
+        if self.lengths[0] != HEAD or not has_padding_alone_behind or paths != self.fields.keys():
+            raise LayoutNotFixedError
 
     def fits(self, table: np.ndarray) -> np.ndarray:
         """Return whether each message of a table of bytes, (messages, size), has the layout's lengths, (messages,).
 
-        `self.lengths`: by the byte where one stands the length of a text or list, and in byte 0 the head of CDR.
+        `self.lengths`: {first byte of the length of a text or list: that length, a uint32}; at byte 0 messages have the
+        four bytes of the encoding's head instead.
         """
-        fits = np.ones(len(table), dtype=bool)
-        for begin, length in self.lengths.items():
-            fits &= _decode_column(table, begin, "uint32") == length
-        return fits
+        has_equal_lengths = np.ones(len(table), dtype=bool)
+        for first_byte, length in self.lengths.items():
+            has_equal_lengths &= _decode_column(table, first_byte, "uint32") == length
+        return has_equal_lengths
 
     def read_columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return each wanted field of messages of this layout, (messages,)."""
@@ -87,8 +89,9 @@ class MessageLayout:
         """
         if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
             raise LayoutNotFixedError
-        for name, (node, of) in self._definitions[kind][1]:
-            begin = self._locate_field_numbers(begin, str(node.name), of, prefix + name)
+        _constants, fields = self._definitions[kind]
+        for name, (node, item_type) in fields:
+            begin = self._locate_field_numbers(begin, str(node.name), item_type, prefix + name)
         return begin
 
     def _locate_field_numbers(self, begin: int, node: str, of: Any, path: str) -> int:
@@ -159,14 +162,15 @@ class BatchDecoder:
         sources: sources of the network.
     """
 
-    def __init__(self, reader: "AnyReader", sources: Sources):
+    def __init__(self, reader: "AnyReader", sources: TopicReader):
+        """Hold the bag's definitions of messages and the network's sources; no layout of a message is known yet."""
         self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
         self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
 
     def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
         """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
 
-        What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
+        What `TopicReader.read` says of a message at a time is what it gives: the same numbers, in the same order.
         """
         try:
             readings = self._read_by_node(batch)
@@ -256,9 +260,10 @@ def _list_paths_of_numbers(source: Source) -> list[str]:
     """
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutNotFixedError
+    values = [component for path in source.paths for component in _list_component_paths(path)]
     stamp = [] if source.time is None else [f"{source.time.path}.{field}" for field in STAMP]
-    values = [part for path in source.paths for part in _list_component_paths(path)]
-    return [*values, *stamp, *([] if source.sequence is None else [source.sequence.path])]
+    count = [] if source.sequence is None else [source.sequence.path]
+    return [*values, *stamp, *count]
 
 
 def _list_component_paths(path: str | Computed) -> tuple[str, ...]:
@@ -310,10 +315,10 @@ def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) 
     Raises:
         LayoutNotFixedError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
     """
-    numbers = [columns[part].astype(np.float64) for part in _list_component_paths(path)]
-    parts = [np.where(np.isfinite(number), number, np.nan) for number in numbers]
+    components = [columns[name].astype(np.float64) for name in _list_component_paths(path)]
+    finite_or_nan = [np.where(np.isfinite(numbers), numbers, np.nan) for numbers in components]
     try:
-        return parts[0] if isinstance(path, str) else np.asarray(path.of(*parts))
+        return finite_or_nan[0] if isinstance(path, str) else np.asarray(path.of(*finite_or_nan))
     except InputError:
         raise LayoutNotFixedError from None
 

@@ -58,10 +58,10 @@ class Pose:
     child: str = "base_link"
 
     def __post_init__(self) -> None:
-        """Check that each field, the name of the state that is this axis, is a text; None where there is no state."""
-        for name, value in vars(self).items():
-            if value is not None:
-                text(f"pose, {name}", value)
+        """Raise ValueError unless each field is a text, the name of the state on that axis, or None."""
+        for axis, state in vars(self).items():
+            if state is not None:
+                text(f"pose, {axis}", state)
 
     def places(self, states: tuple[str, ...]) -> tuple[list[int | None], list[int | None]]:
         """Return for each axis of the pose, and of the twist, the index of its state; None where it has none.
@@ -71,12 +71,13 @@ class Pose:
         Raises:
             ValueError: an unknown state.
         """
-        named: list[str | None] = [getattr(self, name) for name in (*AXES, *(f"v{axis}" for axis in AXES))]
-        for name in named:
-            if name is not None and name not in states:
-                raise fail("pose", f"names of the states {', '.join(states)}", repr(name))
-        places = [None if name is None else states.index(name) for name in named]
-        return places[:6], places[6:]
+        axes = (*AXES, *(f"v{axis}" for axis in AXES))
+        state_of_axis: list[str | None] = [getattr(self, axis) for axis in axes]
+        for state in state_of_axis:
+            if state is not None and state not in states:
+                raise fail("pose", f"names of the states {', '.join(states)}", repr(state))
+        indices = [None if state is None else states.index(state) for state in state_of_axis]
+        return indices[:6], indices[6:]
 
 
 def find_pose_states(states: tuple[str, ...]) -> Pose:
@@ -141,9 +142,9 @@ def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None
     Times that are steps are taken as seconds.
     """
     if time.dtype.kind == "M":
-        return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
-    begun = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
-    return [begun + round(at * 1e9) for at in time.tolist()]
+        return [int(nanoseconds) for nanoseconds in time.astype("datetime64[ns]").astype(np.int64)]
+    start = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
+    return [start + round(seconds * 1e9) for seconds in time.tolist()]
 
 
 def _make_valid_topic_word(name: str) -> str:
@@ -163,7 +164,8 @@ def _yield_topics_and_types(
 
     There is odometry where a state is an axis of the pose or twist, and deviations (sd) where the filter claims any.
     """
-    if any(state is not None for places in pose.places(states) for state in places):
+    axes_of_pose, axes_of_twist = pose.places(states)
+    if any(state is not None for state in (*axes_of_pose, *axes_of_twist)):
         yield f"{prefix}/odometry", ODOMETRY
     for state in states:
         yield f"{prefix}/{_make_valid_topic_word(state)}", NUMBER

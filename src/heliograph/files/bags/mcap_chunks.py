@@ -58,12 +58,14 @@ def _merge_chunks(
     starts = [chunk.message_start_time for chunk in chunks]
     earliest = [*accumulate(reversed(starts), min)][::-1]  # the earliest time of each chunk and all after it
     waiting: list[RawMessage] = []
-    for chunk, next_start in zip(chunks, [*earliest[1:], None], strict=True):
+    for chunk, earliest_of_later in zip(chunks, [*earliest[1:], None], strict=True):
         waiting = sorted([*waiting, *_yield_messages_of_chunk(storage, chunk, channels)], key=attrgetter("logged"))
-        # Those before the earliest that a later chunk may hold.
-        ready = len(waiting) if next_start is None else bisect_left(waiting, next_start, key=attrgetter("logged"))
-        yield from waiting[:ready]
-        waiting = waiting[ready:]
+        if earliest_of_later is None:
+            yield from waiting
+            return
+        count = bisect_left(waiting, earliest_of_later, key=attrgetter("logged"))  # of those before later chunks
+        yield from waiting[:count]
+        waiting = waiting[count:]
 
 
 def _yield_messages_of_chunk(

@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.files.bags.protobuf import ProtobufSchema
 from heliograph.files.bags.ros_bag import DATA_END, FOOTER, MAGIC, BagDamagedError
 from heliograph.files.messages.message_files import FileMessage
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.files.text.text_file import CutOffError
 from heliograph.numerics.check import InputError, error_text, fail
 
@@ -64,7 +64,7 @@ def holds_messages(path: Path) -> bool:
     return bool(encodings & {JSON, PROTOBUF})
 
 
-def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterator[FileMessage | InputError]:
     """Yield the messages of an MCAP file in its order, each with the moment when it was logged.
 
     Messages in other encodings have no content; one that its schema does not fit is an error.
@@ -112,7 +112,7 @@ class _StoredMessage(NamedTuple):
     types: dict[int, ProtobufType]
 
 
-def _yield_stored_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_StoredMessage]:
+def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | None) -> Iterator[_StoredMessage]:
     """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
 
     Raises:
@@ -157,25 +157,26 @@ def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
 
     The record has its number, then name and encoding, each behind its length, then LENGTH and the description of types.
     """
-    name, at = _read_sized_text(content, NUMBER.size)
-    encoding, at = _read_sized_text(content, at)
+    (number,) = NUMBER.unpack_from(content)
+    name, end = _read_sized_text(content, NUMBER.size)
+    encoding, end = _read_sized_text(content, end)
     if encoding != PROTOBUF:
         return {}
     try:
-        return {NUMBER.unpack_from(content)[0]: ProtobufType(name, ProtobufSchema.of(content[at + LENGTH.size :]))}
+        return {number: ProtobufType(name, ProtobufSchema.of(content[end + LENGTH.size :]))}
     except (ValueError, KeyError):
         return {}
 
 
 def _find_channels(file: BinaryIO) -> list[McapChannel]:
     """Return the channels of the summary of an MCAP file; without one, those that stand before the first message."""
-    # The footer says where the summary begins.
+    # The footer says where the summary begins; 0: there is none.
     file.seek(-END.size - len(MAGIC), os.SEEK_END)
-    kind, _, summary, _, _ = END.unpack(file.read(END.size))
-    if kind == FOOTER and summary and file.read() == MAGIC:
-        file.seek(summary)
-        if found := _list_channels(_read_records(file)):
-            return found
+    kind, _length, summary_start, _offsets_start, _checksum = END.unpack(file.read(END.size))
+    if kind == FOOTER and summary_start and file.read() == MAGIC:
+        file.seek(summary_start)
+        if channels := _list_channels(_read_records(file)):
+            return channels
     # Without a summary channels stand where they are first used: those behind the first message are not looked for.
     file.seek(len(MAGIC))
     return _list_channels(takewhile(lambda record: record[0] != MESSAGE, _read_records(file)))
@@ -187,7 +188,9 @@ def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
     for kind, content in records:
         if kind == SCHEMA:
             types |= _read_protobuf_schemas(content)
-        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []  # [0] is its number
+        elif kind == CHANNEL:
+            _number, channel = _read_channel(content, types)
+            channels.append(channel)
     return channels
 
 
@@ -225,11 +228,12 @@ def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[in
     `types`: types by number of a schema, as far as they are known; without them Protocol Buffers are BARE, unreadable.
     The record begins with two numbers, of channel and schema, before its topic.
     """
-    topic, at = _read_sized_text(content, 2 * NUMBER.size)
-    encoding, _ = _read_sized_text(content, at)
-    (schema,) = NUMBER.unpack_from(content, NUMBER.size)
-    encoding = BARE if encoding == PROTOBUF and schema not in types else encoding
-    return NUMBER.unpack_from(content)[0], McapChannel(topic, encoding, schema)
+    (number,), (schema,) = NUMBER.unpack_from(content), NUMBER.unpack_from(content, NUMBER.size)
+    topic, end = _read_sized_text(content, 2 * NUMBER.size)
+    encoding, _end = _read_sized_text(content, end)
+    if encoding == PROTOBUF and schema not in types:
+        encoding = BARE
+    return number, McapChannel(topic, encoding, schema)
 
 
 def _read_sized_text(content: bytes, at: int) -> tuple[str, int]:

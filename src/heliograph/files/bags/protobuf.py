@@ -93,9 +93,11 @@ class ProtobufSchema:
         for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
-            for number, add in ((4, schema._add_message_type), (5, schema._add_enum)):
-                for content in _list_values_of_field(file, number):
-                    add(content, f"{package}." if package else "", syntax == "proto3")
+            prefix, implicit = f"{package}." if package else "", syntax == "proto3"
+            for message_type in _list_values_of_field(file, 4):
+                schema._add_message_type(message_type, prefix, implicit)
+            for enumeration in _list_values_of_field(file, 5):
+                schema._add_enum(enumeration, prefix, implicit)
         return schema
 
     def _add_message_type(self, data: bytes, prefix: str, implicit: bool) -> None:
@@ -129,11 +131,11 @@ class ProtobufSchema:
         `prefix`: full name of what it stands in, with a dot; `implicit`: not used here (that of messages needs it).
         Numbers of fields: 1 its name, 2 its values; in a value 1 its name, 2 its number, 0 where absent.
         """
-        values = [
-            {number: value for number, _, value in read_fields(content)} for content in _list_values_of_field(data, 2)
-        ]
-        names = {_decode_signed(int(found.get(2, 0))): _decode_text(found[1]) for found in values}
-        self.enums[prefix + _read_text_field(data, 1)] = names
+        name_of_number = {}
+        for content in _list_values_of_field(data, 2):
+            fields = {number: value for number, _, value in read_fields(content)}
+            name_of_number[_decode_signed(int(fields.get(2, 0)))] = _decode_text(fields[1])
+        self.enums[prefix + _read_text_field(data, 1)] = name_of_number
 
     def decode(self, data: bytes, name: str, depth: int = 0) -> dict[str, Any]:
         """Return a message as a dictionary by the names of its fields.
@@ -173,7 +175,8 @@ class ProtobufSchema:
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
         if field.kind == ENUM:
-            return self.enums.get(field.of, {}).get(_decode_signed(value), _decode_signed(value))
+            number = _decode_signed(value)
+            return self.enums.get(field.of, {}).get(number, number)
         if field.kind == TEXT:
             return _decode_text(value)
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
@@ -219,11 +222,12 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     The highest bit of a byte says that another follows; a number has ten bytes at most, of which 64 bits count.
     """
     number = shift = 0
-    while at < len(data) and shift < 70:
-        byte = data[at]
-        number, at, shift = number | (byte & 127) << shift, at + 1, shift + 7
+    for place in range(at, min(at + 10, len(data))):
+        byte = data[place]
+        number |= (byte & 127) << shift
         if byte < 128:
-            return number & (1 << 64) - 1, at
+            return number & (1 << 64) - 1, place + 1
+        shift += 7
     raise ValueError("no message of Protocol Buffers, or one that was cut off")
 
 

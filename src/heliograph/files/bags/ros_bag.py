@@ -15,7 +15,7 @@ from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources.message_reading import Unread
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def read_bag(
-    path: Path, sources: Sources, events: EventTable, progress: Progress | None = None, strict: bool = False
+    path: Path, sources: TopicReader, events: EventTable, progress: Progress | None = None, strict: bool = False
 ) -> None:
     """Append the events of a network in a bag to a table; only the topics of the sources are decoded.
 
@@ -99,7 +99,7 @@ def read_bag(
     _note_unmatched_topics(path, sources, counts, events)
 
 
-def _note_unmatched_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
+def _note_unmatched_topics(path: Path, sources: TopicReader, counts: Counter[str], events: EventTable) -> None:
     """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
 
     `counts`: messages of the bag by topic. Topics of sources with a wildcard, + or #, are never said to be missing.
@@ -209,7 +209,7 @@ def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessa
 def _append_messages(
     path: Path,
     reader: "AnyReader",
-    sources: Sources,
+    sources: TopicReader,
     batch: list[RawMessage],
     done: int,
     table: EventTable,
@@ -250,12 +250,12 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
     """
     from rosbags.interfaces import Nodetype
 
-    _, fields = reader.typestore.fielddefs.get(kind, ([], []))
-    for name, (node, of) in fields if depth else ():
+    _constants, fields = reader.typestore.fielddefs.get(kind, ([], []))
+    for name, (node, field_type) in fields if depth else ():
         if node == Nodetype.BASE:
-            yield prefix + name, str(of[0])
-        elif node == Nodetype.NAME:
-            yield from list_fields(reader, str(of), f"{prefix}{name}.", depth - 1)
+            yield prefix + name, str(field_type[0])
+        elif node == Nodetype.NAME:  # a message within this one
+            yield from list_fields(reader, str(field_type), f"{prefix}{name}.", depth - 1)
         else:
             yield prefix + name, "list"
 
@@ -265,21 +265,17 @@ def format_moment(nanoseconds: int) -> str:
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
-def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: Sources) -> None:
+def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
     """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
     for connection in reader.connections:
-        fields = dict(list_fields(reader, connection.msgtype))
-        needed = [path_ for source, *_ in sources.of(connection.topic) for path_ in source.fields if path_]
+        what, fields = f"{path}, {connection.topic}", dict(list_fields(reader, connection.msgtype))
+        needed = [field for source, *_ in sources.of(connection.topic) for field in source.fields if field]
         if needed and not fields:
-            what = f"{path}, {connection.topic}"
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
-        for path_ in needed:
-            if not _has_field(fields, path_):
-                raise fail(
-                    f"{path}, {connection.topic}",
-                    f"a field {path_!r} in {connection.msgtype}",
-                    f"only {_join_names(list(fields), 24)}",
-                )
+        for field in needed:
+            if not _has_field(fields, field):
+                expected = f"a field {field!r} in {connection.msgtype}"
+                raise fail(what, expected, f"only {_join_names(list(fields), 24)}")
 
 
 def _has_field(fields: dict[str, str], path: str) -> bool:
@@ -288,9 +284,8 @@ def _has_field(fields: dict[str, str], path: str) -> bool:
     `fields`: type of each field by its path; that of a list is "list", and what is in it is not looked up.
     """
     lists = [name for name, kind in fields.items() if kind == "list"]
-    return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
-        path.startswith(f"{name}.") for name in lists
-    )
+    is_field_or_message = any(name == path or name.startswith(f"{path}.") for name in fields)
+    return is_field_or_message or any(path.startswith(f"{name}.") for name in lists)
 
 
 def _format_reason(error: Exception) -> str:
@@ -343,13 +338,13 @@ def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
 
     ENDING is what every whole file ends with, which a file that was cut off lacks; BLOCK bytes are copied at a time.
     """
-    end = find_end_of_whole_records(path)
+    size = find_end_of_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
-        with path.open("rb") as file, copy.open("wb") as whole:
-            left = end
-            while left and (block := file.read(min(BLOCK, left))):
-                whole.write(block)
-                left -= len(block)
-            whole.write(ENDING)
-        yield copy, end
+        with path.open("rb") as source, copy.open("wb") as target:
+            to_copy = size
+            while to_copy and (block := source.read(min(BLOCK, to_copy))):
+                target.write(block)
+                to_copy -= len(block)
+            target.write(ENDING)
+        yield copy, size

@@ -93,10 +93,9 @@ def _make_output_columns(prefix: str, forecast: "heliograph.forecasting.Forecast
         return {}
     columns = {}
     for i, output in enumerate(forecast.outputs.names):
-        parts = {output: forecast.outputs.mean[:, i], f"{output}.sd": forecast.outputs.deviation[:, i]}
-        for name, values in parts.items():
+        mean_and_deviation = {output: forecast.outputs.mean[:, i], f"{output}.sd": forecast.outputs.deviation[:, i]}
+        for name, values in mean_and_deviation.items():
             if not np.isnan(values).all():
-                columns[prefix + make_column_header(name, unit_of(output))] = np.concatenate(
-                    [np.full(rows, np.nan), values]
-                )
+                header = prefix + make_column_header(name, unit_of(output))
+                columns[header] = np.concatenate([np.full(rows, np.nan), values])
     return columns

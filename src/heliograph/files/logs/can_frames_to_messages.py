@@ -31,10 +31,13 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """
     database = {} if sources.dbc is None else read_can_database(sources.dbc)
     notes = list[str]()
-    # By message and signal the units, and the bits of signals that are plain whole numbers, as a counter is.
-    units = {m.name: {s.name: s.unit or "" for s in m.signals} for m in database.values()}
-    kinds = {m.name: f"CAN 0x{m.frame_id:x}" for m in database.values()}
-    bits = {m.name: {s.name: s.length for s in m.signals if s.scale == 1 and not s.unit} for m in database.values()}
+    units, kinds, bits = dict[str, dict[str, str]](), dict[str, str](), dict[str, dict[str, int]]()
+    for message in database.values():
+        signals = message.signals
+        units[message.name] = {signal.name: signal.unit or "" for signal in signals}
+        kinds[message.name] = f"CAN 0x{message.frame_id:x}"
+        # The bits of signals that are plain whole numbers, as a counter is.
+        bits[message.name] = {signal.name: signal.length for signal in signals if signal.scale == 1 and not signal.unit}
     return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read_messages(), notes, bits)
 
 

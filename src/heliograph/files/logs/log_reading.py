@@ -10,7 +10,7 @@ from heliograph.files.logs.mdf import open_mdf
 from heliograph.files.logs.ulog import open_ulog
 from heliograph.files.logs.vehicle_log import MDF, ULOG, Log, Wanted, list_logs
 from heliograph.files.messages.message_files import FileMessage
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.numerics.check import InputError, fail
 
 LISTED = 8  # names in one line
@@ -74,7 +74,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     return open_frame_log(path, sources, wanted)
 
 
-def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> Iterator[FileMessage | InputError]:
+def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
 
     Of several logs in a folder those of one file after another; each message asked for has to be in one of them.
@@ -96,13 +96,14 @@ def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> I
     yield from log.messages
     notes += log.notes
     if path.is_dir():
-        rest = [part.name for part in sorted(path.iterdir()) if part not in list_logs(path) and part != given.dbc]
-        notes += [f"{path}: not read beside logs: {', '.join(rest[:LISTED])}"] if rest else []
+        used_files = (*list_logs(path), given.dbc)
+        other_files = [file.name for file in sorted(path.iterdir()) if file not in used_files]
+        notes += [f"{path}: not read beside logs: {', '.join(other_files[:LISTED])}"] if other_files else []
     if used:
         notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
 
 
-def _find_signal_units(place: str, path: Path, log: Log, sources: Sources) -> list[str]:
+def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -> list[str]:
     """Return the units of the signals of sources.
 
     Raises:

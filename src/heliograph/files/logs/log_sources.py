@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from heliograph.files.sources.json_field import Source
 from heliograph.files.sources.message_fields import parse_start
+from heliograph.files.sources.source_description import Source
 from heliograph.numerics.check import check_count, fail, file_path, show_value
 from heliograph.numerics.module import readable
 

@@ -51,9 +51,13 @@ def _name_groups(file: "MDF") -> list[str]:
 
 def _list_units(file: "MDF", group: int) -> dict[str, str]:
     """Return the units of the signals of the group with this number, by name; its channel of times is none of them."""
-    master = file.masters_db.get(group)
-    channels: Any = enumerate(file.groups[group].channels)
-    return {c.name: file.get_channel_unit(c.name, group=group, index=i) or "" for i, c in channels if i != master}
+    index_of_times = file.masters_db.get(group)
+    channels: Any = file.groups[group].channels
+    return {
+        channel.name: file.get_channel_unit(channel.name, group=group, index=i) or ""
+        for i, channel in enumerate(channels)
+        if i != index_of_times
+    }
 
 
 def _read_group(file: "MDF", group: int, names: dict[str, str]) -> MessageSeries:

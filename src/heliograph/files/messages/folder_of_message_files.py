@@ -5,7 +5,7 @@ from pathlib import Path
 
 from heliograph.files.bags.ros_bag import is_bag
 from heliograph.files.messages.message_files import LINES, FileMessage, make_default_topic, read_message_file
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.files.text.text_file import find_extension
 from heliograph.numerics.check import InputError, fail
 
@@ -30,17 +30,17 @@ def list_message_files(folder: Path) -> list[Path]:
     return files
 
 
-def find_topic_of_file(path: Path, sources: Sources) -> str:
+def find_topic_of_file(path: Path, sources: TopicReader) -> str:
     """Return the topic of a file's messages that name none."""
     return path.name if sources.of(path.name) else make_default_topic(path)
 
 
-def list_used_files(folder: Path, sources: Sources) -> list[Path]:
+def list_used_files(folder: Path, sources: TopicReader) -> list[Path]:
     """Return the files of a folder that are topics of sources."""
     return [path for path in list_message_files(folder) if sources.of(find_topic_of_file(path, sources))]
 
 
-def read_message_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputError]:
+def read_message_folder(folder: Path, sources: TopicReader) -> Iterator[FileMessage | InputError]:
     """Yield the messages of the files that are topics of sources, file by file, or why one cannot be read.
 
     Raises:
@@ -59,17 +59,21 @@ def read_message_folder(folder: Path, sources: Sources) -> Iterator[FileMessage 
                 yield message._replace(topic=topic)
 
 
-def describe_unused_files(folder: Path, sources: Sources) -> list[str]:
+def describe_unused_files(folder: Path, sources: TopicReader) -> list[str]:
     """Return a line on the files that are no topics of sources, and one on the topics that are no files.
 
     A topic with a wildcard, + or #, is never said to be missing.
     """
-    used = list_used_files(folder, sources)
-    rest = [path.name for path in list_message_files(folder) if path not in used]
-    found = {find_topic_of_file(path, sources) for path in used}
-    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
-    lines = [f"{folder}: not among the sources: {_join_names(rest)}"] if rest else []
-    return [*lines, f"{folder}: not in the folder: {_join_names(missing)}"] if missing else lines
+    used_files = list_used_files(folder, sources)
+    unused = [path.name for path in list_message_files(folder) if path not in used_files]
+    used_topics = {find_topic_of_file(path, sources) for path in used_files}
+    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in used_topics]
+    lines = []
+    if unused:
+        lines.append(f"{folder}: not among the sources: {_join_names(unused)}")
+    if missing:
+        lines.append(f"{folder}: not in the folder: {_join_names(missing)}")
+    return lines
 
 
 def _join_names(names: list[str]) -> str:

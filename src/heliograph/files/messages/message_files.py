@@ -96,9 +96,9 @@ def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
     """Return topic, payload, arrival and whether it was stored of a message of a log in JSON; None for any other."""
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
-    inner = content[PAYLOAD]
-    text = inner if isinstance(inner, str) else json.dumps(inner)
-    return content[TOPIC], text, find_arrival_time(content), bool(content.get("retain"))
+    payload = content[PAYLOAD]
+    text, was_stored = payload if isinstance(payload, str) else json.dumps(payload), bool(content.get("retain"))
+    return content[TOPIC], text, find_arrival_time(content), was_stored
 
 
 def find_arrival_time(logged: Mapping[str, Any]) -> Any:
@@ -224,8 +224,8 @@ def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     check_distinct(path, names)
     for i, column in enumerate(table.columns):
         if pa.types.is_timestamp(column.type):
-            whole = column.cast(pa.timestamp("ns", "UTC")).cast(pa.int64()).to_pylist()
-            texts = [None if t is None else _format_moment(t) for t in whole]
+            nanoseconds = column.cast(pa.timestamp("ns", "UTC")).cast(pa.int64()).to_pylist()
+            texts = [None if moment is None else _format_moment(moment) for moment in nanoseconds]
             table = table.set_column(i, names[i], pa.chunked_array([pa.array(texts, pa.string())]))
     for number, row in enumerate(table.to_pylist(), 1):
         yield f"{path}, row {number}", row

@@ -33,7 +33,7 @@ from heliograph.files.messages.own_format import (
 )
 from heliograph.files.sources.message_fields import parse_arrival
 from heliograph.files.sources.message_reading import Reading, Unread
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.files.stores.store_address import is_store, parse_store
 from heliograph.files.stores.store_tables import StoreTable, query_store
 from heliograph.files.text.text_file import CutOffError, find_extension
@@ -102,7 +102,7 @@ def read_events(
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
     strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
-    checked = None if sources is None else Sources(sources, network)
+    checked = None if sources is None else TopicReader(sources, network)
     # By what the recording is: bags and logs, then messages in our own form, or of the sources' topics.
     if isinstance(source, Path) and is_bag(source):
         if checked is None:
@@ -124,16 +124,16 @@ def read_events(
     return events
 
 
-def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: bool) -> EventTable:
+def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, strict: bool) -> EventTable:
     """Return the events of a bag, or of the bags in a folder, with messages of ROS or in JSON."""
     events = EventTable(sources.network, sources.step_seconds)
-    for part in parts_of(path) or [path]:
-        if holds_messages(part):
-            found = _append_messages_by_topic(part, read_mcap_messages(part, sources), sources, events, strict)
-            missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
-            events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
+    for bag in parts_of(path) or [path]:
+        if holds_messages(bag):
+            topics = _append_messages_by_topic(bag, read_mcap_messages(bag, sources), sources, events, strict)
+            missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in topics]
+            events.notes += [f"{bag}: not in the bag: {', '.join(missing)}"] if missing else []
         else:
-            read_bag(part, sources, events, progress, strict)
+            read_bag(bag, sources, events, progress, strict)
     return events
 
 
@@ -157,7 +157,9 @@ def _holds_rows_of_own_format(source: Path | StoreTable) -> bool:
     return holds_events(source) if isinstance(source, Path) else {NODE, SEQUENCE} <= source.columns.keys()
 
 
-def _yield_messages(source: Path | StoreTable, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+def _yield_messages(
+    source: Path | StoreTable, sources: TopicReader | None = None
+) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, of those files of a folder that are topics of sources, or of a store's table."""
     if isinstance(source, Path) and is_message_folder(source) and sources is not None:
         return read_message_folder(source, sources)
@@ -168,13 +170,13 @@ def _read_table_of_own_format(
     path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool
 ) -> EventTable:
     """Return the events of a table in our own form, with the columns node, sequence, time and values."""
-    own = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
+    collector = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _yield_messages(path):
-        own.add(message, strict)
-    return own.events()
+        collector.add(message, strict)
+    return collector.events()
 
 
-def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources | None, strict: bool) -> EventTable:
+def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicReader | None, strict: bool) -> EventTable:
     """Return the events of messages, which are either all of topics of the sources, or all in our own form.
 
     Args:
@@ -213,7 +215,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
     return events
 
 
-def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> EventTable:
+def _read_log(path: Path, table: object, sources: TopicReader, strict: bool) -> EventTable:
     """Return the events of a vehicle's log; `table` are its sources as the network's file has them."""
     events = EventTable(sources.network, sources.step_seconds)
     _append_messages_by_topic(path, read_log(path, table, sources, events.notes), sources, events, strict)
@@ -221,7 +223,7 @@ def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> Even
 
 
 def _append_messages_by_topic(
-    path: Path, messages: Iterator[FileMessage | InputError], sources: Sources, events: EventTable, strict: bool
+    path: Path, messages: Iterator[FileMessage | InputError], sources: TopicReader, events: EventTable, strict: bool
 ) -> set[str | None]:
     """Append the events of messages that name their topics, and return these topics."""
     topics = set[str | None]()
@@ -237,7 +239,7 @@ def _append_messages_by_topic(
 
 
 def _append_message(
-    path: Path | StoreTable, message: FileMessage, sources: Sources, events: EventTable, strict: bool
+    path: Path | StoreTable, message: FileMessage, sources: TopicReader, events: EventTable, strict: bool
 ) -> None:
     """Append the events of a message; what cannot be read is refused alone.
 
@@ -273,7 +275,7 @@ def _append_reading(
     content: object,
     reading: Reading,
     arrival: int | None,
-    sources: Sources,
+    sources: TopicReader,
     events: EventTable,
 ) -> None:
     """Append the event of one reading of a message, unless only the arrival of a stored message would date it.
@@ -305,7 +307,7 @@ def _append_reading(
     sources.senders.note_fields(topic, reading.plant, reading.node, content, sources.list_fields(topic))
 
 
-def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable) -> None:
+def _note_left_out(path: Path | StoreTable, sources: TopicReader, events: EventTable) -> None:
     """Add notes on the messages that were left out to the events.
 
     Raises:

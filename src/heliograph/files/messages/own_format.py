@@ -32,9 +32,8 @@ def holds_events(path: str | Path) -> bool:
     path = Path(path)
     if not path.is_file() or not is_table_file(path):
         return False
-    return {NODE, SEQUENCE} <= set(
-        read_parquet_names(path) if find_extension(path) == ".parquet" else read_csv_header(path)
-    )
+    columns = read_parquet_names(path) if find_extension(path) == ".parquet" else read_csv_header(path)
+    return {NODE, SEQUENCE} <= set(columns)
 
 
 def is_table_file(path: Path) -> bool:
@@ -62,7 +61,7 @@ class OwnMessageCollector:
 
         Counted are messages used and refused; `reasons`: of the first refused; `broken`: where the file was cut off.
         """
-        self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
+        self.source, self._reader = source, HeliographMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
 
@@ -106,17 +105,17 @@ class OwnMessageCollector:
 
     def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and one of the inputs that it brings."""
-        found = self._reader.read(message.where, message.content)  # readings, or why there is none, and arrivals
+        readings_and_arrivals = self._reader.read(message.where, message.content)
         if self._table is None:
             self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
-        for reading, arrival in found:
+        for reading, arrival in readings_and_arrivals:
             if isinstance(reading, Unread):
                 self._table.note_unread(reading, arrival)
                 raise reading.error
             self._table.add(reading, arrival)
 
 
-class OwnMessageReader:
+class HeliographMessageReader:
     """Reader of messages in our own form.
 
     Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the
@@ -255,15 +254,13 @@ def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str,
     the last, how many messages were lost, may be missing in `values`, since the running count says it too.
     """
     if row.get(VALUES) not in (None, ""):
-        cell = row[VALUES]
-        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _list_cell_items(cell)
-        if numbered and len(parts) == len(names) - 1:
-            parts.append("nan" if isinstance(cell, str) else np.nan)
-        if len(parts) != len(names):
-            raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", show_value(cell))
-        from_text = isinstance(cell, str)
-        place = f"{where}, column {VALUES!r}"
-        return np.array([_parse_number(word, place, may_be_empty=True, text=from_text) for word in parts])
+        cell, column, is_text = row[VALUES], f"{where}, column {VALUES!r}", isinstance(row[VALUES], str)
+        items: list[Any] = cell.replace(";", " ").split() if is_text else _list_cell_items(cell)
+        if numbered and len(items) == len(names) - 1:
+            items.append("nan" if is_text else np.nan)
+        if len(items) != len(names):
+            raise fail(column, f"{len(names)} numbers, {' '.join(names)}", show_value(cell))
+        return np.array([_parse_number(item, column, may_be_empty=True, text=is_text) for item in items])
     return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", may_be_empty=True) for name in names])
 
 

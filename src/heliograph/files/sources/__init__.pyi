@@ -1,7 +1,6 @@
 """Names that other folders take; the package loads them when first used."""
 
 from .derived_values import Computed as Computed
-from .json_field import Source as Source
 from .message_fields import TimeUnit as TimeUnit
 from .message_fields import convert_name as convert_name
 from .message_fields import convert_time as convert_time
@@ -16,5 +15,6 @@ from .message_fields import parse_number as parse_number
 from .message_fields import parse_start as parse_start
 from .message_reading import Reading as Reading
 from .message_reading import Unread as Unread
-from .sources import SECOND as SECOND
-from .sources import Sources as Sources
+from .source_description import Source as Source
+from .topic_reader import SECOND as SECOND
+from .topic_reader import TopicReader as TopicReader

@@ -66,8 +66,8 @@ class Covariance:
         The message has the matrix, of `self.size` rows, as a list, row by row; `kind` says whether it is known.
         """
         i, j = self.row, self.row if self.column is None else self.column
-        places = [*((k, k) for k in range(self.size)), (i, j), (j, i), (i, i), (j, j)]
-        entries = tuple(f"{self.path}.{self.size * row + column}" for row, column in places)
+        indices = [*((k, k) for k in range(self.size)), (i, j), (j, i), (i, i), (j, j)]
+        entries = tuple(f"{self.path}.{self.size * row + column}" for row, column in indices)
         return entries if self.kind is None else (*entries, self.kind)
 
     def of(self, *numbers: Any) -> Any:

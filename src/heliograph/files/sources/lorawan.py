@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from heliograph.files.sources.derived_values import Computed, Yaw, ZeroIfAbsent
-from heliograph.files.sources.json_field import (
+from heliograph.files.sources.source_description import (
     Count,
     Name,
     Paths,

@@ -103,8 +103,8 @@ def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]])
     field_of_content = next((field for fields, field in doubled if fields is content), None)
     if field_of_content is not None:
         return field_of_content
-    parts = content.values() if isinstance(content, dict) else content
-    return next((field for part in parts if (field := _name_doubled_field(part, doubled)) is not None), None)
+    items = content.values() if isinstance(content, dict) else content
+    return next((field for item in items if (field := _name_doubled_field(item, doubled)) is not None), None)
 
 
 def _flatten_lists(content: object) -> Iterator[object]:
@@ -117,10 +117,11 @@ def match_topic(topic: str, pattern: str) -> bool:
     """Return whether a topic matches a pattern with the wildcards of MQTT: + for one word, # for all that follow."""
     if topic == pattern:
         return True
-    words, parts = topic.split("/"), pattern.split("/")
-    if parts[-1] == "#":
-        words, parts = words[: len(parts) - 1], parts[:-1]
-    return len(words) == len(parts) and all(level in ("+", word) for word, level in zip(words, parts, strict=True))
+    words, levels = topic.split("/"), pattern.split("/")
+    if levels[-1] == "#":
+        levels = levels[:-1]
+        words = words[: len(levels)]
+    return len(words) == len(levels) and all(level in ("+", word) for word, level in zip(words, levels, strict=True))
 
 
 def field_at(message: object, path: str, where: str) -> Any:
@@ -183,10 +184,11 @@ def convert_number(value: Any, name: str, quoted: bool = False) -> float:
 
 def parse_number(text: str) -> int | float | str:
     """Return the number that a text is, whole ones with every digit; a text that is none as it is."""
-    words = text.strip()
-    kind = int if words.lstrip("+-").isdecimal() else float
+    digits = text.strip()
+    if "_" in digits:  # Python's own way to write a number, and nobody else's
+        return text
     try:
-        return text if "_" in words else kind(words)  # Python's own way to write a number, and nobody else's
+        return int(digits) if digits.lstrip("+-").isdecimal() else float(digits)
     except ValueError:
         return text
 
@@ -236,9 +238,9 @@ def _read_stamp(value: Any, name: str) -> int | None:
         ValueError: a stamp of zero, which nobody has set; one line that begins with `name`.
     """
     is_map = isinstance(value, Mapping)
-    for pair in STAMPS:
-        if set(pair) <= value.keys() if is_map else hasattr(value, pair[0]) and hasattr(value, pair[1]):
-            seconds, nanoseconds = (int(value[part] if is_map else getattr(value, part)) for part in pair)
+    for names in STAMPS:
+        if all(name in value if is_map else hasattr(value, name) for name in names):
+            seconds, nanoseconds = (int(value[name] if is_map else getattr(value, name)) for name in names)
             if seconds == nanoseconds == 0:
                 raise fail(name, "a time that was set (without time= it is the moment of arrival)", "a stamp of 0")
             return seconds * 10**9 + nanoseconds
@@ -250,9 +252,9 @@ def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "n
 
     UNITS: nanoseconds of each unit. The error names a unit, if any, in which the number would be a time.
     """
-    # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
-    is_whole = float(value).is_integer()
-    stamp = int(value) * UNITS[unit] if is_whole else round(Decimal(repr(float(value))) * UNITS[unit])
+    # By the decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
+    decimal = int(value) if float(value).is_integer() else Decimal(repr(float(value)))
+    stamp = round(decimal * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
         fits = next((other for other, size in UNITS.items() if 0 <= float(value) * size < 2**63), None)
         hint = "" if fits is None else f": in {fits} it is one (time_unit={fits!r})"

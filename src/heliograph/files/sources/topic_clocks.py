@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliograph.files.sources.json_field import Source
 from heliograph.files.sources.message_fields import field_at
+from heliograph.files.sources.source_description import Source
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.dates import looks_like_date
 from heliograph.numerics.times.timestamp_order import YEAR
@@ -41,6 +41,7 @@ class TopicClocks:
     """Clocks by topic, of messages that nothing dates but their own times."""
 
     def __init__(self) -> None:
+        """Make clocks of no topics yet; a topic gets its clock with its first message."""
         self._by_topic: dict[str, TopicClock] = {}
 
     def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:

@@ -160,9 +160,8 @@ def _explain_refusal(content: bytes) -> str:
     """Return why a server refuses, by its answer: of JSON its error or message, else all of it."""
     answer = content.decode(errors="replace")
     try:
-        found = json.loads(answer)
+        decoded = json.loads(answer)
     except ValueError:
-        found = None
-    if isinstance(found, dict):
-        return shorten_answer(str(found.get("error") or found.get("message") or answer))
-    return shorten_answer(answer)
+        decoded = None
+    reason = decoded.get("error") or decoded.get("message") if isinstance(decoded, dict) else None
+    return shorten_answer(str(reason or answer))

@@ -117,12 +117,10 @@ def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[
     Raises:
         ValueError: a tag of a column's name, with another value: one of the two would be lost.
     """
-    both = [name for name in tags if name in columns and tags[name] != columns[name]]
-    if both:
-        remedy = (
-            f"tags and columns of different names (AS in the query, or rename() of Flux, gives {both[0]!r} another)"
-        )
-        raise fail(str(address), remedy, f"{both[0]!r} for both")
+    shared_name = next((name for name in tags if name in columns and tags[name] != columns[name]), None)
+    if shared_name is not None:
+        remedy = f"AS in the query, or rename() of Flux, gives {shared_name!r} another"
+        raise fail(str(address), f"tags and columns of different names ({remedy})", f"{shared_name!r} for both")
     return {**tags, **columns}
 
 

@@ -88,14 +88,11 @@ def check_postgres(address: StoreAddress) -> None:
 
 
 def _convert_cells(column: np.ndarray) -> list[Any]:
-    """Return the cells of a column as the server reads them: dates to the microsecond, what is no number as NULL.
-
-    A value that differs from itself is NaN.
-    """
+    """Return the cells of a column as the server reads them: dates to the microsecond, None (NULL) in place of NaN."""
     if column.dtype.kind == "M":
         moments = np.datetime_as_string(column.astype("datetime64[us]")).tolist()
         return [f"{moment}Z" for moment in moments]
-    return [value if value == value else None for value in column.tolist()]
+    return [None if value != value else value for value in column.tolist()]  # NaN alone differs from itself
 
 
 def _explain_error(address: StoreAddress, error: Exception) -> InputError:

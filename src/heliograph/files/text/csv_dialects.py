@@ -61,9 +61,8 @@ def guess_names_in_header(line: str) -> set[str]:
     COMMENTS are marks of a comment, # and %; such a line may have blanks between names.
     """
     separators = r"[,;\t|\s]" if line.startswith(COMMENTS) else r"[,;\t|]"
-    return {name.strip().strip('"').strip() for name in re.split(separators, line.lstrip("".join(COMMENTS) + " "))} - {
-        ""
-    }
+    words = re.split(separators, line.lstrip("".join(COMMENTS) + " "))
+    return {word.strip().strip('"').strip() for word in words} - {""}
 
 
 def suggest_rewrite(path: Path, **how: object) -> str:
@@ -77,8 +76,9 @@ def suggest_recoding(path: Path | None, line: str) -> str:
     if path is None:
         return ""
     encoding = "utf-16-le" if "\0" in line else "latin-1"
-    commented = line.startswith(COMMENTS)
-    return f": {_suggest_without_comments(path, encoding) if commented else suggest_rewrite(path, encoding=encoding)}"
+    if line.startswith(COMMENTS):
+        return f": {_suggest_without_comments(path, encoding)}"
+    return f": {suggest_rewrite(path, encoding=encoding)}"
 
 
 def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:

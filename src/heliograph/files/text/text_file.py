@@ -42,18 +42,17 @@ def _begins_as_table(path: Path) -> bool:
     names = header.split(",")
     if header.startswith("#"):  # a comment, of which the reader of tables says what to do
         return len(names) > 1
-    words = all(re.fullmatch(r"[^\W\d][^{}\[\]:]*", name.strip().strip('"')) for name in names)
-    return len(names) > 1 and words and all(len(row.split(",")) == len(names) for row in rows)
+    are_words = all(re.fullmatch(r"[^\W\d][^{}\[\]:]*", name.strip().strip('"')) for name in names)
+    return len(names) > 1 and are_words and all(len(row.split(",")) == len(names) for row in rows)
 
 
 def guess_encoding(start: bytes) -> str:
     """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter."""
     if start.startswith(WIDE):
         return "utf-16"
-    # Ones in place of bytes that a shorter text lacks: they are not NUL.
-    low, high = (*start[:2], 1, 1)[:2]
-    if 0 in (low, high) and low != high:
-        return "utf-16-be" if low == 0 else "utf-16-le"
+    first_byte, second_byte = (*start[:2], 1, 1)[:2]  # 1, which is not NUL, of a text that is shorter
+    if 0 in (first_byte, second_byte) and first_byte != second_byte:
+        return "utf-16-be" if first_byte == 0 else "utf-16-le"
     return "utf-8-sig"
 
 
@@ -157,13 +156,13 @@ def yield_until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
     Raises:
         CutOffError: nothing came before.
     """
-    some = False
+    has_yielded = False
     try:
         for part in parts:
-            some = True
+            has_yielded = True
             yield part
     except CutOffError as error:
-        if not some:
+        if not has_yielded:
             raise
         yield error
 

@@ -47,6 +47,7 @@ class TraceIntersection(AbstractIntersection):
     improvements: int = eqx.field(static=True)
 
     def __init__(self, power: Float[ArrayLike, ""] = 4.0, improvements: int = 0):
+        """Check and hold the power of the traces, and the number of steps of the search that begins there."""
         self.power = float(scalar("power of the traces", power, 0.0))
         self.improvements = check_count("improvements", improvements, 0)
 

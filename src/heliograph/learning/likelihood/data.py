@@ -173,8 +173,8 @@ def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
 def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
     """Return the array (rows, columns) with rows added up to a length: of `filler`, or if None copies of the last."""
     missing = length - len(values)
-    end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
-    return np.concatenate([values, np.repeat(end, missing, axis=0)]) if missing else values
+    added_row = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
+    return np.concatenate([values, np.repeat(added_row, missing, axis=0)]) if missing else values
 
 
 def _check_enough_data(data: LikelihoodData, free: int) -> None:

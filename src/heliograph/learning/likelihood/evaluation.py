@@ -121,8 +121,8 @@ def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Likelihood
     if choice.code is not None:
         results = choice.results()
     else:
-        parts = [to_numpy(_by_xla(objective, *pair)) for pair in zip(*pairs, strict=True)]
-        results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        results_of_pairs = [to_numpy(_by_xla(objective, *pair)) for pair in zip(*pairs, strict=True)]
+        results = jax.tree.map(lambda *leaves: np.stack(leaves), *results_of_pairs)
     density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
     return Evaluation(density=density, score=score, halves=halves.sum(axis=1))
 
@@ -181,9 +181,11 @@ def _differentiate_errors(
     """
 
     def errors_at(x: Array) -> tuple[jax.Array, jax.Array]:
+        """Return e and S at x."""
         return objective.compute_innovations(x, z, u) if truth is None else objective.compute_errors(x, z, u, truth)
 
     def differentiate_along(axis: jax.Array) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+        """Return (e, S) at x, and their derivatives along one axis of x."""
         return jax.jvp(errors_at, (x,), (axis,))
 
     (e, s), (de, ds) = jax.vmap(differentiate_along, out_axes=(None, 1))(jnp.eye(len(x)))

@@ -234,9 +234,10 @@ class MaximumSearch:
 
         EXACTLY: logarithm of the data's size over that of the innovations beyond which these are rounding.
         """
-        z = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
-        size = np.log(np.nanmax(np.abs(z)))
-        if top.total / np.count_nonzero(~np.isnan(z)) + size > EXACTLY:
+        data = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
+        log_likelihood_of_number = top.total / np.count_nonzero(~np.isnan(data))
+        log_size = np.log(np.nanmax(np.abs(data)))
+        if log_likelihood_of_number + log_size > EXACTLY:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
         return ""
 
@@ -260,12 +261,12 @@ def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
 
     `climbed.order`: climbs from the highest down; `remaining`: nats that a further step still promises.
     """
-    lane = int(climbed.order[0])
-    converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
+    best = int(climbed.order[0])
+    converged, remaining = bool(climbed.converged[best]), float(climbed.remaining[best])
     return HighestPoint(
-        x=climbed.x[lane].copy(),
+        x=climbed.x[best].copy(),
         ends=ends,
-        total=float(climbed.total[lane]),
+        total=float(climbed.total[best]),
         converged=converged,
         reason="" if converged else _explain_unconverged_climb(remaining),
         steps=climbed.steps,

@@ -125,12 +125,12 @@ class Objective:
         """
         filter, angles = self.filter(x), first(self.description.start.plant).angles
 
-        def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def read_estimate(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return mean and claimed covariance of the estimate after a row."""
             estimate = filter.estimate(state)
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
-        mean, covariance = filter.scan(z, u, claimed)
+        mean, covariance = filter.scan(z, u, read_estimate)
         return wrap_near(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
@@ -199,10 +199,11 @@ def find_sole_filter(network: Network) -> AbstractFilter:
     """
     nodes = list(network.nodes.values())
     filters = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
-    items = [*filters.values(), *(fusion for fusion in network.fused.values() if isinstance(fusion, AbstractFilter))]
-    if len(items) != 1 or items[0].states != network.states:
+    central = [fusion for fusion in network.fused.values() if isinstance(fusion, AbstractFilter)]
+    every = [*filters.values(), *central]
+    if len(every) != 1 or every[0].states != network.states:
         expected = "one filter, of all that arrives, whose estimates are compared with them"
-        raise fail("network to be learned by its true states", expected, len(items) or "none")
-    if items[0].claim == "none":
+        raise fail("network to be learned by its true states", expected, len(every) or "none")
+    if every[0].claim == "none":
         raise fail("filter to be learned by true states", "one that claims a covariance", "one that claims none")
-    return items[0]
+    return every[0]

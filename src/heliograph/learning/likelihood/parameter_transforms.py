@@ -106,13 +106,15 @@ def slope_to_line(domain: Domain, value: PyTree) -> PyTree:
 
 
 def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
-    """Return how many coordinates on the line a number of this domain and shape has."""
-    count = int(np.prod(shape))
+    """Return how many unbounded coordinates a number of this domain and shape has."""
+    entries = int(np.prod(shape))
     if domain.kind == "simplex":
         # The probabilities of each distribution (last axis) sum to 1: one of them is not free.
-        return count - count // shape[-1]
-    # Of a covariance: the entries on and below the diagonal.
-    return shape[0] * (shape[0] + 1) // 2 if domain.kind == "covariance" else count
+        distributions = entries // shape[-1]
+        return entries - distributions
+    if domain.kind == "covariance":
+        return shape[0] * (shape[0] + 1) // 2  # entries on and below the diagonal
+    return entries
 
 
 def _factorise_start(name: str, value: np.ndarray) -> np.ndarray:

@@ -48,13 +48,14 @@ def discretise_laws(channel: Map, count: int) -> Map:
     """Return the channel with each gain's law replaced by `count` values; constant gains stay."""
 
     def is_law(leaf: object) -> bool:
+        """Return whether a part of the channel is a law, which is replaced as a whole."""
         return isinstance(leaf, AbstractLaw)
 
     def discretise(leaf: object) -> object:
         """Return `count` values with probabilities in place of a random law; anything else as it is."""
-        return (
-            approximate_law_by_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and leaf.constant is None else leaf
-        )
+        if isinstance(leaf, AbstractLaw) and leaf.constant is None:
+            return approximate_law_by_nodes(leaf, count)
+        return leaf
 
     discrete: Map = jax.tree.map(discretise, channel, is_leaf=is_law)
     return discrete
@@ -103,7 +104,7 @@ class Predictive(NamedTuple):
 
 
 def make_signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
-    """Return the filter that predicts what the sensor sends (`expect_signals`), of one law of motion and measuring.
+    """Return the filter that predicts what the sensor sends (`expect_signals`), of a plant and a sensor without modes.
 
     Raises:
         ValueError: a plant or sensor with modes, or an unknown start.
@@ -190,8 +191,12 @@ def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
     probability zero are left out.
     """
     possible = [component for component in components if component.weight > 0]
-    weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
-    return StackPartDensity(log_weight=np.log(weight), gain=gain, offset=offset, noise=noise)
+    return StackPartDensity(
+        log_weight=np.log(np.array([component.weight for component in possible])),
+        gain=np.array([component.gain for component in possible]),
+        offset=np.array([component.offset for component in possible]),
+        noise=np.array([component.noise for component in possible]),
+    )
 
 
 def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: ChannelDensities) -> Predictive:

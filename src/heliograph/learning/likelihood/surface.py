@@ -72,9 +72,13 @@ class LikelihoodSurface:
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return l, scores and information at each point (points, p); the result for the last points is kept."""
-        if not (self._last and np.array_equal(self._last[0][0], x)):
-            self._last[:] = [(np.array(x), evaluate_at_points(self.objective, np.asarray(x), self.data))]
-        return self._last[0][1]
+        if self._last:
+            last_points, last_evaluation = self._last[0]
+            if np.array_equal(last_points, x):
+                return last_evaluation
+        evaluation = evaluate_at_points(self.objective, np.asarray(x), self.data)
+        self._last[:] = [(np.array(x), evaluation)]
+        return evaluation
 
     def evaluate_rows(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return the evaluation at points with densities and scores by row, which are not cached of long recordings."""
@@ -244,9 +248,10 @@ def _choose_next_distances(
     place of a middle; nothing is further than `furthest`.
     """
     is_closed = np.isfinite(outside)
-    most = np.minimum(np.where(is_closed, outside, 3 * distance), furthest)
-    is_within = np.isfinite(newton) & (newton > inside) & (newton < most)
-    return np.where(is_within, newton, np.where(is_closed, (inside + most) / 2, most))
+    bracket_end = np.minimum(np.where(is_closed, outside, 3 * distance), furthest)
+    is_within = np.isfinite(newton) & (newton > inside) & (newton < bracket_end)
+    fallback = np.where(is_closed, (inside + bracket_end) / 2, bracket_end)
+    return np.where(is_within, newton, fallback)
 
 
 def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
@@ -259,6 +264,7 @@ def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " siz
     if domain.kind == "simplex":
         return ~none, ~none
     if domain.kind == "covariance":
-        return np.eye(len(parameter.start), dtype=bool)[np.tril_indices(len(parameter.start))], none
-    sides = np.isfinite([domain.low, domain.high])
-    return none | sides.any(), none | sides.all()
+        is_diagonal = np.eye(len(parameter.start), dtype=bool)[np.tril_indices(len(parameter.start))]
+        return is_diagonal, none
+    has_end = np.isfinite([domain.low, domain.high])
+    return none | has_end.any(), none | has_end.all()

@@ -184,9 +184,9 @@ def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray,
 
     `total` (lanes,), `gradient` and `moving` (lanes, p), `information` (lanes, p, p).
     """
-    pairs = moving[:, :, None] & moving[:, None, :]
-    derivatives = np.all(np.isfinite(gradient) | ~moving, axis=1)
-    return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
+    finite_gradient = np.all(np.isfinite(gradient) | ~moving, axis=1)
+    finite_information = np.isfinite(information) | ~(moving[:, :, None] & moving[:, None, :])
+    return np.asarray(np.isfinite(total) & finite_gradient & np.all(finite_information, axis=(1, 2)))
 
 
 def _mark_arrived(state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
@@ -322,10 +322,10 @@ def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
 
 def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _Lanes) -> Evaluated:
     """Return log-likelihood, gradient and information at x (lanes, p) in lanes `going` on; in others the last ones."""
-    values = state.total.copy(), state.gradient.copy(), state.information.copy()
-    for value, new in zip(values, evaluate(x[going]), strict=True):
-        value[going] = new
-    return values
+    arrays = state.total.copy(), state.gradient.copy(), state.information.copy()
+    for array, new_values in zip(arrays, evaluate(x[going]), strict=True):
+        array[going] = new_values
+    return arrays
 
 
 def _update_hessian(

@@ -77,9 +77,9 @@ def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -
     `unit`: standard errors (lanes, p), a lane being one of several searches side by side. LARGEST: curvature in
     these units beyond which a model is but rounding.
     """
-    scaled = _scale_both_sides(model, unit)
-    sane = np.all(np.abs(scaled) < LARGEST, axis=(1, 2))  # neither huge nor NaN
-    return np.where(sane[:, None, None], scaled, _scale_both_sides(information, unit))
+    scaled_model = _scale_both_sides(model, unit)
+    is_usable = np.all(np.abs(scaled_model) < LARGEST, axis=(1, 2))  # neither huge nor NaN
+    return np.where(is_usable[:, None, None], scaled_model, _scale_both_sides(information, unit))
 
 
 def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -128,9 +128,11 @@ def expected_gain(
     """
     unit, _ = find_errors_and_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
-    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
-    return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
+    eigenvalues, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    components = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)  # of g along the eigenvectors
+    is_identified = eigenvalues > FLAT
+    gains = np.where(is_identified, components**2 / np.where(is_identified, eigenvalues, 1.0), 0.0)
+    return np.asarray(np.sum(gains, axis=1))
 
 
 def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,11 +143,12 @@ def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray)
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     # LEAST: information so small that its square would underflow.
-    informed = moving & (diagonal > LEAST) & np.isfinite(diagonal)
-    unit = np.where(informed, 1 / np.sqrt(np.where(informed, diagonal, 1.0)), 0.0)
-    scaled = _scale_both_sides(information, unit)
-    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * informed[:, :, None]
+    has_information = moving & (diagonal > LEAST) & np.isfinite(diagonal)
+    errors = np.where(has_information, 1 / np.sqrt(np.where(has_information, diagonal, 1.0)), 0.0)
+    scaled = _scale_both_sides(information, errors)
+    eigenvalues, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    is_flat = eigenvalues <= FLAT
+    return errors, np.where(is_flat[:, None, :], vectors, 0.0) * has_information[:, :, None]
 
 
 def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:

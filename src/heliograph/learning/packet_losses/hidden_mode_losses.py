@@ -118,8 +118,9 @@ class FateRuns:
         """Return the runs of stretches of fates (packets,), one after another, each behind a START."""
         # Fates as whole numbers: 0 arrived, 1 lost, and UNKNOWN.
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
-        first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
-        return FateRuns(code[first], np.diff(np.append(first, len(code))))
+        begins_run = np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)])
+        starts = np.flatnonzero(begins_run)
+        return FateRuns(kind=code[starts], length=np.diff(np.append(starts, len(code))))
 
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log-likelihood l at logits x of (loss when good, when bad, fail, recover), and its gradient (4,).
@@ -171,10 +172,10 @@ def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 def _rescale_matrices(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm (...)."""
-    rows = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
-    size = np.maximum(rows[..., 0], rows[..., 1])
-    size = np.where(size > 0, size, 1.0)
-    return matrix * (1 / size)[..., None, None], np.log(size)  # a division by a real number would be a complex one
+    largest_of_columns = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
+    largest = np.maximum(largest_of_columns[..., 0], largest_of_columns[..., 1])
+    scale = np.where(largest > 0, largest, 1.0)
+    return matrix * (1 / scale)[..., None, None], np.log(scale)  # a division by a real number would be a complex one
 
 
 def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -198,15 +199,16 @@ def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray
     return power, scale
 
 
-def _multiply_runs(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _multiply_runs(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the logarithm of its scale.
 
     The product is the returned matrix (sets, 2, 2) times its scale (sets,). Pair by pair: each turn halves the number.
     """
-    scale = np.zeros(len(parts))
-    while parts.shape[1] > 1:
-        if parts.shape[1] % 2:
-            parts = np.concatenate([parts, np.broadcast_to(np.eye(2), (len(parts), 1, 2, 2))], axis=1)
-        parts, more = _rescale_matrices(parts[:, 1::2] @ parts[:, ::2])
-        scale = scale + more.sum(axis=1)
-    return parts[:, 0], scale
+    log_scale = np.zeros(len(matrices))
+    while matrices.shape[1] > 1:
+        if matrices.shape[1] % 2:
+            identity = np.broadcast_to(np.eye(2), (len(matrices), 1, 2, 2))
+            matrices = np.concatenate([matrices, identity], axis=1)
+        matrices, log_scales = _rescale_matrices(matrices[:, 1::2] @ matrices[:, ::2])
+        log_scale = log_scale + log_scales.sum(axis=1)
+    return matrices[:, 0], log_scale

@@ -203,13 +203,12 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
 
     `parts`: stretches of fates; `known`: which packets are trials, of all stretches one after another.
     """
-    everything = np.concatenate(parts)
-    late = known & (np.cumsum(known) > cut)
+    is_held_out = known & (np.cumsum(known) > cut)
     # Later fates are hidden as unknown, so that the laws are fitted to the first `cut` alone.
-    early = np.where(late, np.nan, everything)
+    fates_to_fit = np.where(is_held_out, np.nan, np.concatenate(parts))
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
-    laws = _fit_laws(CheckedFates(np.split(early, ends)), intervals=False)
-    log_likelihoods = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
+    laws = _fit_laws(CheckedFates(np.split(fates_to_fit, ends)), intervals=False)
+    log_likelihoods = {name: law.log_likelihoods(parts)[is_held_out] for name, law in laws.items()}
     scores = {}
     for name, logs in log_likelihoods.items():
         gain, error = estimate_mean_and_error(logs - log_likelihoods[INDEPENDENT])
@@ -278,9 +277,10 @@ class RunningRateLosses(AbstractLossLaw):
         """Return the probability of each loss by the running rate; an unknown fate leaves it where it is."""
         known = ~np.isnan(fate)
         base, weight, step = (share.estimate for share in self.shares().values())
-        at_known, _ = _predict_losses(np.append(fate[known], 0.0), base, weight, step)  # also after the last known one
-        # Each packet, known or not, is predicted from the known fates before it, which are so many.
-        return np.asarray(at_known[np.cumsum(known) - known])
+        # The probability after each number of known fates: 0, 1, ..., all.
+        after_known, _ = _predict_losses(np.append(fate[known], 0.0), base, weight, step)
+        known_before = np.cumsum(known) - known  # of each packet, how many known fates are before it
+        return np.asarray(after_known[known_before])
 
 
 def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:

@@ -54,8 +54,7 @@ class AbstractLossLaw(Module):
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
         """
-        parts = check_fates(fates)
-        return np.concatenate([self._score_stretch(stretch) for stretch in parts])
+        return np.concatenate([self._score_stretch(stretch) for stretch in check_fates(fates)])
 
     def _score_stretch(self, fate: Packets) -> Packets:
         """Return log P(fate | those before) of each packet of a stretch (packets,); NaN where the fate is unknown.
@@ -174,18 +173,19 @@ class MarkovLosses(AbstractLossLaw):
         return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability (k + 1/2) / (n + 1) of each loss: k losses of n packets had the same past.
+        """Return the probability (k + 1/2) / (n + 1) of each loss: k of n packets with the same past were lost.
 
-        The past are the last fates, at most `order`, as many as are known without a gap.
+        The past are the last fates, at most `order`, as many as are known without a gap: a number whose lowest bit is
+        the latest fate (1: lost). `self.counts` has (arrived, lost) after each past.
         """
         past, length = _number_last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
         for known in range(self.order + 1):
             # (arrived, lost) after the last `known` fates (2^known, 2), summed over fates further back.
-            counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)
-            p = (counts[:, 1] + 0.5) / (counts.sum(axis=1) + 1)
-            selected = length == known
-            probabilities[selected] = p[past[selected] & (2**known - 1)]
+            arrived, lost = self.counts.reshape(-1, 2**known, 2).sum(axis=0).T
+            probability_after = (lost + 0.5) / (arrived + lost + 1)
+            has_length = length == known
+            probabilities[has_length] = probability_after[past[has_length] & (2**known - 1)]
         return probabilities
 
     def _compute_return_probability(self, steps: int) -> float:
@@ -196,7 +196,8 @@ class MarkovLosses(AbstractLossLaw):
         """
         if self.order > 1:
             return super()._compute_return_probability(steps)
-        a, b = self.predicted(np.array([0.0, np.nan]))[1], 1 - self.predicted(np.array([1.0, np.nan]))[1]
+        arrived, lost = np.array([0.0, np.nan]), np.array([1.0, np.nan])  # one known fate, and the one to predict
+        a, b = self.predicted(arrived)[1], 1 - self.predicted(lost)[1]
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:

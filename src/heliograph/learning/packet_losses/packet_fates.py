@@ -107,11 +107,11 @@ def _split_at_restarts(received: np.ndarray, jump: int, may_be_copies: bool) -> 
     stretches: list[list[int]] = [[]]
     for run in _split_rising(received):
         # Numbers at the begin of a rising run that are not above the last one.
-        again = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
-        if again and not (may_be_copies and _are_copies(again, run, stretches[-1])):
+        repeated = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
+        if repeated and not (may_be_copies and _are_copies(repeated, run, stretches[-1])):
             stretches.append([])
-            again = []
-        for number in run[len(again) :]:
+            repeated = []
+        for number in run[len(repeated) :]:
             if stretches[-1] and number - stretches[-1][-1] >= jump:
                 stretches.append([])
             stretches[-1].append(number)
@@ -221,7 +221,8 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
     for node, value in table("measurements", measurements, "arrays").items():
         name = f"measurements of {node!r}"
         values = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
-        lost = np.isnan(array(name, values[:, None] if values.ndim == 1 else values, (None, None), missing=True))
+        matrix = values[:, None] if values.ndim == 1 else values  # (steps, received)
+        lost = np.isnan(array(name, matrix, (None, None), missing=True))
         if np.all(lost == lost[:, :1]):
             fates[node] = [lost[:, 0].astype(float)]
         else:

@@ -28,14 +28,17 @@ def maximise_over_shares(
     precision: the relative change of the value at which a climb ends.
     """
 
-    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative(x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return minus the function and minus its gradient, since SciPy minimises."""
         value, gradient = function(x)
         return -value, -gradient
 
     # Logits beyond END are shares of 0 and 1, as far as data tell.
     bounds = [(-END, END)] * len(starts[0])
-    results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
-    best = min(results, key=lambda end: float(end.fun))
+    results = [
+        minimize(negative, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts
+    ]
+    best = min(results, key=lambda result: float(result.fun))
     return np.asarray(best.x), -float(best.fun)
 
 
@@ -61,8 +64,8 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
     # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
-    low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, -1)
-    high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, 1)
+    low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, side=-1)
+    high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, side=1)
     estimate = float(expit(top[i]))
     if is_zero or is_one:
         estimate = 0.0 if is_zero else 1.0
@@ -82,23 +85,21 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
         i: index of the share.
         side: -1 or 1.
     """
-    others = np.delete(np.arange(len(top)), i)
-    nearby = top[others]  # the other logits at the last point above the level: the next search begins there
+    others = np.delete(np.arange(len(top)), i)  # indices of the other logits
+    start_of_others = top[others]  # the other logits at the last point above the level: the next search begins there
 
     @cache  # from another start a search may end elsewhere, so that an end of a bracket has to keep its value
-    def height_above_level(logit_of_share: float) -> float:
-        """Return how far the profile at this logit is above the level.
+    def height_above_level(logit: float) -> float:
+        """Return how far the profile is above `level`: the log-likelihood, largest over the other logits, at this one.
 
-        `function`: log-likelihood of all logits. i: the logit that is held; `others`: the rest, over which it
-        is maximised; `nearby`: their values at the last height above the level, from which the next search
-        begins.
+        `function` is the log-likelihood of all logits, of which number i is held at `logit`. The search over the
+        others begins at `start_of_others`, which are kept from the last point above the level.
         """
-        nonlocal nearby
-        best_others, profile = maximise_over_shares(
-            _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
-        )
+        nonlocal start_of_others
+        function_of_others = _fix_logit(function, i, logit, others)
+        best_others, profile = maximise_over_shares(function_of_others, [start_of_others], PROFILE_ACCURACY)
         if profile > level:
-            nearby = best_others
+            start_of_others = best_others
         return profile - level
 
     # The maximum itself, if it is below by rounding; an end of the domain, if the profile is above the level there.

@@ -84,15 +84,17 @@ class _ColumnCounter:
     """
 
     def __init__(self, covariances: bool):
+        """Begin at column 0; `covariances`: whether states hold covariances in place of their factors L and D."""
         self._covariances = covariances
         self.filters: dict[str, dict[str, list[Any]]] = {}
         self.count = 0
 
     def number_parts(self, state: PyTree) -> dict[str, np.ndarray]:
-        """Return {path of a part: the numbers of its columns, in the part's shape}, counted from the next free one."""
+        """Return by path the column numbers of each array of a filter's state, in its shape, from `count` on."""
         shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in split_by_path(state).items()}
+        shapes = describe_old_layout(shapes) if self._covariances else shapes
         columns = {}
-        for path, shape in (describe_old_layout(shapes) if self._covariances else shapes).items():
+        for path, shape in shapes.items():
             size = prod(shape)
             columns[path] = np.arange(self.count, self.count + size).reshape(shape)
             self.count += size
@@ -141,6 +143,7 @@ class PlantMigration:
     """
 
     def __init__(self, fleet: Fleet, mine: Identity, say: Callable[[str], None]):
+        """Hold the fleet, its network's identity, and `say`, which is called with a line for each change."""
         self.fleet, self.mine, self._say = fleet, mine, say
         self._old: dict[str, Any] = {}  # "layout" of the network that is stored, as `describe_network` writes it
 
@@ -192,15 +195,16 @@ class PlantMigration:
 
         Before 0.3.0 outputs had no probabilities of modes: these become NaN.
         """
-        new, without_modes = json.loads(self.mine[DESCRIPTION])["layout"], ~_find_mode_columns(self.fleet)
-        if any(list(self._old[part]) != list(new[part]) for part in ("nodes", "filters")):
+        new_layout = json.loads(self.mine[DESCRIPTION])["layout"]
+        if any(list(self._old[kind]) != list(new_layout[kind]) for kind in ("nodes", "filters")):
             return None
-        if rows.shape[1] == len(without_modes):
+        is_old_column = ~_find_mode_columns(self.fleet)
+        if rows.shape[1] == len(is_old_column):
             return rows
-        if rows.shape[1] != np.count_nonzero(without_modes):
+        if rows.shape[1] != np.count_nonzero(is_old_column):
             return None
-        results = np.full((len(rows), len(without_modes)), np.nan)
-        results[:, without_modes] = rows
+        results = np.full((len(rows), len(is_old_column)), np.nan)
+        results[:, is_old_column] = rows
         return results
 
     def _translate_plant(self, stored: bytes) -> bytes:
@@ -209,11 +213,8 @@ class PlantMigration:
         Rows, events and counts of a node that is gone, or that receives another number of values now, are left out.
         """
         network, sizes_before = self.fleet.network, self._old["nodes"]  # {node: how many numbers it received}
-        kept = [
-            name
-            for name, received in sizes_before.items()
-            if name in network.nodes and network.nodes[name].received == received
-        ]
+        sizes_here = {name: node.received for name, node in network.nodes.items()}
+        kept = [name for name, received in sizes_before.items() if sizes_here.get(name) == received]
         index_here = {i: network.names.index(name) for i, name in enumerate(sizes_before) if name in kept}
         index_here[-1] = -1  # the inputs
         parts = PlantParts.from_bytes(stored, self._count_columns_before())
@@ -232,9 +233,9 @@ class PlantMigration:
         ).to_bytes()
 
     def _count_columns_before(self) -> int:
-        """Return how many columns the other network's table has.
+        """Return how many columns the table of the other network, of which the state was saved, has.
 
-        They are (state, outputs, inputs held, step number, measurements by node, inputs, time).
+        They are (state, outputs, inputs that hold, step number, measurements by node, inputs that came, time).
         """
         old = self._old
         return int(old["state"] + old["outputs"] + 2 * old["given"] + sum(old["nodes"].values()) + 2)
@@ -317,17 +318,16 @@ class PlantMigration:
 
         `numbers_before`: those of the other network (`_old`). `index_here`: a node's index here by that there.
         """
-        given, received, network = self._old["given"], self.fleet.program.received, self.fleet.network
-        numbers = np.full((len(numbers_before), received + given + 1), np.nan)
-        # Inputs (`given` columns) and time come last in both, behind the measurements (`received` columns here).
-        numbers[:, received:] = numbers_before[:, numbers_before.shape[1] - given - 1 :]
-        # The first column of each node, and the end of the last one's: node `there` has as many as it has `here`.
-        starts_before = np.cumsum([0, *self._old["nodes"].values()])
+        network, measurement_count = self.fleet.network, self.fleet.program.received
+        input_and_time_count = self._old["given"] + 1  # these come last in both, behind the measurements
+        numbers = np.full((len(numbers_before), measurement_count + input_and_time_count), np.nan)
+        numbers[:, measurement_count:] = numbers_before[:, -input_and_time_count:]
+        # The first column of each node, and the end of the last one's; a node has as many columns there as here.
+        old_starts = np.cumsum([0, *self._old["nodes"].values()])
         starts = np.cumsum([0, *(network.nodes[name].received for name in network.names)])
-        for there, here in index_here.items():
-            if there >= 0:  # -1 stands for the inputs
-                before = numbers_before[:, starts_before[there] : starts_before[there + 1]]
-                numbers[:, starts[here] : starts[here + 1]] = before
+        for old, new in index_here.items():
+            if old >= 0:  # -1 stands for the inputs
+                numbers[:, starts[new] : starts[new + 1]] = numbers_before[:, old_starts[old] : old_starts[old + 1]]
         return numbers
 
 
@@ -395,6 +395,6 @@ def _describe_changes(before: object, after: object) -> list[str]:
         return [f"{before} -> {after}"]
     if a.shape != b.shape or before is None or after is None:
         return [" -> ".join("none" if side is None else f"{side}" for side in (before, after))]
-    changed = [tuple(map(int, index)) for index in np.argwhere(a != b)]
-    lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in changed]
-    return lines[:LISTED] + ([f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else [])
+    indices = [tuple(map(int, index)) for index in np.argwhere(a != b)]
+    lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in indices]
+    return [*lines[:LISTED], f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else lines

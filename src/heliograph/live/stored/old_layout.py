@@ -36,11 +36,12 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
     A part is known by its path, such as ".covariance" behind a stem; its factors are the parts LOWER (L below the
     diagonal) and VARIANCES (D), of n (n - 1) / 2 and n numbers.
     """
-    shapes, places = {path: list(shape) for path, shape in old.items()}, _trace_paths(old, new)
-    for stem in _find_factored(old, places.values()):
-        *lead, n, _ = shapes.pop(stem + COVARIANCE)
-        shapes |= {stem + LOWER: [*lead, n * (n - 1) // 2], stem + VARIANCES: [*lead, n]}
-    return shapes == {places[path]: list(shape) for path, shape in new.items()}
+    shapes = {path: list(shape) for path, shape in old.items()}
+    old_paths = _trace_paths(old, new)  # {new path of a part: its path in `old`, or the one that its factor would have}
+    for stem in _find_factored(old, old_paths.values()):
+        *leading_axes, n, _ = shapes.pop(stem + COVARIANCE)
+        shapes[stem + LOWER], shapes[stem + VARIANCES] = [*leading_axes, n * (n - 1) // 2], [*leading_axes, n]
+    return shapes == {old_paths[path]: list(shape) for path, shape in new.items()}
 
 
 def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
@@ -48,10 +49,10 @@ def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[
 
     A covariance of which only the factors are wanted, LOWER (L below the diagonal) and VARIANCES (D), is factorised.
     """
-    results, places = dict(parts), _trace_paths(parts, new)
-    for stem in _find_factored(parts, places.values()):
+    results, old_paths = dict(parts), _trace_paths(parts, new)
+    for stem in _find_factored(parts, old_paths.values()):
         results[stem + LOWER], results[stem + VARIANCES] = factorise_covariance(results.pop(stem + COVARIANCE))
-    return {path: results[place] for path, place in places.items()}
+    return {path: results[old_path] for path, old_path in old_paths.items()}
 
 
 def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
@@ -61,12 +62,12 @@ def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
     """
     results: dict[str, list[int]] = {}
     for path, shape in new.items():
-        place = _flatten_path(path)
-        stem = place.removesuffix(VARIANCES)
-        if place.endswith(VARIANCES) and results.pop(stem + LOWER, None) is not None:
+        old_path = _flatten_path(path)
+        stem = old_path.removesuffix(VARIANCES)
+        if old_path.endswith(VARIANCES) and results.pop(stem + LOWER, None) is not None:
             results[stem + COVARIANCE] = [*shape, shape[-1]]
         else:
-            results[place] = list(shape)
+            results[old_path] = list(shape)
     return results
 
 
@@ -122,9 +123,9 @@ def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFl
     """Add the columns of a filter's parts to `taken`, up to the first flag; return that flag, or None without one.
 
     A flag is a boolean part. Old versions wrote its value, 0 or 1, where the number of its first column belongs, so
-    that its columns are not known ("lost"). It is found by that number: no part begins before the end of the part
-    before it, or, as the first, at a column that is taken. Parts after the flag that begin behind the part before
-    it have true columns, and are taken as well.
+    that its columns are lost. Parts of which the first columns are written as 0, 4, 1, 7, the third a flag with the
+    value 1, give the columns of the first two; the last, which begins behind the end of the second, has true columns,
+    and is taken as well.
 
     Args:
         parts: of one filter, in their order.
@@ -132,17 +133,30 @@ def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFl
         taken: columns that are taken, to which those of the parts are added.
     """
     for i, part in enumerate(parts):
-        if part.columns and (part.first < end or (not end and part.first in taken)):
+        if _is_lost_flag(part, end, taken):
             # A flag that comes first is of the memory of fusions, which stands behind all filters: so does its end.
             end = end or sys.maxsize
-            after = parts[i + 1 :]
-            for later in after:
-                if later.first >= end:
-                    taken.update(later.columns)
-            return _LostFlag(end, part, after)
+            parts_after_flag = parts[i + 1 :]
+            for later_part in parts_after_flag:
+                if later_part.first >= end:
+                    taken.update(later_part.columns)
+            return _LostFlag(end, part, parts_after_flag)
         taken.update(part.columns)
         end = max(end, part.end)
     return None
+
+
+def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
+    """Return whether a part is a flag whose columns are lost, as its value, 0 or 1, stands for the first of them.
+
+    No other part begins before the `end` of the part before it, or, if it is the filter's first (`end` is 0), at a
+    column that is `taken` by another filter.
+    """
+    if not part.columns:
+        return False
+    begins_before_end = part.first < end
+    is_first_at_taken_column = end == 0 and part.first in taken
+    return begins_before_end or is_first_at_taken_column
 
 
 def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,16 +166,16 @@ def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray
     and is set to that.
     """
     n = covariance.shape[-1]
-    # What is left of P after the columns eliminated so far, and the variances themselves.
-    rest, whole = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
-    lower, variances = np.zeros_like(rest), np.zeros_like(whole)
+    # What remains of P once the columns before j are eliminated, and the diagonal of P itself.
+    remainder, diagonal_of_P = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
+    L, D = np.zeros_like(remainder), np.zeros_like(diagonal_of_P)
     for j in range(n):
-        d = np.maximum(rest[..., j, j], n * np.finfo(float).eps * whole[..., j])
-        variances[..., j], below = d, rest[..., j + 1 :, j]
-        share = np.divide(below, d[..., None], out=np.zeros_like(below), where=d[..., None] > 0)
-        lower[..., j + 1 :, j] = share
-        rest[..., j + 1 :, j + 1 :] -= share[..., :, None] * below[..., None, :]
-    return lower[..., *np.tril_indices(n, -1)], variances
+        D[..., j] = pivot = np.maximum(remainder[..., j, j], n * np.finfo(float).eps * diagonal_of_P[..., j])
+        column_below, pivot = remainder[..., j + 1 :, j], pivot[..., None]
+        quotients = np.divide(column_below, pivot, out=np.zeros_like(column_below), where=pivot > 0)
+        L[..., j + 1 :, j] = quotients
+        remainder[..., j + 1 :, j + 1 :] -= quotients[..., :, None] * column_below[..., None, :]
+    return L[..., *np.tril_indices(n, -1)], D
 
 
 def _trace_paths(old: Iterable[str], new: Iterable[str]) -> dict[str, str]:

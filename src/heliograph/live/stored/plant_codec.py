@@ -90,33 +90,40 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
     return _pack_parts(head, keys, events, table, times, values)
 
 
-def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
-    """Return as bytes the lengths of all parts, the head, and the flat parts (keys, events, table, times, values).
+def _pack_parts(head: dict[str, Any], *flat_arrays: Sequence[float] | np.ndarray) -> bytes:
+    """Return as bytes: the lengths of what follows, the head as JSON, and five flat arrays.
 
-    HEAD: the lengths; TYPES: type of the numbers of each flat part; TABLE: index of the table among these; KEPT:
-    entry of the head that says how many of its numbers are stored.
+    These are keys, events, table, times and values. HEAD: the struct of the lengths; TYPES: type of the numbers of
+    each array; TABLE: index of the table among these; KEPT: entry of the head that says how many of its numbers are
+    stored.
     """
-    keys, events, _, _, values = flat  # of shapes (rows, 2), (events, 3) and (numbers,) once they are unpacked
+    keys, events, _, _, values = flat_arrays  # of shapes (rows, 2), (events, 3) and (numbers,) once they are unpacked
     counts = len(keys) // 2, len(events) // 3, len(values)
-    arrays = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
+    arrays = [np.array(numbers, dtype=kind) for numbers, kind in zip(flat_arrays, TYPES, strict=True)]
     # Of a table that is mostly zeros a bit for each number, and those that are not zero.
     table = arrays[TABLE]
-    nonzero = table.view("<i8") != 0  # the sign of a zero counts
-    kept = int(np.count_nonzero(nonzero))
+    is_stored = table.view("<i8") != 0  # by their bits, so that -0.0 is stored as well
+    stored_count = int(np.count_nonzero(is_stored))
     packed = [array.tobytes() for array in arrays]
-    if 2 * kept < len(table):
-        head, packed[TABLE] = head | {KEPT: kept}, np.packbits(nonzero).tobytes() + table[nonzero].tobytes()
-    text = json.dumps(head).encode()
-    return b"".join([HEAD.pack(len(text), *counts), text, *packed])
+    if 2 * stored_count < len(table):
+        head = head | {KEPT: stored_count}
+        packed[TABLE] = np.packbits(is_stored).tobytes() + table[is_stored].tobytes()
+    json_head = json.dumps(head).encode()
+    return b"".join([HEAD.pack(len(json_head), *counts), json_head, *packed])
 
 
 def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
-    """Read `size` numbers from place `at`, of which `kept` stand behind a bit for each; return them and the end."""
-    bits = np.frombuffer(data, np.uint8, -(-size // 8), at)  # eight of them in a byte, rounded up
-    values = np.frombuffer(data, "<f8", kept, at + len(bits))
-    array = np.zeros(size)
-    array[np.unpackbits(bits, count=size).astype(bool)] = values
-    return array, at + len(bits) + values.nbytes
+    """Read a table of `size` numbers, most of them 0, from offset `at` of `data`; return it, and where it ends.
+
+    First stands a bit for each number, 1 where it is stored, then the `kept` numbers that are.
+    """
+    byte_count = (size + 7) // 8  # of `size` bits, rounded up
+    values_begin = at + byte_count
+    bits = np.frombuffer(data, np.uint8, byte_count, at)
+    values = np.frombuffer(data, "<f8", kept, values_begin)
+    table = np.zeros(size)
+    table[np.unpackbits(bits, count=size).astype(bool)] = values
+    return table, values_begin + values.nbytes
 
 
 def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
@@ -162,17 +169,18 @@ def _pack_leap(leap: ClockLeap) -> dict[str, Any]:
     return leap._asdict() | {"earlier": None if leap.earlier is None else _pack_leap(leap.earlier)}
 
 
-def _unpack_leap(parts: Any) -> ClockLeap:
-    """Return the leap that `_pack_leap` packed, or a version until 0.3.0.
+def _unpack_leap(packed: Any) -> ClockLeap:
+    """Return the leap in time that `_pack_leap` packed as a dict of its fields.
 
-    Such a version wrote a list: its time, the arrival before it, and five numbers of each node.
+    A version until 0.3.0 wrote a list: its time, the arrival before it, and five numbers of each node.
     """
-    if isinstance(parts, list):
-        time, now, links = parts
-        moments = {node: (numbers[2], numbers[4]) for node, numbers in links.items()}  # `at` and `latest` of each
+    if isinstance(packed, list):
+        time, now, links = packed
+        moments = {node: (at, latest) for node, (_, _, at, _, latest) in links.items()}
         return ClockLeap(time=time, since=time, now=now, moments=moments)
-    moments = {node: (at, latest) for node, (at, latest) in parts["moments"].items()}
-    return ClockLeap(**parts | {"moments": moments, "earlier": parts["earlier"] and _unpack_leap(parts["earlier"])})
+    moments = {node: (at, latest) for node, (at, latest) in packed["moments"].items()}
+    earlier = packed["earlier"] and _unpack_leap(packed["earlier"])
+    return ClockLeap(**packed | {"moments": moments, "earlier": earlier})
 
 
 def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:

@@ -57,13 +57,14 @@ def check_same_network(
         kept: names of entries that have to be the same even if changes are accepted.
         accept: whether changes of other entries are accepted; where they are not and would do, the error advises it.
     """
-    names = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
-    fits = not any(name in kept for name in names)
-    if names and not (accept and fits):
-        here = "; ".join(f"{name}: {mine.get(name, 'none')}" for name in names)
-        there = "; ".join(f"{name}: {other.get(name, 'none')}" for name in names)
-        more = "; accept_changes=True goes on with what fits" if kept and fits else ""
-        raise fail(what, f"the state of what is here ({here})", f"one that differs ({there}){more}")
+    differing = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
+    may_be_accepted = not any(name in kept for name in differing)
+    if differing and not (accept and may_be_accepted):
+        mine_in_words = "; ".join(f"{name}: {mine.get(name, 'none')}" for name in differing)
+        other_in_words = "; ".join(f"{name}: {other.get(name, 'none')}" for name in differing)
+        advice = "; accept_changes=True goes on with what fits" if kept and may_be_accepted else ""
+        found = f"one that differs ({other_in_words}){advice}"
+        raise fail(what, f"the state of what is here ({mine_in_words})", found)
 
 
 HEAD = "head"
@@ -75,8 +76,8 @@ def pack_snapshot(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) 
     The head is JSON, under the name HEAD among the arrays of an NPZ file.
     """
     file = BytesIO()
-    written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
-    np.savez(file, allow_pickle=False, **{HEAD: written, **arrays})
+    json_bytes = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
+    np.savez(file, allow_pickle=False, **{HEAD: json_bytes, **arrays})
     return file.getvalue()
 
 

@@ -134,13 +134,14 @@ class DrivenTransition(Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state [x; b] after a step: x moves as the plant says, plus `coupling` times the biases b.
+        """Return the state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
 
-        The biases move by a plant of their own, whose inputs stand at `places` of u.
+        E is `self.coupling`, by which the biases drive the plant; u_b are the inputs at `self.places`, which move them.
         """
         n = len(self.plant.states)
-        moved = self.plant.transition(x[:n], u) + jnp.asarray(self.coupling) @ x[n:]
-        return jnp.concatenate([moved, self.bias.transition(x[n:], u[np.array(self.places, int)])])
+        state, biases = x[:n], x[n:]
+        next_state = self.plant.transition(state, u) + jnp.asarray(self.coupling) @ biases
+        return jnp.concatenate([next_state, self.bias.transition(biases, u[np.array(self.places, int)])])
 
 
 def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
@@ -184,26 +185,29 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
     return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 
 
-def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
-    """Return [[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
-    below = np.zeros((len(bias.states), len(plant.states)))
+def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, E: np.ndarray, inputs_of_bias: Any) -> tuple[Any, Any]:
+    """Return [[A, E], [0, F]] and [B; B_b], as functions of the inputs u where some block is a function of them.
+
+    E is the coupling, by which biases drive the plant; `inputs_of_bias` @ u are those of u that move the biases.
+    """
+    zeros = np.zeros((len(bias.states), len(plant.states)))
     if not any(isinstance(value, MatrixOfInputs) for model in (plant, bias) for value in vars(model).values()):
-        xp = library(plant.matrix, coupling, bias.matrix, plant.input_matrix, bias.input_matrix)
-        matrix = xp.block([[plant.matrix, coupling], [below, bias.matrix]])
-        return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
+        xp = library(plant.matrix, E, bias.matrix, plant.input_matrix, bias.input_matrix)
+        matrix = xp.block([[plant.matrix, E], [zeros, bias.matrix]])
+        return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ inputs_of_bias])
 
-    def move(u: jax.Array) -> jax.Array:
-        """Return [[A, E], [0, F]] under the inputs u."""
-        of_bias = bias.transition_matrix(pick @ u)
-        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), of_bias]])
+    def transition_matrix(u: jax.Array) -> jax.Array:
+        """Return [[A, E], [0, F]] under the inputs u: of the plant, of the coupling E, and of the bias."""
+        A, F = plant.transition_matrix(u), bias.transition_matrix(inputs_of_bias @ u)
+        return jnp.block([[A, jnp.asarray(E)], [jnp.asarray(zeros), F]])
 
-    def drive(u: jax.Array) -> jax.Array:
-        """Return [B; B_b] under the inputs u: of the plant, and of the biases, whose inputs `pick` takes out of u."""
-        return jnp.concatenate(
-            [matrix_under_inputs(plant.input_matrix, u), matrix_under_inputs(bias.input_matrix, pick @ u) @ pick]
-        )
+    def input_matrix(u: jax.Array) -> jax.Array:
+        """Return [B; B_b] under the inputs u: of the plant, and of the bias, which `inputs_of_bias` @ u moves."""
+        B = matrix_under_inputs(plant.input_matrix, u)
+        of_bias = matrix_under_inputs(bias.input_matrix, inputs_of_bias @ u)
+        return jnp.concatenate([B, of_bias @ inputs_of_bias])
 
-    return move, drive
+    return transition_matrix, input_matrix
 
 
 class BiasedMeasurement(Module):
@@ -228,8 +232,8 @@ def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int
 
 def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
     """Return a list of `count` values, one for each bias, from one value for all or from as many."""
-    given: Any = value
-    values = list(given) if rank(name, value) else [given] * count
+    number_or_sequence: Any = value
+    values = list(number_or_sequence) if rank(name, value) else [number_or_sequence] * count
     if len(values) != count:
         raise fail(name, f"one, or one for each of {count}", len(values))
     return values

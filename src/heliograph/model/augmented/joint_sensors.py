@@ -131,10 +131,10 @@ def join_links(sensors: Mapping[str, AnySensor], channels: Sequence[Channel]) ->
         channels: of the nodes, in the same order.
     """
 
-    def joint(*parts: AbstractSensor) -> AbstractSensor:
-        """Return the joint sensor of one step."""
-        return joint_sensor(dict(zip(sensors, parts, strict=True)))
+    def join_sensors_of_step(*sensors_of_step: AbstractSensor) -> AbstractSensor:
+        """Return the joint sensor of one step, of those of the nodes in their order."""
+        return joint_sensor(dict(zip(sensors, sensors_of_step, strict=True)))
 
-    sensor: AnySensor = at_each_step(joint, *sensors.values())
-    channel: Channel = at_each_step(lambda *parts: parallel(parts), *channels)
+    sensor: AnySensor = at_each_step(join_sensors_of_step, *sensors.values())
+    channel: Channel = at_each_step(lambda *channels_of_step: parallel(channels_of_step), *channels)
     return sensor, channel

@@ -34,10 +34,11 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     """
     check_linear("plant and sensor behind a random delay", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
-    moved: AnyPlant = at_each_step(partial(_append_delay_line, past=first(channel).past), plant, sensor)
-    n, total = len(first(plant).states), len(first(moved).states)
-    everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
-    return moved, everything, place_on_delay_line(channel)
+    augmented: AnyPlant = at_each_step(partial(_append_delay_line, past=first(channel).past), plant, sensor)
+    n, states = len(first(plant).states), first(augmented).states
+    outputs = len(states) - n  # y_k, ..., y_{k-D}, read without noise
+    read_outputs = LinearSensor(np.eye(len(states))[n:], np.zeros((outputs, outputs)), states[n:])
+    return augmented, read_outputs, place_on_delay_line(channel)
 
 
 def _append_delay_line(plant: Any, sensor: Any, past: int) -> LinearPlant:

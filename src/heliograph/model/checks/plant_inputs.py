@@ -80,10 +80,10 @@ def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
     One below zero that unsigned counters of 32 bits give reads just below 2^32: within NEAR for whole numbers, or
     within CLOSE where dt has SMALLER = 1e3 or 1e6 counts in a unit. `precision`: type of the numbers.
     """
-    wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
-    for counts in SMALLER:
-        wrapped = wrapped | _is_near_wrap(dt, counts, CLOSE, precision)
-    return (dt >= 0) & (dt <= LONGEST) & ~wrapped
+    has_wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
+    for counts_in_unit in SMALLER:
+        has_wrapped = has_wrapped | _is_near_wrap(dt, counts_in_unit, CLOSE, precision)
+    return (dt >= 0) & (dt <= LONGEST) & ~has_wrapped
 
 
 def _is_near_wrap(dt: Array, counts: float, near: float, precision: type) -> Array:
@@ -191,15 +191,16 @@ def _check_functions_of_inputs(
     COVARIANCES: names of the matrices that must be covariances. `steps`: the step of each row.
     """
     functions = _list_functions_of_inputs(first(plant))
-    parts = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
-    for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
-        wrong = mask_invalid_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
+    blocks = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
+    for name, matrices in zip(functions, map(np.concatenate, zip(*blocks, strict=True)), strict=True):
+        is_covariance = name in COVARIANCES
+        wrong = mask_invalid_covariances(matrices) if is_covariance else ~np.isfinite(matrices).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
-            given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
+            inputs = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
             where = f"row {row + 1}" if len(u) > 1 else f"step {steps[0]}"
-            came = f"{_shorten(values[row])} in {where}, for {given}"
-            raise fail(name, "a covariance" if name in COVARIANCES else "finite numbers", came)
+            got = f"{_shorten(matrices[row])} in {where}, for {inputs}"
+            raise fail(name, "a covariance" if is_covariance else "finite numbers", got)
 
 
 def _evaluate_in_blocks_of_steps(
@@ -238,14 +239,14 @@ def _shorten(value: np.ndarray) -> str:
 
 def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
     """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
-    finite = np.isfinite(values).all(axis=(1, 2))
-    safe = np.where(finite[:, None, None], values, 0.0)
-    unit = standard_deviations(safe)  # so that tolerances do not depend on the states' units
-    correlations = safe / (unit[:, :, None] * unit[:, None, :])
-    skew = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2), initial=0.0)
-    smallest = np.linalg.eigvalsh((correlations + np.swapaxes(correlations, 1, 2)) / 2)[:, 0]
-    wrong: np.ndarray = ~finite | (skew > SYMMETRY_TOLERANCE) | (smallest < -DEFINITENESS_TOLERANCE)
-    return wrong
+    is_finite = np.isfinite(values).all(axis=(1, 2))
+    finite_values = np.where(is_finite[:, None, None], values, 0.0)
+    deviations = standard_deviations(finite_values)  # so that tolerances do not depend on the states' units
+    correlations = finite_values / (deviations[:, :, None] * deviations[:, None, :])
+    asymmetry = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2), initial=0.0)
+    least_eigenvalue = np.linalg.eigvalsh((correlations + np.swapaxes(correlations, 1, 2)) / 2)[:, 0]
+    invalid: np.ndarray = ~is_finite | (asymmetry > SYMMETRY_TOLERANCE) | (least_eigenvalue < -DEFINITENESS_TOLERANCE)
+    return invalid
 
 
 def do_inputs_spoil(
@@ -278,12 +279,12 @@ def _returns_invalid_value(model: AbstractPlant | AbstractSensor, u: jax.Array, 
 
     COVARIANCES: names of the matrices that must be covariances. `precision`: type of the numbers, for tolerances.
     """
-    spoilt = jnp.asarray(False)
+    has_invalid = jnp.asarray(False)
     for name, function in _list_functions_of_inputs(model).items():
         value = function(model, u)
-        sound = _is_covariance(value, precision) if name in COVARIANCES else jnp.all(jnp.isfinite(value))
-        spoilt |= ~sound
-    return spoilt
+        is_valid = _is_covariance(value, precision) if name in COVARIANCES else jnp.all(jnp.isfinite(value))
+        has_invalid |= ~is_valid
+    return has_invalid
 
 
 def _is_covariance(matrix: jax.Array, precision: type | None) -> jax.Array:

@@ -31,6 +31,7 @@ class RefusedError(InputError):
     """A message that is refused for one of these reasons, in the words of an error."""
 
     def __init__(self, reason: Reason, error: InputError):
+        """Make the error with the words of `error`, and the reason under which the refused message is counted."""
         super().__init__(str(error))
         self.reason: Reason = reason
 

@@ -23,17 +23,18 @@ def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
     Raises:
         ValueError: dates that are missing, that go backwards, or that differ from those of another table.
     """
-    first, clock = "", None
+    first_table, common_dates = "", None
     for name, rows in tables.items():
-        dated = row_dates(name, rows)
-        if dated is None:
+        dates = row_dates(name, rows)
+        if dates is None:
             continue
-        if clock is None:
-            first, clock = name, dated
-        elif len(dated) == len(clock) and (dated != clock).any():  # other lengths are refused as such
-            row = int(np.argmax(dated != clock))
-            raise fail(f"dates of {name}", f"those of {first}", f"{dated[row]} in row {row + 1}, not {clock[row]}")
-    return clock
+        if common_dates is None:
+            first_table, common_dates = name, dates
+        elif len(dates) == len(common_dates) and (dates != common_dates).any():  # other lengths are refused as such
+            row = int(np.argmax(dates != common_dates))
+            got = f"{dates[row]} in row {row + 1}, not {common_dates[row]}"
+            raise fail(f"dates of {name}", f"those of {first_table}", got)
+    return common_dates
 
 
 def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> None:
@@ -43,8 +44,11 @@ def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> No
         inputs: names of the plant's inputs.
         clock: times of the rows, numbers or dates; None where they are not known.
     """
-    if clock is not None and TIME_STEP not in inputs and (said := unequal_steps(clock)):
-        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_count_frames_up_to_user())
+    if clock is None or TIME_STEP in inputs:
+        return
+    description = unequal_steps(clock)
+    if description:
+        warnings.warn(f"time: {description}: {ONE_STEP}", stacklevel=_count_frames_up_to_user())
 
 
 def read_row_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:

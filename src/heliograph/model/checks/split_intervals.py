@@ -85,19 +85,19 @@ def _predict_over_intervals(
         For each cut the mean (n,), the product of the transition matrices and the noise's covariance (n, n).
     """
 
-    def integrate(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def integrate(intervals: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return mean, transition matrix and noise covariance after intervals of these lengths, one after another.
 
         x: the mean before them; `dt`: the number of the input that is the length, all other inputs being 1.
         """
         n = len(x)
-        state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
-        for interval in parts:
+        mean, matrix, covariance = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
+        for interval in intervals:
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
-            a, moved = jax.jacfwd(plant.make_motion_about(u, state))(state), plant.transition(state, u)
-            state = plant.manifold.settle(moved, moved + plant.noise_mean())
-            matrix, spread = a @ matrix, a @ spread @ a.T + plant.noise_covariance(u)
-        return state, matrix, spread
+            F, predicted = jax.jacfwd(plant.make_motion_about(u, mean))(mean), plant.transition(mean, u)
+            mean = plant.manifold.settle(predicted, predicted + plant.noise_mean())
+            matrix, covariance = F @ matrix, F @ covariance @ F.T + plant.noise_covariance(u)
+        return mean, matrix, covariance
 
     moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(integrate)(jnp.asarray(intervals))
     return moved

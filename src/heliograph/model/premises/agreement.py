@@ -155,11 +155,11 @@ def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
 
 def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
     """Return whether two plants move a state alike: by equal matrices, or by the same function of state and inputs."""
-    linear = [plant for plant in (a, b) if isinstance(plant, LinearPlant)]
-    if len(linear) == 2 and not any(isinstance(m, MatrixOfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
-        return equal_to_rounding(linear[0].matrix, linear[1].matrix) and equal_to_rounding(
-            linear[0].input_matrix, linear[1].input_matrix
-        )
+    if isinstance(a, LinearPlant) and isinstance(b, LinearPlant):
+        matrices = (a.matrix, a.input_matrix, b.matrix, b.input_matrix)
+        if not any(isinstance(matrix, MatrixOfInputs) for matrix in matrices):
+            has_same_matrix = equal_to_rounding(a.matrix, b.matrix)
+            return has_same_matrix and equal_to_rounding(a.input_matrix, b.input_matrix)
     return same_function(a.transition, b.transition, (len(a.states),), (len(a.inputs),))
 
 
@@ -243,8 +243,10 @@ def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
     """
     if isinstance(sensor, LinearSensor):
         return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
-    parts = [find_sensor_matrix(part) for part in sensor.parts] if isinstance(sensor, JointSensor) else [None]
-    return None if any(part is None for part in parts) else np.concatenate([p for p in parts if p is not None])
+    if not isinstance(sensor, JointSensor):
+        return None
+    matrices = [matrix for part in sensor.parts if (matrix := find_sensor_matrix(part)) is not None]
+    return np.concatenate(matrices) if len(matrices) == len(sensor.parts) else None
 
 
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
@@ -280,7 +282,7 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
         return True
     if first(a).remembers or first(b).remembers:
         return False
-    return _agree_at_each_step(lambda x, y, o: _same_map(x, y, o, loses), a, b, order)
+    return _agree_at_each_step(lambda a_k, b_k, order: _same_map(a_k, b_k, order, loses), a, b, order)
 
 
 def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:
@@ -319,10 +321,15 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
     """
     if has_bounded_noise(a) != has_bounded_noise(b):
         return False
-    believed, own = (_take_moments_by_arrival(channel) for channel in (a, b))
-    of_all = [moments for arrived, moments in believed if arrived.all()]
+    moments_of_a, moments_of_b = _take_moments_by_arrival(a), _take_moments_by_arrival(b)
+    if not moments_of_b:
+        return False
+    where_all_arrive = next((moments for arrived, moments in moments_of_a if arrived.all()), None)
+    if where_all_arrive is None:
+        return False
     # Each set of components that may arrive has, in both, the moments that it has where all arrive.
-    return bool(of_all and own) and all(_moments_agree(of_all[0], m, arrived) for arrived, m in [*believed, *own])
+    every = [*moments_of_a, *moments_of_b]
+    return all(_moments_agree(where_all_arrive, moments, arrived) for arrived, moments in every)
 
 
 Moments = tuple[np.ndarray, np.ndarray]  # E[(G, n)] (m, p + 1) and the tensor of E[z z' | y] (m, m, p + 1, p + 1)
@@ -372,10 +379,10 @@ def _same_observation(
     """
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
-    maps = [whole for observation in (a, b) if (whole := _compose_with_sensor(*observation)) is not None]
-    if len(maps) < 2 or has_bounded_noise(a) != has_bounded_noise(b):
+    map_of_a, map_of_b = _compose_with_sensor(*a), _compose_with_sensor(*b)
+    if map_of_a is None or map_of_b is None or has_bounded_noise(a) != has_bounded_noise(b):
         return False
-    return _same_map(drop_names(maps[0]), drop_names(maps[1]), order, True)
+    return _same_map(drop_names(map_of_a), drop_names(map_of_b), order, loses=True)
 
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:

@@ -59,6 +59,7 @@ class Premise:
         range: "ReadingLimits | None" = None,
         encoder: "Words | None" = None,
     ):
+        """Hold the models that a filter believes in; the class says what the arguments are."""
         self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
         self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
         self.encoder = encoder
@@ -73,10 +74,11 @@ class Premise:
 class StaticPremise:
     """A premise as a static field of a tree of arrays: all of them are equal, so that none decides what is compiled.
 
-    lowered: whether the claim was lowered, since the filter stands in another world.
+    lowered: whether the claim was lowered, since the filter runs in another world than its premise.
     """
 
     def __init__(self, premise: Premise | None, lowered: bool = False):
+        """Hold a premise, None of a filter without one, and whether the filter's claim was lowered to nominal."""
         self.premise, self.lowered = premise, lowered
 
     def __eq__(self, other: object) -> bool:

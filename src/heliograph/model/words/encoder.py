@@ -57,6 +57,7 @@ class Words(Module):
         dither: Dither = "none",
         resolution: "Float[ArrayLike, ''] | None" = None,
     ):
+        """Check and hold the lowest and highest word, the bits (or those that D needs) and the dither."""
         # The range of the words; of a resolution D the highest word follows.
         self.low, self.high = (np.asarray(_read_range_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):
@@ -115,14 +116,14 @@ class Words(Module):
 
         "none", "triangular" (the sum of two uniform ones) or uniform, in units of `step`, the distance of two words.
         """
-        drawn = jax.random.uniform(key, (2, outputs), dtype=float)
+        uniform = jax.random.uniform(key, (2, outputs), dtype=float)  # two numbers from 0 to 1 for each output
         match self.dither:
             case "none":
                 return jnp.zeros(outputs)
             case "triangular":
-                return jnp.asarray(self.step) * (drawn[0] + drawn[1] - 1)
+                return jnp.asarray(self.step) * (uniform[0] + uniform[1] - 1)
             case _:
-                return jnp.asarray(self.step) * (drawn[0] - 0.5)
+                return jnp.asarray(self.step) * (uniform[0] - 0.5)
 
     def index(self, y: jax.Array) -> jax.Array:
         """Return the number i of the word nearest to each component of y, a whole number as a float."""
@@ -145,8 +146,8 @@ class Words(Module):
         """
         d = self.draw_dither(key, len(y))
         index = self.index(y + d)
-        numbers = self.signs(index)
-        numbers = jnp.concatenate([numbers, d[:, None]], axis=1) if self.subtracts else numbers
+        bits = self.signs(index)
+        numbers = jnp.concatenate([bits, d[:, None]], axis=1) if self.subtracts else bits
         return self.word(index), numbers.reshape(-1)
 
     def dithers(

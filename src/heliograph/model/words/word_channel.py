@@ -74,9 +74,10 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the link of one step, `power` being the variance of each word, all of its values equally likely."""
         power = encoder.each(encoder.power, signal_size(link))
-        return rewrite_channel(
-            link, WordForm(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)
-        ).map
+        as_numbers = WordForm(
+            flips=lambda flips, places: flips.about_centre(power[list(places)]), selection=known, size=1
+        )
+        return rewrite_channel(link, as_numbers).map
 
     numbers: Channel = at_each_step(convert, channel)
     return numbers
@@ -159,8 +160,8 @@ def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMa
     `places`: the components of y that the first is given.
     """
     maps = []
-    for part in link.maps:
-        rewritten = _rewrite_map(part, places, form)
+    for inner in link.maps:
+        rewritten = _rewrite_map(inner, places, form)
         places = rewritten.places
         maps.append(rewritten.map)
     return RewrittenMap(Series(maps), places)
@@ -171,10 +172,10 @@ def _rewrite_choice(link: AbstractOneOfSeveralMaps, places: Places, form: WordFo
 
     `places`: the components of y that each is given.
     """
-    parts = [_rewrite_map(part, places, form) for part in link.maps]
-    if len({part.places for part in parts}) > 1:
+    choices = [_rewrite_map(inner, places, form) for inner in link.maps]
+    if len({choice.places for choice in choices}) > 1:
         raise fail("channel of words", "choices and modes that deliver the same components", "others")
-    return RewrittenMap(replace_inner_maps(link, [part.map for part in parts]), parts[0].places)
+    return RewrittenMap(replace_inner_maps(link, [choice.map for choice in choices]), choices[0].places)
 
 
 def make_word_link_error(got: str) -> Exception:

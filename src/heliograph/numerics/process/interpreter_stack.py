@@ -22,6 +22,7 @@ def reserve_stack(function: Callable[P, R]) -> Callable[P, R]:
     """
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Return the result of `function`; only the size of this call's frame matters."""
         return function(*args, **kwargs)
 
     # The frame of `call` is ROOM references large, half a MB, of which it needs next to nothing itself.

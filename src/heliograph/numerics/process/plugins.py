@@ -18,12 +18,12 @@ def find_plugin(group: str, name: str) -> Any | None:
     Raises:
         ValueError: two packages offer it, or it cannot be imported; one line.
     """
-    offered = {entry.value: entry for entry in entry_points(group=group, name=name)}
-    if len(offered) > 1:
-        raise fail(f"{group}, {name}", "one package that offers it", " and ".join(sorted(offered)))
-    for value, entry in offered.items():
+    entries = {entry.value: entry for entry in entry_points(group=group, name=name)}
+    if len(entries) > 1:
+        raise fail(f"{group}, {name}", "one package that offers it", " and ".join(sorted(entries)))
+    for import_path, entry in entries.items():
         try:
             return entry.load()
         except (ImportError, AttributeError) as error:
-            raise fail(f"{group}, {name}", f"{value}, which can be imported", f"{error}") from None
+            raise fail(f"{group}, {name}", f"{import_path}, which can be imported", f"{error}") from None
     return None

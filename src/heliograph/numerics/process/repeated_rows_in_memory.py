@@ -32,11 +32,11 @@ def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
         row: the row (...).
         count: how many there are.
     """
-    mapped = _map_rows(row, count) if row.nbytes * count >= LEAST else None
-    if mapped is None:
-        mapped = np.empty((count, *row.shape), row.dtype)
-        mapped[...] = row
-    return mapped
+    rows = _map_rows(row, count) if row.nbytes * count >= LEAST else None
+    if rows is None:  # too small, or the system cannot
+        rows = np.empty((count, *row.shape), row.dtype)
+        rows[...] = row
+    return rows
 
 
 def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:

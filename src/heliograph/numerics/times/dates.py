@@ -70,9 +70,12 @@ def parse_moment(text: str, name: str) -> tuple[int, bool]:
     text = text.strip()
     if YEAR.fullmatch(text):
         text = f"{text}-01-01"
-    if month := MONTH.fullmatch(text):
-        quarter = month["quarter"] or month["quarter_of"]
-        text = f"{month['year'] or month['of']}-{month['month'] or f'{3 * int(quarter) - 2:02}'}-01"
+    match_of_month = MONTH.fullmatch(text)  # of a month or a quarter, in one of two ways to write a year
+    if match_of_month:
+        year = match_of_month["year"] or match_of_month["of"]
+        quarter = match_of_month["quarter"] or match_of_month["quarter_of"]
+        month = match_of_month["month"] or f"{3 * int(quarter) - 2:02}"
+        text = f"{year}-{month}-01"
     try:
         match, leap = _match_date(text)
         return _convert_to_nanoseconds(match, leap), match["zone"] is not None
@@ -90,9 +93,10 @@ def _match_date(text: str) -> tuple[re.Match[str], bool]:
         ValueError: no date of ISO 8601, or one of a year that nanoseconds cannot say.
     """
     text = text.upper()
-    if basic := BASIC.fullmatch(text):
-        year, month, day, hour, minute, second, part, zone = basic.groups(default="")
-        text = f"{year}-{month}-{day}T{hour}:{minute}{second and ':'}{second}{part}{zone}"
+    basic = BASIC.fullmatch(text)
+    if basic:
+        year, month, day, hour, minute, second, fraction, zone = basic.groups(default="")
+        text = f"{year}-{month}-{day}T{hour}:{minute}{second and ':'}{second}{fraction}{zone}"
     leap = LEAP_SECOND.search(text) is not None
     match = DATE.fullmatch(LEAP_SECOND.sub(r"\g<1>59", text) if leap else text)
     if match is None or int(match["day"][:4]) not in YEARS:
@@ -150,8 +154,8 @@ def seconds_between(time: np.ndarray) -> np.ndarray:
     """
     if time.dtype.kind != "M":
         return np.diff(time, prepend=time[:1])
-    whole = time.astype("datetime64[ns]").astype(np.int64)
-    return np.asarray(np.diff(whole, prepend=whole[:1]) / 1e9)
+    nanoseconds = time.astype("datetime64[ns]").astype(np.int64)
+    return np.asarray(np.diff(nanoseconds, prepend=nanoseconds[:1]) / 1e9)
 
 
 LONGER = 1.5  # times the usual step: then rows are missing; months and leap years differ by less
@@ -171,11 +175,11 @@ def unequal_steps(time: np.ndarray) -> str:
     steps = steps[steps > 0]
     if not steps.size or steps.max() <= LONGER * np.median(steps):
         return ""
-    usual, longest, unit = float(np.median(steps)), float(steps.max()), ""
-    if time.dtype.kind == "M":
-        unit, span = next(((name, span) for name, span in SPANS.items() if usual >= 0.9 * span), ("seconds", 1.0))
-        usual, longest = round(usual / span, 1), round(longest / span, 1)
-    return f"steps of {usual:g} and {longest:g} {unit}".rstrip()
+    median, longest = float(np.median(steps)), float(steps.max())
+    if time.dtype.kind != "M":
+        return f"steps of {median:g} and {longest:g}"
+    unit, span = next(((name, span) for name, span in SPANS.items() if median >= 0.9 * span), ("seconds", 1.0))
+    return f"steps of {round(median / span, 1):g} and {round(longest / span, 1):g} {unit}"
 
 
 def format_dates(time: np.ndarray) -> np.ndarray:
@@ -183,8 +187,8 @@ def format_dates(time: np.ndarray) -> np.ndarray:
 
     UNITS are the nanoseconds of each unit, the largest first.
     """
-    there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
-    unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))
+    nanoseconds = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
+    unit = next(unit for unit, size in UNITS.items() if not np.any(nanoseconds % size))  # the largest that is exact
     return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))
 
 
@@ -227,10 +231,12 @@ def horizons_in(text: str) -> int | list[float | np.timedelta64 | np.datetime64]
 
 def _parse_horizon(text: str) -> float | np.timedelta64 | np.datetime64:
     """Return how far ahead a text says: a span (5s), a date, a whole number of steps, or seconds with a fraction."""
-    if span := SPAN.fullmatch(text):
+    span = SPAN.fullmatch(text)
+    if span:
         return np.timedelta64(round(float(span["count"]) * NANOSECONDS[span["unit"]]), "ns")
     if looks_like_date(text):
-        return np.datetime64(parse_moment(text, "horizon")[0], "ns")
+        nanoseconds, _ = parse_moment(text, "horizon")
+        return np.datetime64(nanoseconds, "ns")
     if re.fullmatch(r"\d+", text):
         return int(text)
     try:

@@ -74,17 +74,16 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
     if is_traced(value):
         return None
     if getattr(getattr(value, "dtype", None), "kind", "") == "M":
-        given = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
-        whole = np.asarray(given)
-        return _convert_to_nanoseconds(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
+        filled = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
+        dates = np.asarray(filled)
+        return _convert_to_nanoseconds(name, dates if dates.dtype.kind == "M" else np.asarray(filled, NANOSECONDS))
     # Anything else that holds at least one date: all has to be dates then.
-    parts = _list_elements(value)
-    if not any(_is_date(part) for part in parts):
+    elements = _list_elements(value)
+    if not any(_is_date(element) for element in elements):
         return None
-    moments = [part.to_timestamp() if hasattr(part, "to_timestamp") else part for part in parts]
-    return parse_dates(
-        [str(_convert_to_nanoseconds(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name
-    )
+    moments = [period.to_timestamp() if hasattr(period, "to_timestamp") else period for period in elements]
+    texts = [str(_convert_to_nanoseconds(name, m)) if isinstance(m, np.datetime64) else m for m in moments]
+    return parse_dates(texts, name)
 
 
 def _list_elements(value: object) -> list[Any]:
@@ -111,9 +110,9 @@ def _convert_to_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> n
     """
     given = np.asarray(moments)
     converted = round_to_nanoseconds(given)
-    beyond = np.isnat(converted) & ~np.isnat(given)
-    if beyond.any():
-        raise fail(name, f"dates from {YEARS[0]} to {YEARS[-1]}", str(given[beyond][0]))
+    is_too_far = np.isnat(converted) & ~np.isnat(given)
+    if is_too_far.any():
+        raise fail(name, f"dates from {YEARS[0]} to {YEARS[-1]}", str(given[is_too_far][0]))
     return converted
 
 
@@ -133,17 +132,19 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
         labels = rows.coords.get(next(iter(dims))) if dims else None
     if labels is None or callable(labels):  # a list has a function of that name
         return None
-    shown = np.asarray(labels)
-    if shown.dtype.kind != "M" and not (shown.ndim == 1 and len(shown) and all(_is_date_label(part) for part in shown)):
-        return None
-    return check_times(f"dates of {name}", labels, len(shown))
+    label_array = np.asarray(labels)
+    if label_array.dtype.kind != "M":
+        is_filled_list = label_array.ndim == 1 and len(label_array) > 0
+        if not is_filled_list or not all(_is_date_label(label) for label in label_array):
+            return None
+    return check_times(f"dates of {name}", labels, len(label_array))
 
 
-def _is_date_label(part: object) -> bool:
+def _is_date_label(label: object) -> bool:
     """Return whether a row's label is a date: of a class of dates, or a text that reads as one."""
-    if isinstance(part, str):
-        return looks_like_date(part)
-    return _is_date(part)
+    if isinstance(label, str):
+        return looks_like_date(label)
+    return _is_date(label)
 
 
 def find_backwards_row(clock: np.ndarray) -> int | None:

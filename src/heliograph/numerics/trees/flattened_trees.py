@@ -26,12 +26,13 @@ class FlatLayout(NamedTuple):
 
         Of rows (..., size) its leaves have the leading axes too.
         """
-        parts, begin = [], 0
+        leaves, begin = [], 0
+        leading_axes = rows.shape[:-1]
         for shape, kind in zip(self.shapes, self.kinds, strict=True):
             end = begin + int(np.prod(shape))
-            parts.append(rows[..., begin:end].reshape((*rows.shape[:-1], *shape)).astype(kind))
+            leaves.append(rows[..., begin:end].reshape((*leading_axes, *shape)).astype(kind))
             begin = end
-        return self.structure.unflatten(parts)
+        return self.structure.unflatten(leaves)
 
 
 def make_flat_layout(tree: PyTree) -> FlatLayout:

@@ -39,6 +39,7 @@ class _ProgramWriter:
     """Writer of programs, each once wherever it is called."""
 
     def __init__(self) -> None:
+        """Begin before the first program."""
         self._hashes: dict[int, tuple[object, str]] = {}  # by the identity of programs, which are held
 
     def write_program(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
@@ -47,12 +48,12 @@ class _ProgramWriter:
         Variables are numbered in their order, so that programs that differ in their names alone have the same text.
         """
         numbers: dict[Var, int] = {}
-        head = [
-            f"{self._write_definitions(numbers, jaxpr.constvars)} = {[self._write_value(value) for value in consts]}"
-        ]
-        head += [self._write_definitions(numbers, jaxpr.invars)]
-        body = [self._write_line(numbers, equation) for equation in jaxpr.eqns]
-        return "\n".join([*head, *body, self._write_uses(numbers, jaxpr.outvars)])
+        constants = self._write_definitions(numbers, jaxpr.constvars)
+        values = [self._write_value(value) for value in consts]
+        inputs = self._write_definitions(numbers, jaxpr.invars)
+        operations = [self._write_line(numbers, equation) for equation in jaxpr.eqns]
+        results = self._write_uses(numbers, jaxpr.outvars)
+        return "\n".join([f"{constants} = {values}", inputs, *operations, results])
 
     def _write_line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
         """Return the line of an operation: types of its results, its name, its parameters and its arguments."""

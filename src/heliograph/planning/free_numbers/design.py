@@ -84,7 +84,8 @@ def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits
     if budget is None:
         return make_unlimited(steps, hops)
     # All hops may change their powers, and none sends a fixed one.
-    limits = make_power_limits(make_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
+    all_are_free, no_fixed_powers = np.ones(hops, dtype=bool), np.zeros((steps, hops))
+    limits = make_power_limits(make_budget(budget), problem.names, all_are_free, no_fixed_powers)
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
     return limits
@@ -99,9 +100,10 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
     peak, so that its number is 1.
     """
     rows, most = allowed.make_limit_rows()
-    peak = allowed.peak.ravel()
-    finite = np.isfinite(peak)
-    peak_rows = (np.eye(peak.size) / np.where(finite, peak, 1.0)[:, None])[finite]
+    peaks = allowed.peak.ravel()
+    is_limited = np.isfinite(peaks)
+    row_of_each_peak = np.eye(peaks.size) / np.where(is_limited, peaks, 1.0)[:, None]
+    peak_rows = row_of_each_peak[is_limited]
     return PowerAndErrorLimits(
         rows=np.concatenate([peak_rows, rows]),
         most=np.concatenate([np.ones(len(peak_rows)), most]),

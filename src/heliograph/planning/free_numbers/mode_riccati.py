@@ -69,13 +69,14 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     growth = fail("steady error", expected, "growth")
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            parts, gains = _solve_periodic(m) if m.start is None else _run_riccati(m, m.start[None])
+            X, gains = _solve_periodic(m) if m.start is None else _run_riccati(m, m.start[None])
     except np.linalg.LinAlgError:  # of numbers that are none, or of a growth of exactly 1
         raise growth from None
-    if not np.all(np.isfinite(parts)) or np.linalg.eigvalsh(parts).min() < -NEAR * np.abs(parts).max():
+    if not np.all(np.isfinite(X)) or np.linalg.eigvalsh(X).min() < -NEAR * np.abs(X).max():
         raise growth
-    weights = criterion.smooth(parts.sum(axis=1))[1]
-    return ModeSolution(parts, gains, _close_loop(m, gains).adjoint(weights, m.start is None))
+    covariances_of_all_modes = X.sum(axis=1)
+    _, weights = criterion.smooth(covariances_of_all_modes)
+    return ModeSolution(X, gains, _close_loop(m, gains).adjoint(weights, m.start is None))
 
 
 def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
@@ -100,30 +101,31 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
     return parts, gains
 
 
-def _run_riccati(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
+def _run_riccati(m: ModeSystem, X: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
     """Return X after each step (steps, modes, n, n) and its best gains, by the coupled Riccati recursion.
 
-    `parts`: X before the first step, by mode; one for all modes together where their chain has no memory.
+    X of a mode is its covariance times its probability. The argument: X before the first step, by mode; one for all
+    modes together where their chain has no memory.
     """
     covariances, gains = [], []
     for k in range(len(m.law)):
-        gain, parts = _update_riccati(m, k, parts)
-        covariances.append(parts)
+        gain, X = _update_riccati(m, k, X)
+        covariances.append(X)
         gains.append(gain)
     return np.array(covariances), np.array(gains)
 
 
-def _update_riccati(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
+def _update_riccati(m: ModeSystem, k: int, X: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the best gain K (modes, n, m) of step k and the covariances X (modes, n, n) after it, by X before.
 
     X of a mode is its covariance times its probability, `law`: the noises are weighted alike.
     """
     law = m.law[k][:, None, None]
-    prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
+    predicted_X = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(X)
     # A mode that never occurs has X = 0, so with any regular noise its gain is zero.
     noise = np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
-    after = observe_root(roots_of(prior), m.output[k], roots_of(noise))
-    return after.gain, after.covariance
+    corrected_X = observe_root(roots_of(predicted_X), m.output[k], roots_of(noise))
+    return corrected_X.gain, corrected_X.covariance
 
 
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
@@ -131,9 +133,10 @@ def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
 
     F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K'].
     """
-    close = np.eye(gains.shape[2]) - gains @ m.output
-    added = close @ m.process[:, None] @ close.swapaxes(-1, -2) + gains @ m.noise @ gains.swapaxes(-1, -2)
-    return JumpSystem(m.chain, close @ m.transition[:, None], m.law[:, :, None, None] * added)
+    K, law = gains, m.law[:, :, None, None]  # K (steps, modes, n, m), law: pi
+    I_KH = np.eye(K.shape[2]) - K @ m.output
+    noise_in_error = I_KH @ m.process[:, None] @ I_KH.swapaxes(-1, -2) + K @ m.noise @ K.swapaxes(-1, -2)
+    return JumpSystem(m.chain, I_KH @ m.transition[:, None], law * noise_in_error)
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
@@ -142,9 +145,9 @@ def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
     X_k,j: covariance after step k in mode j, weighted by the mode's probability; its right side: what the recursion
     under the gains K makes of those before it; L: adjoint, what the error gains by each X.
     """
-    parts, gains, adjoint = (jnp.asarray(values) for values in solution)
-    earlier = jnp.roll(parts, 1, axis=0)
+    X, gains, adjoint = (jnp.asarray(values) for values in solution)
+    X_before = jnp.roll(X, 1, axis=0)  # of a period: the last step leads to the first
     if m.start is not None:  # the first step's chain forgets the mode before: any will do
-        earlier = jnp.zeros_like(parts).at[0, 0].set(m.start).at[1:].set(parts[:-1])
-    jumps = _close_loop(m, gains)
-    return jnp.sum(adjoint * jumps.step(earlier))
+        X_before = jnp.zeros_like(X).at[0, 0].set(m.start).at[1:].set(X[:-1])
+    right_side = _close_loop(m, gains).step(X_before)
+    return jnp.sum(adjoint * right_side)

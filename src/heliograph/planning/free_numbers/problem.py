@@ -89,10 +89,11 @@ class FreeNumbers(NamedTuple):
 
         `low`, `high`: ends of each number's range, infinite where there is none.
         """
-        between = np.isfinite(self.low) & np.isfinite(self.high)
-        within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
+        has_two_ends = np.isfinite(self.low) & np.isfinite(self.high)
+        between_ends = draws.uniform(np.where(has_two_ends, self.low, 0.0), np.where(has_two_ends, self.high, 1.0))
         factor = np.exp(draws.normal(size=len(self.low)))
-        return np.where(between, within, np.clip(self.start * factor, self.low, self.high))
+        about_first_start = np.clip(self.start * factor, self.low, self.high)
+        return np.where(has_two_ends, between_ends, about_first_start)
 
 
 def make_free_numbers(free: object) -> FreeNumbers:
@@ -186,9 +187,11 @@ class TracedNetwork:
 
     def __eq__(self, other: object) -> bool:
         """Return whether the other leads to the same programs, by builder, network and shapes of arrays."""
-        return isinstance(other, TracedNetwork) and are_same(
-            (self.build, self.start, self._list_array_shapes()), (other.build, other.start, other._list_array_shapes())
-        )
+        if not isinstance(other, TracedNetwork):
+            return False
+        mine = self.build, self.start, self._list_array_shapes()
+        theirs = other.build, other.start, other._list_array_shapes()
+        return are_same(mine, theirs)
 
     def __hash__(self) -> int:
         return hash(self._list_array_shapes())
@@ -216,12 +219,12 @@ class TracedNetwork:
     def differentiate_by_numbers(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
         """Return the derivatives of error and powers by the numbers x, at the fixed X, K and L of the solution."""
         system, pull_back = jax.vjp(self.make_system, jnp.asarray(x))
-        # Cotangents of the system: that of the error first, then a unit one for each power.
-        of_error, size = jax.grad(lagrangian)(system, solution), system.powers.size
-        unit = jnp.eye(size).reshape(size, *system.powers.shape)
-        of_powers = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape)), system)._replace(powers=unit)
-        cotangents = jax.tree.map(lambda error, rest: jnp.concatenate([error[None], rest]), of_error, of_powers)
-        slopes = jax.vmap(pull_back)(cotangents)[0]
+        # Derivatives by the system's arrays, a system each: first of the error, then of each single power.
+        of_error, count = jax.grad(lagrangian)(system, solution), system.powers.size
+        one_for_each = jnp.eye(count).reshape(count, *system.powers.shape)
+        of_powers = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape)), system)._replace(powers=one_for_each)
+        cotangents = jax.tree.map(lambda error, powers: jnp.concatenate([error[None], powers]), of_error, of_powers)
+        (slopes,) = jax.vmap(pull_back)(cotangents)  # by the numbers, (1 + powers, numbers)
         return ErrorAndPowerSlopes(error=slopes[0], powers=slopes[1:].reshape(*system.powers.shape, len(x)))
 
 
@@ -284,8 +287,11 @@ class FreeNumberProblem:
 
         The scalar of Young's inequality (YOUNG) is none of its numbers.
         """
-        named = self.numbers.split_by_name(x).items()
-        values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
+        values = {
+            name: float(value) if np.ndim(value) == 0 else value
+            for name, value in self.numbers.split_by_name(x).items()
+            if name != YOUNG
+        }
         with jax.enable_x64(True):
             return instance("network of free numbers", self.build(**values), Network, "a Network")
 
@@ -299,9 +305,9 @@ class FreeNumberProblem:
         starts = {name: number.start for name, number in self.numbers.by_name.items()}
         for name, (start, low, high) in self.numbers.by_name.items():
             for end in (low, high):
-                near = np.where(np.isfinite(end), end, start)
-                near = near + INSIDE * (start - near)
-                values = {**starts, name: near}
+                end_or_start = np.where(np.isfinite(end), end, start)
+                near_end = end_or_start + INSIDE * (start - end_or_start)
+                values = {**starts, name: near_end}
                 try:
                     self.network(np.concatenate([value.ravel() for value in values.values()]))
                 except InputError as error:
@@ -350,7 +356,8 @@ class FreeNumberProblem:
         LEAST_UNIT: the unit of numbers whose range and start are less.
         """
         low, high = self.numbers.low, self.numbers.high
-        unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), LEAST_UNIT)
+        width = high - low
+        unit = np.maximum(np.where(np.isfinite(width), width, np.abs(self.numbers.start)), LEAST_UNIT)
         return DescentProblem(
             low=low,
             high=high,

@@ -8,6 +8,7 @@ each step, bounds what a gain K leaves by
 a step of the filter with (1 + b) A X A', (1 + b) Q and another noise; b is one more free number.
 """
 
+from collections.abc import Callable
 from functools import reduce
 from itertools import product
 from math import prod
@@ -176,11 +177,13 @@ def _stack_nodes(nodes: list[NodeReception]) -> tuple[Array, Array]:
     There is a mode for every combination of a mode of each node, the last node's fastest.
     """
     outputs, noises = [], []
+    make_block_diagonal_at_each_time: Callable[..., Array] = jax.vmap(
+        lambda *blocks: jax.scipy.linalg.block_diag(*blocks)
+    )
     for combination in product(*(range(node.law.shape[1]) for node in nodes)):
-        pairs = list(zip(nodes, combination, strict=True))
-        outputs.append(jnp.concatenate([node.output[:, mode] for node, mode in pairs], axis=1))
-        blocks = [node.noise[:, mode] for node, mode in pairs]
-        noises.append(jax.vmap(lambda *parts: jax.scipy.linalg.block_diag(*parts))(*blocks))
+        node_modes = list(zip(nodes, combination, strict=True))
+        outputs.append(jnp.concatenate([node.output[:, mode] for node, mode in node_modes], axis=1))
+        noises.append(make_block_diagonal_at_each_time(*[node.noise[:, mode] for node, mode in node_modes]))
     return jnp.stack(outputs, axis=1), jnp.stack(noises, axis=1)
 
 
@@ -277,13 +280,13 @@ def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     Raises:
         ValueError: a chain whose mode is not delivered.
     """
-    parts = channel.in_parallel
-    rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
-    flags, chains = len(parts) - len(rest), memories(channel)
-    delivers_all_modes = flags == len(chains) and not any(memory.drifts for memory in chains.values())
-    if not rest or not delivers_all_modes:
+    maps = channel.in_parallel
+    maps_of_signal = [affine for affine in maps if not isinstance(affine, ModeOutput)]
+    flag_count, chains = len(maps) - len(maps_of_signal), memories(channel)
+    delivers_all_modes = flag_count == len(chains) and not any(memory.drifts for memory in chains.values())
+    if not maps_of_signal or not delivers_all_modes:
         raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
-    return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
+    return joint_modes(maps_of_signal[0] if len(maps_of_signal) == 1 else Stack(maps_of_signal), order=2)
 
 
 def _propagate_laws(
@@ -295,11 +298,12 @@ def _propagate_laws(
     leads to the first; else they go from the initial law on, whatever was before.
     """
     over_period = reduce(jnp.matmul, onward)
-    law = [find_stationary_law(over_period) if forever and len(over_period) > 1 else jnp.asarray(initial)]
-    for step in onward[:-1]:
-        law.append(law[-1] @ step)
-    into_first = onward[-1] if forever else jnp.tile(law[0], (len(law[0]), 1))
-    return jnp.stack(law), jnp.concatenate([into_first[None], onward[:-1]])
+    mode_count = len(over_period)
+    laws = [find_stationary_law(over_period) if forever and mode_count > 1 else jnp.asarray(initial)]
+    for transition in onward[:-1]:
+        laws.append(laws[-1] @ transition)
+    into_first_step = onward[-1] if forever else jnp.tile(laws[0], (mode_count, 1))
+    return jnp.stack(laws), jnp.concatenate([into_first_step[None], onward[:-1]])
 
 
 def _compute_steps_reception(

@@ -71,8 +71,8 @@ class PathProblem(NamedTuple):
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
         """Return the error, powers and their derivatives at x, powers in one row, with this smoothing of the error."""
         powers = np.maximum(x, 0.0).reshape(self.limits.peak.shape)
-        sharp = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
-        value, _, gradient = sharp.sensitivity(powers)
+        smoothed = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
+        value, _, gradient = smoothed.sensitivity(powers)
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
     def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
@@ -234,9 +234,9 @@ def _choose_total(limits: PowerLimits, paths: Paths) -> float:
 
     Plenty is so much that noise hardly counts: ten times the largest alpha, at which half of what arrives is noise.
     """
-    largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
+    largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
     plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
-    return float(np.where(np.isfinite(largest), largest, plenty).sum())
+    return float(np.where(np.isfinite(largest_means), largest_means, plenty).sum())
 
 
 def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
@@ -331,23 +331,23 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
     no_power = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
         return no_power
-    raised = [start for start in (_raise_powers(problem, start, target) for start in starts) if start is not None]
-    if not raised:
+    raised_starts = [_raise_powers(problem, start, target) for start in starts]
+    reaching_starts = [start for start in raised_starts if start is not None]
+    if not reaching_starts:
         return None
-    scale = max(float(raised[0].mean(axis=0).sum()), np.finfo(float).tiny)
-    return problem._replace(scale=scale).solve_from_starts(raised, target)
+    scale = max(float(reaching_starts[0].mean(axis=0).sum()), np.finfo(float).tiny)
+    return problem._replace(scale=scale).solve_from_starts(reaching_starts, target)
 
 
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
-    """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None.
-
-    By bisection of the factor's logarithm, between the ends FACTORS.
-    """
+    """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None."""
 
     def reaches(factor: float) -> bool:
-        return problem.criterion.smooth(problem.covariances(problem.limits.clip_powers(start * factor)))[0] <= target
+        """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less."""
+        powers = problem.limits.clip_powers(start * factor)
+        return problem.criterion.smooth(problem.covariances(powers))[0] <= target
 
-    low, high = FACTORS
+    low, high = FACTORS  # between which the factor's logarithm is bisected
     if not reaches(high):
         return None
     for _ in range(BISECTIONS):
@@ -358,15 +358,15 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
     """Raise ValueError where the target is not above (by REACHED) the error that remains however much is sent."""
-    limits = task.problem.limits
-    bounded = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
+    limits, alpha = task.problem.limits, task.problem.paths.alpha[:, task.free]
+    has_limits = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
     # The most that each may send: up to its peak, or plenty (UNLIMITED), or its whole mean power in one step.
-    most = np.minimum(limits.peak, UNLIMITED * np.maximum(task.problem.paths.alpha[:, task.free], 1.0))
-    most = np.minimum(most, limits.mean * len(most))
-    left = task.problem.compute_exact_error(most)
-    if target <= left * (1 + REACHED):
-        what = "power at its limits" if bounded else "unlimited power"
-        raise fail("target error", f"more than {left:.6g}: {what} leaves {left:.6g}", f"{target:.6g}")
+    plenty, whole_mean = UNLIMITED * np.maximum(alpha, 1.0), limits.mean * len(limits.peak)
+    largest_powers = np.minimum(np.minimum(limits.peak, plenty), whole_mean)
+    least_error = task.problem.compute_exact_error(largest_powers)
+    if target <= least_error * (1 + REACHED):
+        what = "power at its limits" if has_limits else "unlimited power"
+        raise fail("target error", f"more than {least_error:.6g}: {what} leaves {least_error:.6g}", f"{target:.6g}")
 
 
 def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, present: float) -> PowerDesign:

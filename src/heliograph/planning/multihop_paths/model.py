@@ -105,10 +105,11 @@ def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weig
 
     `information`: J_k; `p`: P_k; `weights`: derivative W_k of the cost by P_k alone; all (time, n, n).
     """
+    # The filter's error moves by phi from step to step: its covariance follows X+ = phi X phi'.
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
-    # A single mode, that is always on: its recursion is X+ = phi X phi'.
-    always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
-    return always.adjoint(weights, plants.start is None)[:, 0]
+    one_mode_always, no_noise = np.ones((len(p), 1, 1)), np.zeros_like(phi[:, None])
+    system = JumpSystem(one_mode_always, phi[:, None], no_noise)
+    return system.adjoint(weights, plants.start is None)[:, 0]
 
 
 Powers = Float[np.ndarray, "time hop"]
@@ -247,13 +248,13 @@ def _arrange_by_place(
 ) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
     """Return the values of hops as (time, path, place along the path), 1 where a path is shorter, and hops' places."""
     order = np.argsort(paths.path, kind="stable")
-    counts = np.bincount(paths.path, minlength=paths.second.shape[1])
-    position = np.empty_like(paths.path)
-    # A hop's number in the order by paths, less that of the first hop of its path.
-    position[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    along = np.ones((len(values), len(counts), max(1, int(counts.max(initial=1)))))
-    along[:, paths.path, position] = values
-    return along, position
+    hop_counts = np.bincount(paths.path, minlength=paths.second.shape[1])
+    first_hops = np.cumsum(hop_counts) - hop_counts  # of each path, in the order by paths
+    places = np.empty_like(paths.path)
+    places[order] = np.arange(len(order)) - np.repeat(first_hops, hop_counts)
+    arranged = np.ones((len(values), len(hop_counts), max(1, int(hop_counts.max(initial=1)))))
+    arranged[:, paths.path, places] = values
+    return arranged, places
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
@@ -269,16 +270,16 @@ def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h, where F is the product of p / (p + alpha) along the
     path, s = E y^2 of what is sent, t = s less the sensor's noise, and K the product of kappa.
     """
-    factors, position = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # (time, path, place)
-    product, full = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)  # F and s K
-    left = full - paths.signal * product
+    factors, places = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # factors (time, path, place)
+    F, sK = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)
+    denominator = sK - paths.signal * F
     # dF/dp_h is the product of the other hops' factors times alpha / (p + alpha)^2.
-    places = range(factors.shape[-1])
-    others = np.stack([np.delete(factors, place, axis=-1).prod(axis=-1) for place in places], axis=-1)
+    products_of_others = [np.delete(factors, place, axis=-1).prod(axis=-1) for place in range(factors.shape[-1])]
+    product_of_others = np.stack(products_of_others, axis=-1)[:, paths.path, places]
     total = powers + paths.alpha
-    by_power = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
-    slope = (full / left**2)[:, paths.path] * others[:, paths.path, position] * by_power
-    return PathInformation(product / left, slope)
+    slope_of_factor = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
+    slope = (sK / denominator**2)[:, paths.path] * product_of_others * slope_of_factor
+    return PathInformation(F / denominator, slope)
 
 
 def compute_information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:

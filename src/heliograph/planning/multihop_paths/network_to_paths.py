@@ -188,12 +188,13 @@ def _split_loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
 
     A loss is a mixture of one channel with maps that deliver nothing.
     """
-    p = np.asarray(mixture.choice.probabilities)
-    audible = [index for index, affine in enumerate(mixture.maps) if not _delivers_nothing(affine)]
-    # More than one corner: the probabilities are uncertain.
-    if len(audible) != 1 or mixture.corner_count() > 1 or not p[audible[0]] > 0:
+    probabilities = np.asarray(mixture.choice.probabilities)
+    delivering = [index for index, affine in enumerate(mixture.maps) if not _delivers_nothing(affine)]
+    has_uncertain_probabilities = mixture.corner_count() > 1
+    if len(delivering) != 1 or has_uncertain_probabilities or not probabilities[delivering[0]] > 0:
         raise _make_no_paths_error("a mixture of several channels")
-    return mixture.maps[audible[0]], 1 / float(p[audible[0]])
+    index = delivering[0]
+    return mixture.maps[index], 1 / float(probabilities[index])
 
 
 def _delivers_nothing(affine: AbstractRandomAffine) -> bool:
@@ -266,7 +267,9 @@ def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance
 
     UNCORRELATED: a correlation that is rounding.
     """
-    noise = rows @ covariance @ rows.T
-    deviation = np.sqrt(np.diag(noise))
-    if np.any(np.abs(noise - np.diag(np.diag(noise))) > UNCORRELATED * np.outer(deviation, deviation)):
+    path_covariance = rows @ covariance @ rows.T
+    variances = np.diag(path_covariance)
+    deviations = np.sqrt(variances)
+    off_diagonal = np.abs(path_covariance - np.diag(variances))
+    if np.any(off_diagonal > UNCORRELATED * np.outer(deviations, deviations)):
         raise _make_no_paths_error(f"paths of {name!r} that share a sensor's noise")

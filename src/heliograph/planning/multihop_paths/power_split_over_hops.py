@@ -94,8 +94,9 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
         return np.zeros(len(noise))
     if power and not 1 / LARGEST <= power <= LARGEST:
         raise fail("total power", f"0, or a number from {1 / LARGEST:g} to {LARGEST:g}", f"{power:g}")
-    unit = np.ones((1, 1))
-    return np.asarray(split_power_over_hops(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
+    one = np.ones((1, 1))  # one step of one path
+    path = SplitPaths(full=one, signal=0 * one, alpha=noise[None, None])
+    return np.asarray(split_power_over_hops(path, power * one).powers[0, 0])
 
 
 def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
@@ -148,11 +149,11 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
     has_hops = (alpha > 0).any(axis=-1, keepdims=True)
     log_l: np.ndarray = 2 * np.log(np.where(has_hops, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
     for _ in range(NEWTON_STEPS):
-        p, falls = _split_at_multiplier(alpha, log_l)
-        reached = p.sum(axis=-1, keepdims=True)
-        excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
-        # `falls` is -d sum p / d log l: Newton's step for the logarithm of the sum.
-        step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
+        p, negative_slope = _split_at_multiplier(alpha, log_l)
+        total = p.sum(axis=-1, keepdims=True)
+        excess = np.log(np.divide(total, power, out=np.ones_like(power), where=total > 0))
+        # Newton's step for the logarithm of the sum, whose slope is d sum p / d log l over the sum.
+        step = np.divide(excess * total, negative_slope, out=np.zeros_like(total), where=negative_slope > 0)
         log_l = log_l + step
         if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
             break
@@ -162,16 +163,15 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
 def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return p_h(l) of each hop (time, path, hop), and -d sum_h p_h / d log l of each path (time, path, 1).
 
-    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the same as (root - alpha) / 2,
-    without
-    the difference, and so without cancellation.
+    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the same as (root - alpha) / 2, but
+    without a difference that cancels.
     """
     inverse = np.exp(-log_l)
     root = np.sqrt(alpha**2 + 4 * alpha * inverse)
     denominator = root + alpha
     p = np.divide(2 * alpha * inverse, denominator, out=np.zeros_like(denominator), where=denominator > 0)
-    falls = np.divide(alpha * inverse, root, out=np.zeros_like(root), where=root > 0)
-    return p, falls.sum(axis=-1, keepdims=True)
+    negative_slopes = np.divide(alpha * inverse, root, out=np.zeros_like(root), where=root > 0)
+    return p, negative_slopes.sum(axis=-1, keepdims=True)
 
 
 class Envelope(NamedTuple):

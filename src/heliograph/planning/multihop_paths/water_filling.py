@@ -97,60 +97,60 @@ def _search_line(
 def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
     """Return the powers [y sqrt(w b) - b]^+ / a (time, free) at the level y that the limits set.
 
-    They are [y rise - dry]^+ with rise = sqrt(w b) / a and dry = b / a. `weights`: w = -d error / d j of each path,
-    which carries the information j = p / (a p + b).
+    They are [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. `weights`: w = -d error / d j of each
+    path, which carries the information j = p / (a p + b).
     """
-    rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
-    steps = len(dry)
+    rise, ground = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
+    steps, transmitters = ground.shape
     # The level at which each transmitter's mean is reached, then that of the total under these.
     no_limit = np.full(steps, np.inf)
-    of_means = [
-        _find_level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps)
-        for i in range(dry.shape[1])
+    levels_of_means = [
+        _find_level(rise[:, i], ground[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps)
+        for i in range(transmitters)
     ]
-    highest = np.broadcast_to(of_means, dry.shape)
-    level = _find_level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
+    highest = np.broadcast_to(levels_of_means, ground.shape)
+    level = _find_level(rise.ravel(), ground.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
     # A transmitter at its mean keeps its own level where that of the total is higher.
-    return limits.clip_powers(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
+    return limits.clip_powers(_fill_to_level(np.minimum(level, highest), rise, ground, limits.peak))
 
 
 def _fill_to_level(
     level: Float[np.ndarray, "*k"],
     rise: Float[np.ndarray, "*k"],
-    dry: Float[np.ndarray, "*k"],
+    ground: Float[np.ndarray, "*k"],
     peak: Float[np.ndarray, "*k"],
 ) -> Float[np.ndarray, "*k"]:
-    """Return the powers min([level rise - dry]^+, peak), of the arguments' shape; 0 where rise is 0, at any level.
+    """Return the powers min([level rise - ground]^+, peak), of the arguments' shape; 0 where rise is 0, at any level.
 
-    Powers as water: each place is filled above its ground `dry`, the faster the larger `rise`, up to its peak.
+    Powers as water: each place is filled above its ground `ground`, the faster the larger `rise`, up to its peak.
     """
     with np.errstate(invalid="ignore"):
-        wet = np.where(rise > 0, level * rise - dry, 0.0)
+        wet = np.where(rise > 0, level * rise - ground, 0.0)
     return np.clip(wet, 0.0, peak)
 
 
 def _find_level(
     rise: Float[np.ndarray, "k"],
-    dry: Float[np.ndarray, "k"],
+    ground: Float[np.ndarray, "k"],
     peak: Float[np.ndarray, "k"],
     highest: Float[np.ndarray, "k"],
     total: float,
 ) -> float:
     """Return the water level y at which k powers sum to the total; infinity where they do not reach it at any level.
 
-    A power is min([min(y, highest) rise - dry]^+, peak): it is 0 up to the level dry / rise, then grows by `rise` for
-    each unit of the level, until it has reached `peak` or the level `highest`.
+    A power is min([min(y, highest) rise - ground]^+, peak): it is 0 up to the level ground / rise, then grows by
+    `rise` for each unit of the level, until it has reached `peak` or the level `highest`.
     """
     grows = rise > 0
-    rise, dry, peak, highest = rise[grows], dry[grows], peak[grows], highest[grows]
+    rise, ground, peak, highest = rise[grows], ground[grows], peak[grows], highest[grows]
     if not rise.size or not np.isfinite(total):
         return np.inf
     # The sum is piecewise linear in the level: it bends where a power begins to grow, or stops.
-    turns = np.concatenate([dry / rise, (dry + peak) / rise, highest])
-    turns = np.unique(turns[np.isfinite(turns)])
-    sums = _fill_to_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)  # at each bend
+    bends = np.concatenate([ground / rise, (ground + peak) / rise, highest])
+    bends = np.unique(bends[np.isfinite(bends)])
+    sums = _fill_to_level(np.minimum(bends[:, None], highest), rise, ground, peak).sum(axis=1)  # at each bend
     if total < sums[-1]:
-        return float(np.interp(total, sums, turns))
+        return float(np.interp(total, sums, bends))
     # Above the last bend only powers without an end grow, each by its `rise`.
-    is_endless = (highest > turns[-1]) & (rise * turns[-1] - dry < peak)
-    return float(turns[-1] + (total - sums[-1]) / rise[is_endless].sum()) if is_endless.any() else np.inf
+    is_endless = (highest > bends[-1]) & (rise * bends[-1] - ground < peak)
+    return float(bends[-1] + (total - sums[-1]) / rise[is_endless].sum()) if is_endless.any() else np.inf

@@ -43,9 +43,10 @@ class CoverageMiss:
 
         `self.level`: index among the intervals of SHARES; `self.excess`: share held less the share that it claims.
         """
-        s, share = self.score, self.score.coverage[self.level]
-        return (f"{s.part} {s.name}, {s.horizon} ahead: the interval of {SHARES[self.level]} held {share.value:.1%} "
-                f"+- {share.error:.1%}: {'too sure' if self.excess < 0 else 'too cautious'}")  # fmt: skip
+        score, claim, share = self.score, SHARES[self.level], self.score.coverage[self.level]
+        verdict = "too sure" if self.excess < 0 else "too cautious"
+        forecast = f"{score.part} {score.name}, {score.horizon} ahead"
+        return f"{forecast}: the interval of {claim} held {share.value:.1%} +- {share.error:.1%}: {verdict}"
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,12 @@ def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list
     An interval misses whose share held is more than FAR, 3, standard errors off the share that it claims (SHARES).
     """
     verdicts = []
-    for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
+    for name in dict.fromkeys(f"{score.node}/{score.filter}" for score in found.scores):
         scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
-        intervals = [CoverageMiss(s, level) for s in scores for level in range(len(SHARES))]
-        misses = [one for one in intervals if abs(one.excess) > FAR * one.score.coverage[one.level].error]
+        intervals = [CoverageMiss(score, level) for score in scores for level in range(len(SHARES))]
+        misses = [miss for miss in intervals if abs(miss.excess) > FAR * miss.score.coverage[miss.level].error]
         verdicts.append(FilterVerdict(name, len(intervals), misses))
-    return sorted(verdicts, key=lambda v: -len(v.misses) / max(v.compared, 1))
+    return sorted(verdicts, key=lambda verdict: len(verdict.misses) / max(verdict.compared, 1), reverse=True)
 
 
 def describe_coverage_misses(found: "heliograph.forecasting.Backtest") -> list[str]:
@@ -183,9 +184,10 @@ def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
     Verdicts come with the most doubtful first; the line has it last.
     """
     if len(verdicts) > 2:
-        held = sum(not v.misses for v in verdicts)
-        return f"The forecasts of {held} of {len(verdicts)} filters hold"
-    return "Forecasts of " + ", those of ".join(f"{visible(v.name)} {v.summarise()}" for v in reversed(verdicts))
+        count = sum(not verdict.misses for verdict in verdicts)
+        return f"The forecasts of {count} of {len(verdicts)} filters hold"
+    of_filters = [f"{visible(verdict.name)} {verdict.summarise()}" for verdict in reversed(verdicts)]
+    return "Forecasts of " + ", those of ".join(of_filters)
 
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:

@@ -94,11 +94,12 @@ def make_design_summary(results: DesignResults) -> dict[str, Json]:
 
 def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
     """Return by file name the figures of the front (least error by total power), the powers, and any map of places."""
-    drawn = {"front": draw_pareto_front(results.front, {"this design": (results.design.total, results.design.error)})}
-    drawn["powers"] = draw_powers(results.before, compute_mean_powers(results.design))
+    design = results.design
+    figures = {"front": draw_pareto_front(results.front, {"this design": (design.total, design.error)})}
+    figures["powers"] = draw_powers(results.before, compute_mean_powers(design))
     if results.map is not None:
-        drawn["map"] = draw_error_map(results.map)
-    return drawn
+        figures["map"] = draw_error_map(results.map)
+    return figures
 
 
 @matplotlib.rc_context(STYLE)
@@ -175,11 +176,12 @@ def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> P
 
 def _make_headline(results: DesignResults) -> str:
     """Return the title: by how much the design's error and total power are less, or more, than the network's now."""
-    design, before = results.design, sum(results.before.values())
+    design, power_now = results.design, sum(results.before.values())
     changes = []
-    for what, now, then in (("error", design.error, design.present), ("power", design.total, before)):
-        if then > 0 and abs(now - then) > 1e-3 * then:  # a smaller change is not worth a headline
-            changes.append(f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}")
+    for what, designed, present in (("error", design.error, design.present), ("power", design.total, power_now)):
+        if present > 0 and abs(designed - present) > 1e-3 * present:  # a smaller change is not worth a headline
+            less_or_more = "less" if designed < present else "more"
+            changes.append(f"{100 * abs(1 - designed / present):.3g} % {less_or_more} {what}")
     return f"By design: {' with '.join(changes)}" if changes else "No design is better than the network as it is"
 
 

@@ -70,14 +70,14 @@ def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
     PITs, probability integral transforms of what was received, are uniform where the network is right. At most MOST
     filters are in a figure.
     """
-    drawn = {"estimates": _draw_estimates(learned)}
-    tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
-    if tested:
-        drawn["innovations"] = _draw_correlations(tested)
-    received = [transforms for transforms in learned.uniform if np.any(~np.isnan(transforms.pit))][:MOST]
-    if received:
-        drawn["pits"] = _draw_probability_transforms(received)
-    return drawn
+    figures = {"estimates": _draw_estimates(learned)}
+    with_tests = [change for change in learned.changes if change.before.test and change.after.test]
+    if with_tests:
+        figures["innovations"] = _draw_correlations(with_tests[:MOST])
+    with_numbers = [transforms for transforms in learned.uniform if np.any(~np.isnan(transforms.pit))]
+    if with_numbers:
+        figures["pits"] = _draw_probability_transforms(with_numbers[:MOST])
+    return figures
 
 
 @matplotlib.rc_context(STYLE)

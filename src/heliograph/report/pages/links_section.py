@@ -73,12 +73,13 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
     mean, deviation = _format_mean_and_deviation(link.values)
     name = visible(f"{link.node}: {link.component}")
     gap = "–" if link.due is None else str(link.longest_gap)
-    past: list[str] = []  # a column that is there if any sender was silent past its timeout
+    silence_cells: list[str] = []  # of a column that is there if any sender was silent past its timeout
     if health.silences:
-        quiet = health.silences.get(link.node)
-        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"]
-    says = "may be lost" if link.may_be_lost else "never lost"
-    return [name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, says, mean, deviation]
+        silences = health.silences.get(link.node)
+        silence_cells = ["–" if silences is None else f"{len(silences.rows)}, up to {silences.lengths.max():g}"]
+    statement = "may be lost" if link.may_be_lost else "never lost"
+    share = _format_share(link, "{:.1%}", "–")
+    return [name, link.due_in, share, gap, *silence_cells, statement, mean, deviation]
 
 
 def _list_refused(health: Health) -> list[Table]:
@@ -124,11 +125,14 @@ def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
 
     For N independent values of a normal law these are s / sqrt(N) of the mean and s / sqrt(2 N) of the deviation s.
     """
-    if len(values) < 2:
-        return (f"{values[0]:.4g}" if len(values) else "–"), "–"
+    if len(values) == 0:
+        return "–", "–"
+    if len(values) == 1:
+        return f"{values[0]:.4g}", "–"
     deviation = float(values.std())
-    error = deviation / len(values) ** 0.5
-    return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
+    error_of_mean = deviation / len(values) ** 0.5
+    error_of_deviation = error_of_mean / 2**0.5
+    return round_to(float(values.mean()), error_of_mean), round_to(deviation, error_of_deviation)
 
 
 def describe_shared_links(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:

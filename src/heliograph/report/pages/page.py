@@ -233,7 +233,9 @@ def make_template_environment() -> Environment:
 
 def rich(text: str) -> Markup:
     """Return a text as HTML: escaped, then with `**strong**` and backquoted code marked up."""
+    html = str(escape(text))
     # A number stays on one line with the unit, per cent or ± that belongs to it.
-    safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))
-    safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
-    return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))
+    html = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", html)
+    html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", html)
+    html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)
+    return Markup(html)

@@ -29,9 +29,8 @@ def draw_predicted_figures(health: Health) -> dict[str, Figure]:
 
     At most MOST of each are drawn. A row is predicted from those before it; residuals are what was not predicted.
     """
-    figures = {
-        f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_predicting_nodes(health)[:MOST])
-    }
+    nodes = _list_predicting_nodes(health)[:MOST]
+    figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(nodes)}
     for i, (_, judged) in enumerate(_list_residuals(health)[:MOST]):
         figures[f"residuals_{i}"] = judged.figure(health.record.time)
     return figures

@@ -220,12 +220,13 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
 
     One that does not fit is left out, and smaller ones behind it may fit. In a page, as text, all take 4/3 of that.
     """
-    kept, size = dict[str, bytes](), 0
+    fitting, total = dict[str, bytes](), 0
     for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):
-        if size + len(drawings[name]) <= limit:
-            kept[name] = drawings[name]
-            size += len(drawings[name])
-    return kept
+        size = len(drawings[name])
+        if total + size <= limit:
+            fitting[name] = drawings[name]
+            total += size
+    return fitting
 
 
 def _make_headline(health: Health) -> str:
@@ -328,8 +329,11 @@ def _list_doubts(doubts: list[str]) -> list[Points | Text]:
     """Return the first DOUBTS (3) of the doubts, which come by weight, and a line on where the others are."""
     if not doubts:
         return [Text(["No doubts."])]
-    more = f"{_count_in_words(len(doubts) - DOUBTS, 'further doubt')} of less weight: `warnings` in `summary.json`."
-    return [Points([visible(line) for line in doubts[:DOUBTS]]), *([Text([more])] if len(doubts) > DOUBTS else [])]
+    first_doubts = Points([visible(line) for line in doubts[:DOUBTS]])
+    if len(doubts) <= DOUBTS:
+        return [first_doubts]
+    others = f"{_count_in_words(len(doubts) - DOUBTS, 'further doubt')} of less weight: `warnings` in `summary.json`."
+    return [first_doubts, Text([others])]
 
 
 def _list_baseline_remarks(health: Health) -> list[Text | Points]:

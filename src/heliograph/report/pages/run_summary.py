@@ -74,7 +74,9 @@ def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
             "p_value": tested.test.p_value,
         }
     if tested.declared:
-        numbers["declared"] = [dict(one._asdict()) for j in tested.declared for one in j.classes]
+        numbers["declared"] = [
+            dict(of_class._asdict()) for judgement in tested.declared for of_class in judgement.classes
+        ]
     return numbers
 
 
@@ -82,9 +84,9 @@ def _list_error_numbers(record: Record) -> dict[str, dict[str, Json]]:
     """Return RMSE by state and NEES of each filter, by node and filter; nothing where the truth is not known."""
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in compute_filter_errors(record):
-        size = None if np.isnan(of_filter.nees) else of_filter.nees
-        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
-        errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}
+        nees = None if np.isnan(of_filter.nees) else of_filter.nees
+        rmse: dict[str, Json] = {state: None if np.isnan(error) else error for state, error in of_filter.rmse.items()}
+        errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": nees}
     return errors
 
 

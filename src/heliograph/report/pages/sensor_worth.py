@@ -65,9 +65,10 @@ def _scale_axis(axes: Axes, limits: tuple[float, float]) -> None:
 
     Where the limits are less than NARROW, 4, times apart, ticks are evenly spaced: few powers would lie between.
     """
+    low, high = limits
     axes.set_xscale("log")
-    axes.set_xlim(*limits)
-    is_narrow = limits[1] < NARROW * limits[0]
+    axes.set_xlim(low, high)
+    is_narrow = high < NARROW * low
     axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]) if is_narrow else LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda times, _: f"{times:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
@@ -78,7 +79,8 @@ def _find_limits(worth: SensorWorth) -> tuple[float, float]:
 
     Bars begin at 1 and end at a factor `increase`; SPARE and ROOM are shares of their span in logarithms.
     """
-    increase = np.array([case.increase for case in worth.cases])
-    known = np.append(increase[np.isfinite(increase) & (increase > 0)], 1.0)
-    span = max(float(np.log(known.max() / known.min())), np.log(2.0))
-    return float(known.min() * np.exp(-SPARE * span)), float(known.max() * np.exp(ROOM * span))
+    increases = np.array([case.increase for case in worth.cases])
+    ends_of_bars = np.append(increases[np.isfinite(increases) & (increases > 0)], 1.0)
+    low, high = ends_of_bars.min(), ends_of_bars.max()
+    span = max(float(np.log(high / low)), np.log(2.0))
+    return float(low * np.exp(-SPARE * span)), float(high * np.exp(ROOM * span))

@@ -2,9 +2,9 @@
 
 from .broker_address import Address as Address
 from .broker_address import parse_address as parse_address
+from .broker_inspection import listen as listen
 from .line_reader import LineReader as LineReader
 from .line_reader import redirected_file as redirected_file
-from .listening import listen as listen
 from .mqtt import Mqtt as Mqtt
 from .nats import Nats as Nats
 from .opcua import OpcUa as OpcUa

@@ -36,7 +36,7 @@ class ArrivalOrder:
     """
 
     def __init__(self, source: str, steps: bool) -> None:
-        # Name of the file, for errors; whether times that are numbers are steps.
+        """Begin without messages; the class says what the arguments are."""
         self._source, self._steps = source, steps
         self._held = list[HeldPayload]()  # a heap
         self._count, self._last = 0, float("-inf")  # of all payloads so far; moment of the newest

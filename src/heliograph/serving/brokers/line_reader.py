@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from heliograph.files.messages.message_files import FileMessage, parse_message_document, parse_message_line
-from heliograph.files.messages.own_format import OwnMessageReader, is_own_message
+from heliograph.files.messages.own_format import HeliographMessageReader, is_own_message
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
@@ -63,7 +63,7 @@ class LineReader:
         # our own form; a table.
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
-        self._own = OwnMessageReader(network, self.source, ignore_unknown, table=False)
+        self._own = HeliographMessageReader(network, self.source, ignore_unknown, table=False)
         self._table = TableLineReader(network, translator, path, ignore_unknown)
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
@@ -78,7 +78,7 @@ class LineReader:
             ValueError: a table whose header names no columns, or others than expected; one line.
         """
         payloads, rows = list[Payload](), list[str]()
-        # `_is_table` is None until a line has told: the first that names columns makes all that follow a table's.
+        # Whether it is a table is not known (None) until a line names columns; then all that follow are its rows.
         for line in lines:
             if self._is_table is None:
                 self._is_table = self._table.names_columns(_decode_line(line)) or None
@@ -96,10 +96,12 @@ class LineReader:
         With those of a file that waited for earlier ones (`_order`).
         """
         if self._is_table:
-            rest = self._table.end()
+            last = self._table.end()
+        elif self._document is not None:
+            last = self._read_document_or_lines(self._document)
         else:
-            rest = [] if self._document is None else self._read_document_or_lines(self._document)
-        return rest if self._order is None else [*self._order.add_messages(rest), *self._order.take_rest()]
+            last = []
+        return last if self._order is None else [*self._order.add_messages(last), *self._order.take_rest()]
 
     def _read_line(self, line: bytes) -> list[Payload]:
         """Return the messages of a line that is none of a table; [] while a document over several lines goes on."""
@@ -122,8 +124,8 @@ class LineReader:
         """Return the messages of a JSON document of several lines, or else of each line by itself."""
         self._document = None
         with suppress(InputError):
-            found = parse_message_document(b"\n".join(lines), self.source)
-            return [payload for message in found for payload in self._interpret_message(message, None)]
+            messages = parse_message_document(b"\n".join(lines), self.source)
+            return [payload for message in messages for payload in self._interpret_message(message, None)]
         # No document: each line is read and counted (`_number`) again, as none of a table.
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()

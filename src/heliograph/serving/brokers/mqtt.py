@@ -35,6 +35,13 @@ class Mqtt:
     """
 
     def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
+        """Connect to the broker at `address`, to read a part of the plants' messages and to write outputs.
+
+        Args:
+            address: of the broker, with the topic.
+            part: which of the equal parts of the plants is read; all plants by default.
+            translator: translates messages of the sources' topics to our own; none by default.
+        """
         self.address = address
         self._reader, self._writer = _Reader(address, part, translator), _Writer(address)
 
@@ -185,21 +192,24 @@ class _Reader(Connection):
         super().connected(client, data, flags, code, more)
         self._connection += 1  # messages of an earlier one are not acknowledged in this one
         if not code.is_failure:
-            topics = [] if self._translator is None else self._translator.sources.subscribed_topics
+            own_topic = f"{self._prefix}{self._topics_below}"
+            topics_of_sources = [] if self._translator is None else self._translator.sources.subscribed_topics
             LOG.info("%s: connected", self.address)
-            client.subscribe([(topic, AT_LEAST_ONCE) for topic in (f"{self._prefix}{self._topics_below}", *topics)])
+            client.subscribe([(topic, AT_LEAST_ONCE) for topic in (own_topic, *topics_of_sources)])
 
     def disconnected(
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
     ) -> None:
+        """Count the end of the connection: what was received before can no longer be acknowledged."""
         super().disconnected(client, data, flags, code, more)
-        self._connection += 1  # what was received before can no longer be acknowledged
+        self._connection += 1
 
 
 class _Writer(Connection):
     """Connection that publishes outputs."""
 
     def __init__(self, address: Address):
+        """Connect to the broker in a session of no name; what the broker confirms is noted from now on."""
         super().__init__(address, "")
         self._delivered: set[int] = set()  # numbers of what the broker has
         self.client.on_publish = self._note_received
@@ -207,15 +217,15 @@ class _Writer(Connection):
 
     def publish(self, outputs: Sequence[Output]) -> None:
         """Publish outputs; return when the broker has all that have a number. A provisional estimate may be lost."""
-        sent = set()
+        to_confirm = set()
         for output in outputs:
-            # With quality 0 a message is sent once, and nobody says whether it came.
+            # With quality of service 0 a message is sent once, and nobody says whether it came.
             quality = 0 if output.kind == "provisional" else AT_LEAST_ONCE
-            handle = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
+            message = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
             if output.number is not None:
-                sent.add(handle.mid)
+                to_confirm.add(message.mid)
         with self.changed:
-            self.changed.wait_for(lambda: sent <= self._delivered or not self.open)
+            self.changed.wait_for(lambda: to_confirm <= self._delivered or not self.open)
             self._delivered.clear()
 
     def _note_received(self, client: Client, data: object, number: int, code: ReasonCode, more: object) -> None:

@@ -163,10 +163,10 @@ class OpcUa:
 
         `val`: the new value; `data`: its dates and its quality.
         """
-        name, body = _translate_change(node, val, data)
-        stored = name in self._first
-        self._first.discard(name)
-        self._changes.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
+        topic, body = _translate_change(node, val, data)
+        was_stored = topic in self._first
+        self._first.discard(topic)
+        self._changes.put_nowait(self._translator.read(topic, body, datetime.now(UTC), was_stored))
 
     async def _connect(self) -> None:
         """Connect and subscribe, again and again while the server is away."""
@@ -203,6 +203,7 @@ class Listener:
     """
 
     def __init__(self, topics: dict[str, TopicStatistics]):
+        """Hold the statistics of each topic, which it adds to; the types of the variables are not known yet."""
         self.topics, self.kinds = topics, dict[str, str]()
 
     async def listen(self, where: Address, seconds: float) -> None:
@@ -226,11 +227,11 @@ class Listener:
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Note a change in the statistics of its topic; of a variable's first value, which may be old, no times."""
-        name, body = _translate_change(node, val, data)
-        stored = name not in self.topics
-        note_payload(self.topics, name, body, time.time_ns())
-        if stored:
-            del self.topics[name].logged[:], self.topics[name].late[:]
+        topic, body = _translate_change(node, val, data)
+        is_first = topic not in self.topics
+        note_payload(self.topics, topic, body, time.time_ns())
+        if is_first:
+            del self.topics[topic].logged[:], self.topics[topic].late[:]
 
 
 def _make_client(where: Address) -> Client:
@@ -278,8 +279,8 @@ def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple
     A value of bad quality, or NaN or infinite, becomes null; what is no number a text.
     """
     sample = data.monitored_item.Value
-    good = sample.StatusCode is None or sample.StatusCode.is_good()
-    if not good or (isinstance(value, float) and not isfinite(value)):  # JSON has neither NaN nor infinity
+    has_good_quality = sample.StatusCode is None or sample.StatusCode.is_good()
+    if not has_good_quality or (isinstance(value, float) and not isfinite(value)):  # JSON has no NaN, no infinity
         value = None
     elif not isinstance(value, bool | int | float):
         value = show_value(value)

@@ -90,12 +90,12 @@ class Pipe:
 
         For that MORE milliseconds are waited each time.
         """
-        data = more = os.read(self.source, READ)
-        waiting = select.poll()
-        waiting.register(self.source, select.POLLIN)
-        while more and FULL <= len(data) < READ and waiting.poll(MORE):
-            more = os.read(self.source, READ - len(data))
-            data += more
+        data = next_bytes = os.read(self.source, READ)
+        poll = select.poll()
+        poll.register(self.source, select.POLLIN)
+        while next_bytes and FULL <= len(data) < READ and poll.poll(MORE):
+            next_bytes = os.read(self.source, READ - len(data))
+            data += next_bytes
         return data
 
     def _split_lines(self, data: bytes, ended: bool) -> list[bytes]:
@@ -142,15 +142,18 @@ def _set_nonblocking(file: int) -> Iterator[tuple[int, int | None]]:
     A pipe is opened again, since whether it waits is a property that all who share an opened one have in common. Where
     that fails, AT_ONCE bytes never wait in one that takes any.
     """
-    mode, again = os.fstat(file).st_mode, None
+    mode, reopened = os.fstat(file).st_mode, None
     if stat.S_ISFIFO(mode):
         with suppress(OSError):
-            again = os.open(f"/proc/self/fd/{file}", os.O_WRONLY | os.O_NONBLOCK)
+            reopened = os.open(f"/proc/self/fd/{file}", os.O_WRONLY | os.O_NONBLOCK)
     try:
-        yield (file, None if stat.S_ISREG(mode) else AT_ONCE) if again is None else (again, None)
+        if reopened is not None:
+            yield reopened, None
+        else:
+            yield file, None if stat.S_ISREG(mode) else AT_ONCE
     finally:
-        if again is not None:
-            os.close(again)
+        if reopened is not None:
+            os.close(reopened)
 
 
 async def _wait_until_ready(

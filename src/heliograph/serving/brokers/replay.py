@@ -90,12 +90,12 @@ def check_time_steps(dt: np.ndarray, time: np.ndarray, numbers: np.ndarray, sour
         numbers: their numbers, for errors.
         source: name of the table, for errors.
     """
-    since = np.diff(time)
+    since_row_before = np.diff(time)
     # SAME: the relative difference that rounded times explain.
-    wrong = np.flatnonzero(~np.isclose(dt[1:], since, rtol=SAME, atol=1e-3 * SAME))
+    wrong = np.flatnonzero(~np.isclose(dt[1:], since_row_before, rtol=SAME, atol=1e-3 * SAME))
     if wrong.size:
         row = int(wrong[0])
-        expected = f"the time since the row before, {since[row]:.10g}, which is all that messages say"
+        expected = f"the time since the row before, {since_row_before[row]:.10g}, which is all that messages say"
         raise fail(f"{source}, row {numbers[row + 1]}, column {TIME_STEP!r}", expected, f"{dt[row + 1]:.10g}")
 
 
@@ -205,10 +205,13 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     delays = np.asarray(columns[DELAY], dtype=float)
     if np.any(delays < 0):
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
-    received = [event for event in events if event.node != INPUTS]
-    known = zip(received, np.resize(delays, len(received)).tolist(), strict=True)
-    results = [_delay_event(event, delay) for event, delay in known if not np.isnan(delay)]
-    return _sort_events(results + [_delay_event(event, 0.0) for event in events if event.node == INPUTS])
+    sent = [event for event in events if event.node != INPUTS]
+    inputs = [event for event in events if event.node == INPUTS]
+    delay_of_sent = np.resize(delays, len(sent)).tolist()
+    received = [
+        _delay_event(event, delay) for event, delay in zip(sent, delay_of_sent, strict=True) if not np.isnan(delay)
+    ]
+    return _sort_events(received + [_delay_event(event, delay=0.0) for event in inputs])
 
 
 def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
@@ -224,16 +227,18 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
     """
     for event in events:
         arrival = event.time if event.arrival is None else event.arrival  # without one: at once
-        said = {"arrival": _format_time(arrival, origin)}
-        yield arrival, json.dumps(encode_event(event, plant, origin) | said)
+        fields = encode_event(event, plant, origin) | {"arrival": _format_time(arrival, origin)}
+        yield arrival, json.dumps(fields)
 
 
 def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict[str, object]:
     """Return an event as the fields of a message, without its arrival; NaN as null. `origin`: date of time 0."""
-    values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
-    name = {"plant": plant} if plant else {}
-    moment = {"time": _format_time(event.time, origin)}
-    return name | {"node": event.node, "sequence": int(event.sequence)} | moment | {"values": values}
+    return ({"plant": plant} if plant else {}) | {
+        "node": event.node,
+        "sequence": int(event.sequence),
+        "time": _format_time(event.time, origin),
+        "values": [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)],
+    }
 
 
 def _delay_event(event: Event, delay: float) -> Event:

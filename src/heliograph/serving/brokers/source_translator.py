@@ -8,7 +8,7 @@ from pathlib import Path
 from heliograph.files.messages.message_files import FileMessage, make_default_topic
 from heliograph.files.sources.message_fields import decode_json, parse_arrival
 from heliograph.files.sources.message_reading import Reading, Unread
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.times.timestamp_order import YEAR
@@ -46,7 +46,7 @@ class Translator:
         instance("network", network, Network, "a Network")
         if isinstance(others, str) or not isinstance(others, Collection):
             raise fail("nodes of other processes", "a list of names", show_value(others))
-        self.sources = Sources(table, network, others)
+        self.sources = TopicReader(table, network, others)
         topics = self.sources.topics
         # The only topic, if there is one, and it is no pattern (with the wildcards + or #).
         is_alone = len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/"))
@@ -264,14 +264,14 @@ class Translator:
         A copy of a message, which has the same values and may come where `repeatable`, gets the number of the message.
         """
         assert reading.time is not None
-        values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
-        mine = reading.values.tobytes()
-        if repeatable and mine in values:  # a copy
-            return values.index(mine)
-        values.append(mine)
+        values_so_far = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
+        values = reading.values.tobytes()
+        if repeatable and values in values_so_far:  # a copy
+            return values_so_far.index(values)
+        values_so_far.append(values)
         if len(self._uncounted) > REMEMBERED:  # forget the oldest time
             self._uncounted.popitem(last=False)
-        return len(values) - 1
+        return len(values_so_far) - 1
 
 
 def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:

@@ -51,6 +51,7 @@ class StatePublishing:
     """
 
     def __init__(self, inner: Transport, topics: StateTopics, states: Sequence[str]):
+        """Hold the inner transport, and connect to the broker where the states of these names go."""
         address = instance("topics", topics, StateTopics, "StateTopics").address
         if instance("topics, address", address, Address, "an Address").kind != "mqtt":
             raise fail("topics, address", "mqtt:// or mqtts://host:port/topic", str(address))
@@ -81,6 +82,7 @@ class _StateWriter(Connection):
     """
 
     def __init__(self, topics: StateTopics, states: Sequence[str]):
+        """Connect to the broker, to publish the states of these names; the last will says "offline"."""
         super().__init__(topics.address, "")
         # Topics of which Home Assistant was told; the newest estimate by plant, to be published again; its lock.
         self._topics, self._states, self._announced = topics, states, set[str]()

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.files.csv_columns import CsvColumnReader
 from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, make_message_of_row
-from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, OwnMessageReader
+from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, HeliographMessageReader
 from heliograph.files.recording import RowReader
 from heliograph.files.recording_rows import RecordingRows, join_recording_rows
 from heliograph.files.sources.message_reading import Reading, Unread
@@ -37,11 +37,11 @@ class TableLineReader:
     """
 
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
-        # The class says what these are. The reader of rows is chosen by the header, when it has come.
+        """Hold the network, and how its sources translate rows; a table without a path is read from standard input."""
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
-        self._reader: MessageRowReader | TimeRowReader | None = None
+        self._reader: IndependentRowReader | TimeRowReader | None = None
 
     def names_columns(self, line: str) -> bool:
         """Return whether a line is the first of a table: it names a column that the network or its sources know."""
@@ -76,35 +76,37 @@ class TableLineReader:
             self._reader = self._choose_reader(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
-    def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
+    def _choose_reader(self, header: list[str]) -> "IndependentRowReader | TimeRowReader":
         """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time.
 
         A row of time has the measurements of all nodes; an event is one node's, with its name and count.
         """
         if {NODE, SEQUENCE} <= set(header):
-            own = OwnMessageReader(self._network, self._source, self._ignore, table=True)
-            return MessageRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
+            own = HeliographMessageReader(self._network, self._source, self._ignore, table=True)
+            return IndependentRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
         translator = self._translator
         if translator is not None:
             topic = translator.topic_of_rows(self._path, header)
             if topic is not None or TOPIC in header:
-                return MessageRowReader(
+                return IndependentRowReader(
                     lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
                 )
         return TimeRowReader(self._network, header, self._text, self._ignore)
 
 
-class MessageRowReader:
+class IndependentRowReader:
     """Reads rows by themselves: each is a message, or several, in our own form or by the sources' map."""
 
     def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
+        """Hold `decode`, which returns the messages of one row, or texts in place of those that are refused."""
         self._decode = decode
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows (`_decode`), and texts why others cannot be read, in order."""
-        return [
-            payload for row in rows for payload in ([str(row)] if isinstance(row, InputError) else self._decode(row))
-        ]
+        """Return the messages of all rows in order, and in the place of a row that cannot be read a text why."""
+        payloads = list[Payload]()
+        for row in rows:
+            payloads += [str(row)] if isinstance(row, InputError) else self._decode(row)
+        return payloads
 
 
 class TimeRowReader:
@@ -163,14 +165,14 @@ class TimeRowReader:
     def end(self) -> list[Payload]:
         """Return the messages of the rows of a file, now that all have come, and why others have none.
 
-        Messages are lines of JSON. Doubts about the rows (warnings) are logged.
+        Messages are lines of JSON. Warnings about the rows are logged.
         """
         if not self._cells:
             return []
-        with warnings.catch_warnings(record=True) as doubts:
+        with warnings.catch_warnings(record=True) as caught_warnings:
             warnings.simplefilter("always", UserWarning)
             recording, self._cells = self._rows.arrange_recording(join_recording_rows(self._cells)), []
-        for line in [*self._rows.notes, *(str(doubt.message) for doubt in doubts)]:
+        for line in [*self._rows.notes, *(str(warning.message) for warning in caught_warnings)]:
             LOG.warning("%s", line)
         events, origin = events_of_recording(recording, self._network)
         lines = [json.dumps(encode_event(event, "", origin)).encode() for event in events]
@@ -189,17 +191,17 @@ class TimeRowReader:
         return np.asarray((time - self._origin) / SECOND)
 
 
-def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
+def read_own_event(reader: HeliographMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
     """Return the messages of an event in our own form: its measurement, and its inputs if it has any.
 
     Or why one cannot be read: as a text, or with its count and time where these are known.
     """
     try:
-        found = reader.read(where, content)
+        readings_and_arrivals = reader.read(where, content)
     except InputError as error:
         return [str(error)]
     payloads = list[Payload]()
-    for reading, arrival in found:
+    for reading, arrival in readings_and_arrivals:
         if not isinstance(reading, Unread):
             payloads.append(_make_message(reader, reading, arrival))
         elif reading.counted is not None:
@@ -207,7 +209,7 @@ def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, obje
     return payloads
 
 
-def _make_message(reader: OwnMessageReader, reading: Reading, arrival: float) -> Message:
+def _make_message(reader: HeliographMessageReader, reading: Reading, arrival: float) -> Message:
     """Return the message of an event; it has no arrival where that is the time of the measurement."""
     assert reading.time is not None
     time = reading.time if reader.numbers else convert_nanoseconds_to_date(int(reading.time))

@@ -97,6 +97,7 @@ class Retry:
     """Waits that double, each shortened at random by up to a half so that processes do not come back all at once."""
 
     def __init__(self, what: str):
+        """Begin with the shortest wait; `what` is done again after it, in the words of a log."""
         self.what, self._wait = what, FIRST
 
     async def wait(self, error: Exception) -> None:
@@ -149,7 +150,7 @@ def part_of(plant: str, parts: int) -> int:
         The number of the part, 0 <= number < `parts`.
     """
     check_count("parts", parts)
-    value = OFFSET  # FNV-1a, a hash of 32 bits that is the same in every process and program
+    hash_ = OFFSET  # FNV-1a, a hash of 32 bits that is the same in every process and program
     for byte in encode_name(plant).encode():
-        value = (value ^ byte) * PRIME & 0xFFFFFFFF
-    return value % parts
+        hash_ = (hash_ ^ byte) * PRIME & 0xFFFFFFFF
+    return hash_ % parts

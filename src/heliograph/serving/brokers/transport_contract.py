@@ -54,6 +54,7 @@ class _Examination:
     """One examination of a broker, which sends numbered messages and asserts each promise of its transport."""
 
     def __init__(self, broker: Broker, messages: int, patience: float):
+        """Hold the broker, how many messages are sent, and the seconds after which a missing one is lost."""
         self.broker, self.messages, self.patience = broker, messages, patience
         self.silence = patience / 20  # seconds without a message after which we assume that there is none
         self._numbers = count()  # of the messages, each of which has another
@@ -130,8 +131,8 @@ class _Examination:
         """Receive until all of these bodies have arrived; return each once, in the order of first arrival."""
         received = list[bytes]()
 
-        async def listen() -> None:
-            """Receive batches until all of the bodies have arrived, and add what came to `received`."""
+        async def receive_all() -> None:
+            """Receive batches of the transport, acknowledged if `acknowledge`, until `received` has all `bodies`."""
             while set(bodies) - set(received):
                 received.extend(await self._unpack(await transport.receive(), acknowledge))
                 await asyncio.sleep(0)  # a transport that never waits would let no time pass
@@ -139,7 +140,7 @@ class _Examination:
         # A timeout, and not `wait_for`: Python 3.11's may lose the cancellation of what waits inside, and never end.
         try:
             async with asyncio.timeout(self.patience):
-                await listen()
+                await receive_all()
         except TimeoutError:
             missing, total = len(set(bodies) - set(received)), len(bodies)
             what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
@@ -179,13 +180,12 @@ class _Examination:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
     def _make_bodies(self, total: int) -> list[bytes]:
-        """Return bodies of messages, each with a number that none had before; the first is LONG bytes long.
+        """Return bodies of messages, each with a number that none had before; the first has a text of LONG bytes.
 
-        With a letter of two bytes, so that a transport that changes the encoding is found out.
+        The name of that text is a letter of two bytes, so that a transport that changes the encoding is found out.
         """
-        return [
-            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(total)
-        ]
+        texts = [b"x" * LONG, *[b""] * (total - 1)][:total]
+        return [b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), text) for text in texts]
 
 
 def _drop_repeated(bodies: Iterable[bytes]) -> list[bytes]:

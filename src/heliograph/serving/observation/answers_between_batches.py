@@ -20,6 +20,7 @@ class LastAnswers(Generic[T]):
     """
 
     def __init__(self, lock: threading.Lock, answer: Callable[[str], T], begin: T, most: int = 1):
+        """Hold how a question is answered; no question was asked yet. The class says what the arguments are."""
         self.lock, self.answer, self.begin, self.most = lock, answer, begin, most
         self._last: OrderedDict[str, T] = OrderedDict()
 

@@ -33,6 +33,7 @@ class ServiceMetrics(Collector):
     """Collector of the metrics of a watch: by node and filter, and by plant where there are few, else of the worst."""
 
     def __init__(self, watch: ServiceWatch):
+        """Register these metrics of the watched service, and write their text once, before the first batch."""
         self.watch = watch
         watch.registry.register(self)
         text = partial(generate_latest, watch.registry)

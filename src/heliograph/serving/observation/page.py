@@ -184,6 +184,7 @@ class TokenMiddleware:
     """Middleware that requires the token: as `Authorization: Bearer`, or once as ?token=, then kept as a cookie."""
 
     def __init__(self, app: ASGIApp, token: str | None):
+        """Wrap the web application `app`; a request needs this token, or none where it is None."""
         self.app, self.token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -108,10 +108,10 @@ class RememberedPlants:
 
         Of `most` plants at most, those in which a crossing is most probable.
         """
-        # p["by"]: probability up to then, at any time.
-        largest = {plant: max(p["by"] for p in levels.values()) for plant, levels in self.crossings.items()}
-        first = sorted(largest, key=lambda plant: -largest[plant])[:most]
-        return [((plant, *key), p["by"]) for plant in first for key, p in self.crossings[plant].items()]
+        # Of the probabilities of a crossing "by" is that of one at any time up to then.
+        largest = {plant: max(p["by"] for p in crossings.values()) for plant, crossings in self.crossings.items()}
+        most_probable = sorted(largest, key=lambda plant: -largest[plant])[:most]
+        return [((plant, *key), p["by"]) for plant in most_probable for key, p in self.crossings[plant].items()]
 
 
 class BatchHistograms:
@@ -147,10 +147,10 @@ def _means_and_deviations(message: Mapping[str, Any]) -> dict[str, object]:
 
     The deviations are null where the filter claims no covariance.
     """
-    rows = message["covariance"]
-    claimed = rows and [_deviation_of(row[i]) for i, row in enumerate(rows)]
+    covariance = message["covariance"]  # rows, or null
+    deviations = covariance and [_deviation_of(row[i]) for i, row in enumerate(covariance)]
     modes = {"modes": message["modes"]} if message.get("modes") is not None else {}
-    return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"], **modes}
+    return {"mean": message["mean"], "deviation": deviations, "claim": message["claim"], **modes}
 
 
 def _deviation_of(variance: float | None) -> float | None:

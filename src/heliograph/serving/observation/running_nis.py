@@ -49,7 +49,8 @@ class RunningNis:
     def band(self) -> tuple[float, float]:
         """Return the interval that contains the ratio with probability 1 - DOUBT if the covariance is right.
 
-        The ratio is the weighted sum of NIS over its mean, taken as of a gamma law with the sum's mean and variance.
+        The ratio is the weighted sum of NIS over its expectation. Its law is taken for the gamma law of mean 1 and of
+        the variance of that ratio.
         """
         if not self.mean:
             return 0.0, float("inf")
@@ -80,6 +81,8 @@ def read_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
     outputs = message.get("outputs")
     if message.get("nis") is None or not outputs:
         return message.get("nis"), message.get("received", 0)
-    used = [value**2 / variance for value, variance, weight in zip(*(outputs[name] for name in WEIGHED), strict=True)
-            if None not in (value, variance, weight) and weight >= HALF and variance > 0]  # fmt: skip
-    return (math.fsum(used), len(used)) if used else (None, 0)
+    squares = list[float]()
+    for innovation, variance, weight in zip(*(outputs[name] for name in WEIGHED), strict=True):
+        if None not in (innovation, variance, weight) and weight >= HALF and variance > 0:
+            squares.append(innovation**2 / variance)
+    return (math.fsum(squares), len(squares)) if squares else (None, 0)

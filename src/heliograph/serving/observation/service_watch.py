@@ -194,10 +194,13 @@ class ServiceWatch:
         """
         refused = dict[str, str]()
         for name, plant in self._iterate_plants(self._overview.touched):
-            counts = [
-                (node, verdict, getattr(link, verdict)) for node, link in plant.links.items() for verdict in REFUSED
+            refusals = [
+                f"{node}: {getattr(link, verdict):,} {verdict}"
+                for node, link in plant.links.items()
+                for verdict in REFUSED
+                if getattr(link, verdict)
             ]
-            refused[name] = "; ".join(f"{node}: {count:,} {verdict}" for node, verdict, count in counts if count)
+            refused[name] = "; ".join(refusals)
         return self._overview.list_worst_plants(self._memory.tests, self._memory.dead_senders, refused)
 
     def tests(self, plant: str) -> Mapping[tuple[str, str], RunningNis]:
@@ -272,10 +275,10 @@ class ServiceWatch:
 
         Asked between two batches. The counts are by node, over all services that have the plant.
         """
-        every = list(self.plants())
+        plants = list(self.plants())
         return ServiceAnswers(
-            names=sorted(name for name, _ in every),
-            links=_add_counts([status for name, status in every if name == plant]),
+            names=sorted(name for name, _ in plants),
+            links=_add_counts([status for name, status in plants if name == plant]),
             malformed=sum(service.malformed for service in self.services),
             wrong=len(self.list_worst_plants()),
         )

@@ -44,8 +44,10 @@ class PlantTroubles(NamedTuple):
     def describe(self) -> list[str]:
         """Return what is wrong with the plant, a line each: dead senders, doubted filters, refused messages."""
         lines = [f"{node}: its sender is dead" for node in self.dead]
-        lines += [f"{d.node}/{d.filter}: squared innovations {d.ratio:.2g} times what its covariance says "
-                  f"({d.low:.2g} to {d.high:.2g})" for d in self.doubts]  # fmt: skip
+        for doubt in self.doubts:
+            interval = f"({doubt.low:.2g} to {doubt.high:.2g})"
+            ratio = f"squared innovations {doubt.ratio:.2g} times what its covariance says {interval}"
+            lines.append(f"{doubt.node}/{doubt.filter}: {ratio}")
         return [*lines, self.refused] if self.refused else lines
 
 
@@ -53,7 +55,8 @@ class TroubleOverview:
     """Keeps what is wrong with each plant, found anew where a plant has had a message since the last look."""
 
     def __init__(self) -> None:
-        self.touched = set[str]()  # since the last look
+        """Begin without plants: `touched` are those that had a message since the last look."""
+        self.touched = set[str]()
         self._wrong: dict[str, PlantTroubles] = {}
 
     def note_change(self, plant: str) -> None:
@@ -125,13 +128,13 @@ that were refused.{more}</p></header>
 
 def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[PlantTroubles], most: int) -> str:
     """Return the page of all plants in HTML, those with something wrong first, of `most` rows at most."""
-    named = {item.plant for item in wrong}
+    plants_in_trouble = {item.plant for item in wrong}
     rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]
-    rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in named]
+    rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in plants_in_trouble]
     lines = [
         f'<tr><th scope="row"><a href="./?plant={quote(plant, safe="")}">{escape(plant) or "(no name)"}</a></th>'
-        f'<td class="words {kind}">{said}</td></tr>'
-        for plant, said, kind in rows[:most]
+        f'<td class="words {style}">{troubles}</td></tr>'
+        for plant, troubles, style in rows[:most]
     ]
     more = f" The first {most:,} are shown." if len(rows) > most else ""
     counts = {"count": len(rows), "wrong": len(wrong), "more": more, "rows": "\n".join(lines)}

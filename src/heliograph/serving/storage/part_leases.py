@@ -36,10 +36,16 @@ class Leases:
     """
 
     def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
-        # `process`: name of this one; `parts`: number of parts of the plants; `term`: seconds of a lease.
+        """Make the tables of leases where the database has none.
+
+        Args:
+            engine: of the database.
+            process: name of this process.
+            parts: number of parts of the plants.
+            term: seconds of a lease.
+        """
         self.engine, self.process, self.parts, self.term = engine, process, parts, term
-        insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
-        self._insert = insert
+        self._insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
         TABLES.create_all(engine)
 
     def renew(self) -> set[int]:
@@ -52,13 +58,12 @@ class Leases:
         """
         with self._raise_if_away(), self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
-            fair = self._report_and_count_fair_share(connection, now)
-            leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
-            held = [(row.number, row.process) for row in connection.execute(leased)]
-            own = [number for number, process in sorted(held) if process == self.process]
-            taken = {number for number, _ in held}
-            free = [number for number in range(self.parts) if number not in taken]
-            return {number for number in (own + free)[:fair] if self._lease(connection, number, now)}
+            fair_share = self._report_and_count_fair_share(connection, now)
+            select_leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
+            process_of_part = {row.number: row.process for row in connection.execute(select_leased)}
+            own = [number for number in sorted(process_of_part) if process_of_part[number] == self.process]
+            free = [number for number in range(self.parts) if number not in process_of_part]
+            return {number for number in (own + free)[:fair_share] if self._lease(connection, number, now)}
 
     @contextmanager
     def _raise_if_away(self) -> Iterator[None]:
@@ -88,17 +93,17 @@ class Leases:
         The dead have not reported for longer than the term. The remainder goes to the first processes by name.
         """
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
-        new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
-        connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
+        insert = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
+        connection.execute(insert.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
         alive = sorted(row.name for row in connection.execute(select(PROCESSES.c.name)))
         each, remainder = divmod(self.parts, len(alive))
         return each + (alive.index(self.process) < remainder)
 
     def _lease(self, connection: Connection, number: int, now: float) -> bool:
         """Lease the part of this number until `now` + term if it is ours or free; return whether it is ours now."""
-        mine = {"process": self.process, "until": now + self.term}
-        new = self._insert(PARTS).values(number=number, **mine)
+        lease = {"process": self.process, "until": now + self.term}
+        insert = self._insert(PARTS).values(number=number, **lease)
         # A row that is there is changed only where its lease is over or ours; else nothing is returned.
-        free = (PARTS.c.until < now) | (PARTS.c.process == self.process)
-        done = new.on_conflict_do_update(index_elements=["number"], set_=mine, where=free).returning(PARTS.c.number)
-        return connection.execute(done).first() is not None
+        is_free_or_own = (PARTS.c.until < now) | (PARTS.c.process == self.process)
+        upsert = insert.on_conflict_do_update(index_elements=["number"], set_=lease, where=is_free_or_own)
+        return connection.execute(upsert.returning(PARTS.c.number)).first() is not None

@@ -228,9 +228,9 @@ class Store:
             for name in names:
                 damage = self.damaged.pop(name, None)
                 # A damaged name may be no text that any name could equal: its row is found by its checksum.
-                nameless = damage is not None and not damage.named
-                this = PLANTS.c.checksum == damage.checksum if damage and nameless else PLANTS.c.name == name
-                if not connection.execute(delete(PLANTS).where(this)).rowcount:
+                has_lost_name = damage is not None and not damage.named
+                is_plant = PLANTS.c.checksum == damage.checksum if damage and has_lost_name else PLANTS.c.name == name
+                if not connection.execute(delete(PLANTS).where(is_plant)).rowcount:
                     raise fail(f"store {self.name}, --anew", "the name of a plant that it has", repr(name))
 
     def commit(
@@ -288,10 +288,10 @@ class Store:
         Raises:
             ValueError: a damaged entry.
         """
-        expected = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
+        select_batches = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
         outputs = list[Output]()
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
-            for last, by, lines, written in connection.execute(expected):
+            for last, by, lines, written in connection.execute(select_batches):
                 if not is_row_undamaged(written, last, by, lines):
                     got = f"damage in those up to number {last}; {MEND} {self.name}"
                     raise fail(f"store {self.name}, journal", "entries as they were written", got)
@@ -307,9 +307,9 @@ class Store:
 
     def words(self) -> dict[str, int]:
         """Return the last words of devices (online or not) that are kept, as numbers by topic."""
-        mine = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
+        select_words = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
-            rows = connection.execute(mine).all()
+            rows = connection.execute(select_words).all()
         return {name.removeprefix(WORD): self._check_count(name, value, written) for name, value, written in rows}
 
     def keep_words(self, words: Mapping[str, int]) -> None:
@@ -350,8 +350,8 @@ class Store:
     def begin_from(self, location: str, mine: Identity, carrier: PlantMigration | None = None) -> None:
         """Copy the plants of another store, which stays, into this empty one; `carrier` fits them to this network."""
         other = Store(location, mine if carrier is None else None)
-        saying = self._name_store_in_errors(f"a database that takes the plants of {other.name}")
-        with saying, self._engine.begin() as here, other._engine.connect() as there:
+        name_store = self._name_store_in_errors(f"a database that takes the plants of {other.name}")
+        with name_store, self._engine.begin() as here, other._engine.connect() as there:
             if here.execute(select(func.count()).select_from(PLANTS)).scalar():
                 raise fail(f"store {self.name}", f"no plants yet, to begin from {other.name}", "some")
             for rows in there.execute(select(PLANTS)).mappings().partitions(AT_ONCE):
@@ -377,21 +377,21 @@ class Store:
 
     def _add_to_count(self, connection: Connection, name: str, more: int) -> int:
         """Add `more` to a stored count, which locks it until the commit; return the new value, its checksum renewed."""
-        new = self._insert(NUMBERS).values(add_checksum(NUMBERS, name, more))
-        locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
-        value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
+        insert = self._insert(NUMBERS).values(add_checksum(NUMBERS, name, more))
+        upsert = insert.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
+        value, written = connection.execute(upsert.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
         # A count that was there has the checksum of what it was before.
         if written != checksum(name, value):
             value = self._check_count(name, value - more, written) + more
-            this = NUMBERS.c.name == name
-            connection.execute(update(NUMBERS).where(this).values(checksum=checksum(name, value)))
+            is_count = NUMBERS.c.name == name
+            connection.execute(update(NUMBERS).where(is_count).values(checksum=checksum(name, value)))
         return int(value)
 
     def _upsert(self, connection: Connection, table: Table, rows: list[dict[str, object]]) -> None:
         """Insert rows in a table whose key is the name, or replace those of the same name."""
-        new = self._insert(table)
-        others = {column.name: new.excluded[column.name] for column in table.c if not column.primary_key}
-        connection.execute(new.on_conflict_do_update(index_elements=["name"], set_=others), rows)
+        insert = self._insert(table)
+        new_values = {column.name: insert.excluded[column.name] for column in table.c if not column.primary_key}
+        connection.execute(insert.on_conflict_do_update(index_elements=["name"], set_=new_values), rows)
 
 
 def _strip_description(identity: Identity) -> Identity:

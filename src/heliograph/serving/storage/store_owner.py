@@ -94,11 +94,11 @@ def _lock_session(engine: Engine, process: str) -> Iterator[None]:
     """
     key = crc32(process.encode()) >> 1  # 31 bits: the server takes signed numbers of 32
     with engine.connect() as connection:
-        connection.execute(text("SELECT set_config('application_name', :name, false)"),
-                           {"name": f"heliograph {name_of_process()}"[:63]})  # fmt: skip
-        locked = connection.execute(text("SELECT pg_try_advisory_lock(:space, :key)"), {"space": SPACE, "key": key})
-        if not locked.scalar():
-            row = connection.execute(WHOSE, {"space": SPACE, "key": key}).first()
+        session_name = f"heliograph {name_of_process()}"[:63]
+        connection.execute(text("SELECT set_config('application_name', :name, false)"), {"name": session_name})
+        lock = {"space": SPACE, "key": key}
+        if not connection.execute(text("SELECT pg_try_advisory_lock(:space, :key)"), lock).scalar():
+            row = connection.execute(WHOSE, lock).first()
             whose = "" if row is None else f"{row[0].removeprefix('heliograph ')} at {row[1]}"
             raise _make_taken_error(engine.url.render_as_string(hide_password=True), whose)
         connection.commit()

@@ -114,6 +114,7 @@ class InMemoryStore:
     keeps, name = False, "memory"
 
     def __init__(self) -> None:
+        """Begin before the first output, whose number is 1."""
         self._number = 0
 
     def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:

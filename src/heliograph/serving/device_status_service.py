@@ -19,6 +19,7 @@ class DeviceStatusService:
     """
 
     def __init__(self, service: BatchService, words: DeviceStatuses, store: StoreProtocol):
+        """Hold the service, the words of its devices and their store; words that the store has are put back."""
         self._service, self._words, self._store = service, words, store
         self._unkept = dict[str, int]()  # words that the store does not have yet, as numbers by topic
         words.restore(store.words())

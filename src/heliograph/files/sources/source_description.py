@@ -33,10 +33,10 @@ class Level:
 
     def of(self, topic: str, message: object, where: str) -> str:
         """Return the name that the word at `self.index` of the topic gives, by `self.names` where that has it."""
-        words = topic.split("/")
-        if not -len(words) <= self.index < len(words):
+        levels = topic.split("/")
+        if not -len(levels) <= self.index < len(levels):
             raise fail(where, f"a topic with a level {self.index}", repr(topic))
-        return (self.names or {}).get(words[self.index], words[self.index])
+        return (self.names or {}).get(levels[self.index], levels[self.index])
 
 
 @readable
@@ -192,10 +192,10 @@ class Source:
     @property
     def fields(self) -> list[str]:
         """Return the dotted paths of all fields that a message needs: of values, names, time, count, and conditions."""
-        values = [part for path in self.paths for part in ((path,) if isinstance(path, str) else path.parts)]
-        given = (self.node, self.plant, self.time, self.sequence)
-        named = [part.path for part in given if isinstance(part, Field | Stamp | Count)]
-        return [*values, *named, *self.where, *self.valid]
+        values = [field for path in self.paths for field in ((path,) if isinstance(path, str) else path.parts)]
+        options = (self.node, self.plant, self.time, self.sequence)
+        fields_of_options = [option.path for option in options if isinstance(option, Field | Stamp | Count)]
+        return [*values, *fields_of_options, *self.where, *self.valid]
 
     def check_valid(self, message: object, where: str) -> None:
         """Raise ValueError unless all flags of a message say that it can be trusted.

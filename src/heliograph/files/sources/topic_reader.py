@@ -1,4 +1,4 @@
-"""Sources of data, read by a network: messages of topics to measurements of nodes and inputs of the plant."""
+"""Messages of topics, read by the sources of a network: measurements of nodes, and inputs of the plant."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -9,7 +9,6 @@ import numpy as np
 
 from heliograph.files.device_availability import DeviceStatuses
 from heliograph.files.sources.derived_values import Computed, ZeroIfAbsent
-from heliograph.files.sources.json_field import Field, Source
 from heliograph.files.sources.message_fields import (
     MissingFieldError,
     convert_count,
@@ -19,6 +18,7 @@ from heliograph.files.sources.message_fields import (
 )
 from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.files.sources.mixed_sender_detection import SenderCounter
+from heliograph.files.sources.source_description import Field, Source
 from heliograph.files.sources.topic_clocks import TopicClocks
 from heliograph.live.event import INPUTS
 from heliograph.model.checks.refusal_reasons import RefusedError
@@ -42,8 +42,8 @@ class MappedSource(NamedTuple):
     places: dict[str, np.ndarray]
 
 
-class Sources:
-    """Sources checked against a network: messages of a topic to readings; unknown topics are counted, never guessed.
+class TopicReader:
+    """Reads messages of topics by the sources of a network, as readings of nodes; unknown topics are counted.
 
     Args:
         table: sources by topic, as in a network's file.
@@ -135,8 +135,10 @@ class Sources:
             fields = self._fields_of_topic.setdefault(topic, set())
             for source, *_ in self.of(topic):
                 names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
-                paths = [part for path in source.paths for part in ((path,) if isinstance(path, str) else path.parts)]
-                fields |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
+                values = [
+                    field for path in source.paths for field in ((path,) if isinstance(path, str) else path.parts)
+                ]
+                fields |= {path.split(".")[0] for path in (*names, *values, *source.where)}
         return self._fields_of_topic[topic]
 
     def of(self, topic: str) -> list[MappedSource]:
@@ -380,11 +382,11 @@ def _describe_rest(count: int) -> str:
 def _read_value(message: object, path: str | Computed, where: str, quoted: bool) -> float:
     """Return the number at a path, or what is computed of several; NaN if none arrived; `quoted`: it may be text."""
     if isinstance(path, ZeroIfAbsent):  # a field that senders leave out where it is 0
-        within, _, name = path.path.rpartition(".")
-        whole = field_at(message, within, where)
-        return 0.0 if isinstance(whole, Mapping) and name not in whole else _read_value(whole, name, where, quoted)
+        path_of_parent, _, name = path.path.rpartition(".")
+        parent = field_at(message, path_of_parent, where)
+        return 0.0 if isinstance(parent, Mapping) and name not in parent else _read_value(parent, name, where, quoted)
     if not isinstance(path, str):
-        return float(path.of(*(_read_value(message, part, where, quoted) for part in path.parts)))
+        return float(path.of(*(_read_value(message, field, where, quoted) for field in path.parts)))
     value = field_at(message, path, where)
     if type(value) is float:  # names its place only where there may be something to say
         return value if np.isfinite(value) else np.nan

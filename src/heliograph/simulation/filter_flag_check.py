@@ -15,7 +15,7 @@ from heliograph.random_affine.modes import ModeOutput, OneStepLate
 NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 
 
-def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
+def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
     """Raise ValueError unless the flags that these channels deliver are those of the filter's model.
 
     With others the filter's claim would be wrong.
