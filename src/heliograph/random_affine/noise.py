@@ -217,7 +217,8 @@ class FiniteSupport(AbstractNoise):
         self.probabilities = check.probabilities("noise probabilities", probabilities, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
         centred = self.atoms - self.mean
-        self.covariance = centred.T @ (self.probabilities[:, None] * centred)
+        weighted = self.probabilities[:, None] * centred
+        self.covariance = centred.T @ weighted
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return the values, each without a spread about it."""

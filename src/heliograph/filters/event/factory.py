@@ -155,7 +155,8 @@ def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
     0.
     """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
-    size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
+    size = np.abs(gain)
+    size = size[..., :, None, :, None] * size[..., None, :, None, :]
     size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
     return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * size, 0.0, spread)
 
