@@ -82,8 +82,10 @@ class ReceivedNoise(Module):
         gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
         signal = (self.output @ sensed)[:, None]
         least = power * self.variance + self.late_variance
-        spread, both = power - gain**2, mean + 2 * signal
-        variance = least + spread * mean * both
+        square_of_mean, twice = gain**2, 2 * signal
+        spread, both = power - square_of_mean, mean + twice
+        by_spread = spread * mean * both
+        variance = least + by_spread
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),
             mean=jnp.asarray(gain * mean + self.late_mean),

@@ -311,7 +311,8 @@ def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta:
     beyond = max(size - cells_of_delta - 1, 0)  # measured cells that have any such value above them, or below
     sums = np.cumsum(f, axis=1)
     far = np.zeros_like(f)
-    far[:, :beyond] = sums[:, -1:] - sums[:, size - beyond - 1 : -1]
+    above = sums[:, -1:] - sums[:, size - beyond - 1 : -1]
+    far[:, :beyond] = above
     far[:, size - beyond :] += sums[:, :beyond]
     return np.asarray(far * noise)
 

@@ -127,5 +127,6 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         mean = moments.mean
         second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
-        noise = Gaussian(second - offset[:, None] * offset, offset)
+        square_of_mean = offset[:, None] * offset
+        noise = Gaussian(second - square_of_mean, offset)
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)

@@ -250,7 +250,8 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
     The spread (m, m, p + 1, p + 1): the covariance of the entries of (G, n), z = G y + n, at [i, j, a, b].
     """
     random = ~channel.known_gains
-    varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
+    gain_varies = np.ones((len(random), channel.inputs)) * random[:, None]
+    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)
     cleaned: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return cleaned
 
@@ -272,7 +273,9 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
         moments = second_order(affine)
         low, high = affine.moment_interval(1)
         xp = library(low, high, mean)
-        reaches.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
+        nominal = mean[start:stop]
+        to_high, to_low = high[:-1] - nominal, low[:-1] - nominal
+        reaches.append(xp.maximum(xp.abs(to_high), xp.abs(to_low)))
         blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
     part_of_output = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
