@@ -217,8 +217,7 @@ class FiniteSupport(AbstractNoise):
         self.probabilities = check.probabilities("noise probabilities", probabilities, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
         centred = self.atoms - self.mean
-        weighted = self.probabilities[:, None] * centred
-        self.covariance = centred.T @ weighted
+        self.covariance = centred.T @ (self.probabilities[:, None] * centred)
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return the values, each without a spread about it."""

@@ -250,8 +250,7 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
     The spread (m, m, p + 1, p + 1): the covariance of the entries of (G, n), z = G y + n, at [i, j, a, b].
     """
     random = ~channel.known_gains
-    gain_varies = np.ones((len(random), channel.inputs)) * random[:, None]
-    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)
+    varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
     cleaned: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return cleaned
 
@@ -273,8 +272,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
         moments = second_order(affine)
         low, high = affine.moment_interval(1)
         xp = library(low, high, mean)
-        nominal = mean[start:stop]
-        to_high, to_low = high[:-1] - nominal, low[:-1] - nominal
+        to_high, to_low = high[:-1] - mean[start:stop], low[:-1] - mean[start:stop]
         reaches.append(xp.maximum(xp.abs(to_high), xp.abs(to_low)))
         blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
