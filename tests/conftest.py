@@ -73,12 +73,15 @@ LONG = (
 )
 
 
-@pytest.hookimpl(trylast=True)
+@pytest.hookimpl(wrapper=True)
 def pytest_collection_modifyitems(config, items):
     """Files that take long come first, so that no worker has one left when the other has none."""
+    draw_no_constants_of_source()
+    result = yield
     if hasattr(config, "workerinput"):  # each in the same order, whichever it collected in
         items.sort(key=lambda item: item.path)
     items.sort(key=lambda item: not item.nodeid.startswith(LONG))
+    return result
 
 
 @pytest.hookimpl(wrapper=True)
@@ -89,6 +92,18 @@ def pytest_make_collect_report(collector):
     if isinstance(collector, pytest.Directory) and int(worker.removeprefix("gw")) % 2:
         report.result.reverse()
     return report
+
+
+def draw_no_constants_of_source():
+    """Let hypothesis draw none of the numbers that stand in the sources: an example in twenty has one.
+
+    It parses all modules that are imported, 780 after collecting, for which a fresh clone takes 2 s a process; and what
+    it draws would depend on which they are.
+    """
+    from hypothesis.internal.conjecture import providers
+
+    if hasattr(providers, "_get_local_constants"):  # not in every release
+        providers._get_local_constants = lambda: providers._local_constants  # none so far
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -71,8 +71,8 @@ def innovation_of_mean_covariance(
     """
     # About the first one, so that equal values, however large, leave no rounding to be squared.
     difference = value - value[0]
-    mean = value[0] + weight @ difference
-    deviation = difference - weight @ difference
+    mean_difference = weight @ difference
+    mean, deviation = value[0] + mean_difference, difference - mean_difference
     covariance = within + jnp.einsum("a,ai,aj->ij", weight, deviation, deviation)
     none_arrived = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
     return Innovation(mean, covariance, jnp.where(none_arrived, 0.0, density))

@@ -83,8 +83,10 @@ class ReceivedNoise(Module):
         gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
         signal = (self.output @ sensor_mean)[:, None]
         without_spread = power * self.variance + self.late_variance
-        spread, mean_and_signal = power - gain**2, mean + 2 * signal
-        variance = without_spread + spread * mean * mean_and_signal
+        squared_gain, twice_signal = gain**2, 2 * signal
+        gain_variance, mean_and_signal = power - squared_gain, mean + twice_signal
+        by_spread = gain_variance * mean * mean_and_signal
+        variance = without_spread + by_spread
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),
             mean=jnp.asarray(gain * mean + self.late_mean),

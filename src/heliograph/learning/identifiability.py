@@ -293,10 +293,13 @@ def describe_identified_links(solution: "Solution") -> list[str]:
         _, sensor, channel = join_all_nodes(description.at(description.parameters.values(x)))
         return _compute_link_moments(first(sensor), first(channel))
 
-    with jax.enable_x64(True):
-        x = jnp.asarray(solution.x)
-        moments = np.asarray(compute_moments_at(x))  # (outputs, 3)
-        slopes = np.asarray(jax.jacfwd(compute_moments_at)(x))[:, :, solution.active]  # (outputs, 3, active)
+    def differentiate_moments(x: Array) -> tuple[jax.Array, jax.Array]:
+        """Return these moments, and their derivatives by x (outputs, 3, p)."""
+        return compute_moments_at(x), jax.jacfwd(compute_moments_at)(x)
+
+    with jax.enable_x64(True):  # compiled: operation by operation the compiler is called two hundred times
+        moments, slopes = map(np.asarray, quickly_compiled(differentiate_moments)(jnp.asarray(solution.x)))
+    slopes = slopes[:, :, solution.active]
     # Intervals of what is identified: a function with the derivatives g has the variance g' C g.
     covariance, freedom = solution.covariance()
     names = sensor.outputs if len(sensor.outputs) == len(moments) else [f"z{i}" for i in range(len(moments))]

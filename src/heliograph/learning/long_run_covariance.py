@@ -103,7 +103,8 @@ def estimate_by_bartlett(scores: Scores) -> LongRunCovariance:
     for s in scores:
         lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
         products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
-        covariances.append(products[0] + sum(product + product.T for product in products[1:]))
+        both_ways = [product + product.T for product in products[1:]]
+        covariances.append(products[0] + sum(both_ways))
     return LongRunCovariance(np.sum(covariances, axis=0), freedom=np.inf)
 
 

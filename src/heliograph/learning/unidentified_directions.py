@@ -80,8 +80,9 @@ def find_confounded(
     for x, rank in zip(points, ranks, strict=True):
         if rank.flat.shape[1] == fewest:
             slopes, log_slopes = _differentiate_coordinates(parameters, x)
-            of_logs.append(_orthonormalise(log_slopes[:, None] * rank.unit[:, None] * rank.flat))
-            of_numbers.append(_orthonormalise(slopes[:, None] * rank.unit[:, None] * rank.flat))
+            flat = rank.unit[:, None] * rank.flat
+            of_logs.append(_orthonormalise(log_slopes[:, None] * flat))
+            of_numbers.append(_orthonormalise(slopes[:, None] * flat))
     return [_make_confounded_numbers(group, of_logs, of_numbers) for group in _group_connected_coordinates(of_logs)]
 
 

@@ -316,7 +316,8 @@ def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta:
     mass_up_to = np.cumsum(f, axis=1)  # [i, j] = P(x in cell i, last sent in cell j or below)
     # [i, z] = P(x in cell i, last sent more than delta from cell z): above it, then below.
     mass_beyond_delta = np.zeros_like(f)
-    mass_beyond_delta[:, :count] = mass_up_to[:, -1:] - mass_up_to[:, size - count - 1 : -1]
+    mass_above = mass_up_to[:, -1:] - mass_up_to[:, size - count - 1 : -1]
+    mass_beyond_delta[:, :count] = mass_above
     mass_beyond_delta[:, size - count :] += mass_up_to[:, :count]
     return np.asarray(mass_beyond_delta * noise)
 

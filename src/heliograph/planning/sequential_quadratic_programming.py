@@ -78,7 +78,8 @@ class ScaledProgramme:
         `size`: the objective at the start, by which it is divided, so that it is about 1.
         """
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
-        self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
+        low, high = problem.low / problem.unit, problem.high / problem.unit
+        self.bounds = Bounds(low, high)
         self._last: tuple[bytes, Evaluation | None] = (b"", None)
         self.size = 1.0
         value = self.objective(start / problem.unit)[0]

@@ -133,5 +133,6 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         noise_products = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
         second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
-        noise = Gaussian(second_moment - offset[:, None] * offset, offset)
+        square_of_mean = offset[:, None] * offset
+        noise = Gaussian(second_moment - square_of_mean, offset)
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)

@@ -208,7 +208,8 @@ class Faded(AbstractHop, AbstractModal):
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
         """Return the map with the gain mean + deviation c."""
-        gain = self.mean + self.deviation * state
+        drift = self.deviation * state
+        gain = self.mean + drift
         return GainAndNoise(Constant(gain), self.matrix, self.noise)
 
 

@@ -99,7 +99,9 @@ def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     # The next power of two, times four: the zeros behind the data make the frequencies of the spectrum close.
     size = 4 * 2 ** int(np.ceil(np.log2(len(arrived))))
     spectrum = np.abs(np.fft.rfft(arrived - np.mean(arrived), size))
-    is_peak = (spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])  # without the first and the last
+    inner = spectrum[1:-1]  # without the first and the last
+    has_risen, will_fall = inner >= spectrum[:-2], inner > spectrum[2:]
+    is_peak = has_risen & will_fall
     peaks = 1 + np.flatnonzero(is_peak)
     largest_first = peaks[np.argsort(spectrum[peaks])[::-1]]
     frequencies = [1 / float(np.median(intervals)), 1 / float(np.mean(intervals))]

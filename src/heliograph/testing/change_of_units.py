@@ -201,7 +201,8 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
     """
     if plant.deviation is None:
         return s * plant.initial_mean, np.outer(s, s) * plant.initial_covariance
-    return s * (plant.initial_mean - plant.deviation.mean), _rescale_noise(plant.deviation, s)
+    center = plant.initial_mean - plant.deviation.mean
+    return s * center, _rescale_noise(plant.deviation, s)
 
 
 def _rescale_matrix(

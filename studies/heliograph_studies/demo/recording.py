@@ -49,7 +49,8 @@ class PlazaRecording:
         """Where the mower was, (time, 2) in metres, at seconds after the start."""
         known = np.concatenate([[0.0], self.time - self.start])
         path = np.concatenate([self.start_pose[None, :2], self.truth[:, :2]])
-        return np.column_stack([np.interp(time, known, path[:, i]) for i in range(2)])
+        x, y = (np.interp(time, known, path[:, i]) for i in range(2))
+        return np.column_stack([x, y])
 
     def distances(self) -> np.ndarray:
         """True distance to each beacon, (rows, 4) m."""

@@ -46,7 +46,8 @@ def errors_over_time(through: Through, stretch: slice) -> Figure:
     curves = []
     for name in SHOWN:
         shown = through.shown[name]
-        at = np.column_stack([np.interp(through.time, shown.time, shown.mean[:, i]) for i in range(2)])
+        x, y = (np.interp(through.time, shown.time, shown.mean[:, i]) for i in range(2))
+        at = np.column_stack([x, y])
         error = np.where(through.time <= shown.time[-1], np.linalg.norm(at - through.truth, axis=1), np.nan)
         curves.append(Curve(*ROWS[name], error[stretch]))
     return curves_over_time(through.time[stretch], [Panel("position error (m)", curves)], "time (s)")

@@ -155,7 +155,8 @@ def _node(node: int, duration: float, generator: np.random.Generator) -> tuple[n
     begin = LOST * (1 - LOST_AFTER_LOST) / (1 - LOST)  # of a loss after none, so that LOST of all are lost
     lost = np.zeros(count, dtype=bool)
     for k, chance in enumerate(generator.random(count)):
-        lost[k] = chance < (LOST if k == 0 else LOST_AFTER_LOST if lost[k - 1] else begin)
+        risk = LOST if k == 0 else LOST_AFTER_LOST if lost[k - 1] else begin
+        lost[k] = chance < risk
     delay = np.exp(np.interp(generator.random(count), SHARES, np.log(DELAYS)))
     received = ~lost
     return np.full(received.sum(), node), np.flatnonzero(received), sent[received], (sent + delay)[received]

@@ -71,7 +71,8 @@ def losses(drive: Drive) -> Loss:
 def power(drive: Drive) -> Power:
     """The fading law of a drive's received power, by `fit`, over the reference's distances."""
     time, ranges, _ = slots(drive)
-    place = np.column_stack([np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1)])
+    x, y = (np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1))
+    place = np.column_stack([x, y])
     # Distances of the true places, and the power of each range beside them.
     apart = np.column_stack([place, np.full(len(place), HEIGHT)])[:, None] - drive.places
     distance = np.linalg.norm(apart, axis=2)

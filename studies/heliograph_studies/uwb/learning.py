@@ -156,7 +156,8 @@ def padded(drives: Sequence[Drive]) -> Padded:
 
 def true_places(drive: Drive, time: np.ndarray) -> np.ndarray:
     """The reference at these times, (times, 2)."""
-    return np.column_stack([np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1)])
+    x, y = (np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1))
+    return np.column_stack([x, y])
 
 
 def density(drive: Drive, late: float, place: np.ndarray, covariance: np.ndarray) -> float:

@@ -153,7 +153,8 @@ def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
     with a last row and column of zeros for n.
     """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
-    squared_gain = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
+    size = np.abs(gain)
+    squared_gain = size[..., :, None, :, None] * size[..., None, :, None, :]
     leading_axes = squared_gain.ndim - 2
     squared_gain = np.pad(squared_gain, [(0, 0)] * leading_axes + [(0, 1)] * 2)
     return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * squared_gain, 0.0, spread)

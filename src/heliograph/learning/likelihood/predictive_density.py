@@ -236,7 +236,8 @@ def _score_stack_parts(
         of_part = logsumexp(log_weight[..., -1], axis=1)
         log_density += of_part
         if i + 1 < len(parts):
-            posterior = np.exp(log_weight[..., -1] - of_part[:, None])
+            log_posterior = log_weight[..., -1] - of_part[:, None]
+            posterior = np.exp(log_posterior)
             y, spread = _correct_signal(y, spread, z[:, start:stop], law, posterior)
         start = stop
     return log_density, np.stack(transforms, axis=1)

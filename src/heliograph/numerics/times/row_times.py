@@ -149,7 +149,8 @@ def _is_date_label(label: object) -> bool:
 
 def find_backwards_row(clock: np.ndarray) -> int | None:
     """Return the first row whose time is before that of the row above, None if there is none."""
-    falls = np.flatnonzero(clock[1:] < clock[:-1])
+    is_lower = clock[1:] < clock[:-1]
+    falls = np.flatnonzero(is_lower)
     return int(falls[0]) + 1 if falls.size else None
 
 

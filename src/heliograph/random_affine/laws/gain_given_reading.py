@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
 
@@ -79,6 +80,7 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
     )
 
 
+@compile_in_float64
 def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the mean and variance of a positive gain g given a reading a = g + e, e of N(0, variance).
 

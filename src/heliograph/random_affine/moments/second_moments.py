@@ -272,7 +272,8 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
         moments = second_order(affine)
         low, high = affine.moment_interval(1)
         xp = library(low, high, mean)
-        reaches.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
+        to_high, to_low = high[:-1] - mean[start:stop], low[:-1] - mean[start:stop]
+        reaches.append(xp.maximum(xp.abs(to_high), xp.abs(to_low)))
         blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
     part_of_output = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])

@@ -99,7 +99,8 @@ def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
     # Judged in units in which N_max has ones on its diagonal, so that the tolerance is relative.
     unit = xp.sqrt(xp.diagonal(largest))
     unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
-    eigenvalues = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
+    units = unit[:, None] * unit
+    eigenvalues = xp.linalg.eigvalsh(stop_gradient(largest - noises) / units)
     is_above_all = xp.min(eigenvalues, initial=0.0) >= -PROPORTIONAL_TOLERANCE
     return largest, is_above_all
 
