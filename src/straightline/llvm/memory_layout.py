@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
-from straightline.llvm.function_writer import count_turns, list_loops_around
 from straightline.llvm.operations import BITS
 from straightline.nodes import REAL, Buffer, Node, Unsupported
 from straightline.program import Program, SummedOutputs, find_differing_items, list_used_nodes
@@ -134,7 +133,7 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
     own = [b for b in owners if b in parts.spread and b not in added and b not in used_in_place]
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
-    turning = {b for b in common if list_loops_around(b.block)}
+    turning = {b for b in common if b.block.list_loops()}
     turning &= _find_read_buffers(mine) if turning else turning
     scratch, in_scratch = _place_buffers(own, parts.width)
     shared, in_shared = _place_buffers(common, 1, turning)
@@ -167,7 +166,7 @@ def _place_buffers(
     start, places = 0, dict[Buffer, int]()
     for buffer in buffers:
         places[buffer] = start
-        copies = count_turns(buffer.block) if buffer in turning else 1
+        copies = buffer.block.count_turns() if buffer in turning else 1
         # Up to the next cache line: -(-a // b) is a / b rounded up.
         start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
     return start, places
