@@ -64,6 +64,7 @@ def pytest_unconfigure(config):
 
 
 LONG = (
+    "tests/straightline/conformance/",
     "tests/studies/",
     "tests/test_docs.py",
     "tests/test_random_programs.py",

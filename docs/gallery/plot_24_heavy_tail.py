@@ -32,7 +32,7 @@ filters = {
     "7 points a direction": hg.filters.gaussian_filter(*model, hg.filters.PolynomialMoments(6)),
 }
 network = hg.Network(target, {"station": hg.Node(station, model[2], filters)})
-record = hg.monte_carlo(network, 80, runs=1000, key=0)
+record = hg.monte_carlo(network, 80, runs=400, key=0)
 
 closest = np.hypot(record.truth[..., 0], record.truth[..., 1]).min(axis=1)
 tenths = np.array_split(np.argsort(closest), 10)  # of the runs, closest pass first

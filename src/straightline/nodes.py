@@ -102,6 +102,14 @@ class Block:
             yield block
             block = block.parent
 
+    def list_loops(self) -> list["Loop"]:
+        """Return the loops around the block's nodes, innermost first."""
+        return [b.owner for b in self.list_enclosing_blocks() if isinstance(b.owner, Loop)]
+
+    def count_turns(self) -> int:
+        """Return how many turns these loops make together; of unknown length one."""
+        return math.prod(loop.length or 1 for loop in self.list_loops())
+
 
 class Buffer:
     """Numbers in memory, `size` of each run; a table has the same numbers in all runs.

@@ -13,6 +13,11 @@ def divide_rounded_up(a: int, b: int) -> int:
 # Operations of a program, and of half of those made while it is folded: of 120,000 LLVM takes half as long as XLA, 0.1
 # ms each; a refusal comes after some 4 s.
 LONGEST = 200_000
+# Lines of a basic block, where nothing jumps: in haste LLVM takes longer for each the more they are. Without a limit
+# the least of 20 numbers, of 220 arrays in one program (55,000 lines), took it 3.7 s; in blocks of 300, 500, 1,000 and
+# 3,000 lines 0.46 to 0.62. A filter with branches (21,000 lines) took 0.38, then 0.31 to 0.37. With care it takes as
+# long, and so does the code that it makes.
+LONGEST_BASIC_BLOCK = LONGEST // 400
 # Executions of each operation after which care pays: it takes LLVM 20 to 90 us an operation more, and saves 0.03 to 0.3
 # ns for a block of runs. Of thirteen filters of 180 to 42,000 operations, it pays after 160,000 to 1,600,000.
 OFTEN = 200_000

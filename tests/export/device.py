@@ -39,11 +39,16 @@ class Device:
         subprocess.run(command, cwd=folder, check=True)
         self.library, self.name = ctypes.CDLL(str(library)), name
         self.real = ctypes.c_double if precision == "double" else ctypes.c_float
-        self.state = np.full(self.exported.state_bytes // 4, -1, dtype=np.int32)
         self.size = len(filter_.states)
         for part in ("mean", "covariance"):
             self._function(part).restype = ctypes.POINTER(self.real)
-        self._function("start" if window is None else "window_start")(self._pointer(self.state))
+        self.begin = self._function("start" if window is None else "window_start")
+        self.start()
+
+    def start(self) -> None:
+        """Begin, or begin again, in memory that held anything before."""
+        self.state = np.full(self.exported.state_bytes // 4, -1, dtype=np.int32)
+        self.begin(self._pointer(self.state))
 
     def step(self, z, u=()) -> int:
         """Advance; 0 unless refused."""

@@ -1,5 +1,7 @@
 """Every number that a device can be given, among good ones: what is refused leaves the state as it was, bit for bit."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,21 @@ FILTERS = {
 BENT = ("cubature", "extended")
 
 
+@pytest.fixture(scope="module")
+def started(tmp_path_factory):
+    """Called with the name of a filter and a precision, returns its device at the start; each is compiled once."""
+
+    @cache
+    def compiled(name, precision):
+        return Device(FILTERS[name], tmp_path_factory.mktemp("device"), precision=precision)
+
+    def start(name, precision):
+        compiled(name, precision).start()
+        return compiled(name, precision)
+
+    return start
+
+
 def drawn(random, size, usual):
     """Numbers of which one in ten is absurd, of either sign."""
     absurd = random.choice(ABSURD, size=size) * random.choice([-1.0, 1.0], size=size)
@@ -35,9 +52,9 @@ def drawn(random, size, usual):
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)
-def test_no_number_spoils_a_device(name, precision, tmp_path):
+def test_no_number_spoils_a_device(name, precision, started):
     """Whatever comes, the estimate is a number, and what is refused changes nothing."""
-    device, random = Device(FILTERS[name], tmp_path, precision=precision), np.random.default_rng(7)
+    device, random = started(name, precision), np.random.default_rng(7)
     received, refused = FILTERS[name].received, 0
     with np.errstate(over="ignore"):  # an absurd double is an infinite float
         for _ in range(STEPS):
@@ -55,10 +72,10 @@ def test_no_number_spoils_a_device(name, precision, tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)
-def test_after_absurd_measurements_a_device_follows_the_plant(name, precision, tmp_path):
+def test_after_absurd_measurements_a_device_follows_the_plant(name, precision, started):
     """Every tenth number is replaced by one beyond the bound of 1e6 deviations: it is refused, and nothing else."""
     filter_, random = FILTERS[name], np.random.default_rng(7)
-    device, plant, x = Device(filter_, tmp_path, precision=precision), filter_.plant, np.array([1.3, 1.8])
+    device, plant, x = started(name, precision), filter_.plant, np.array([1.3, 1.8])
     noise, output = (
         np.sqrt(0.02) * (plant is LINE),
         BEARING.function if name in BENT else np.asarray(BOTH.matrix).__matmul__,

@@ -3,7 +3,6 @@
 What the second computes is in memory between them, in `SharedSlots`.
 """
 
-import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -21,6 +20,7 @@ from straightline.llvm.prefetch import PrefetchedRows, write_prefetch_requests
 from straightline.llvm.vector_types_and_gathers import WIDTH, gather_name
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
 from straightline.program import find_fused_product
+from straightline.size_limits import LONGEST_BASIC_BLOCK
 
 Scope = dict[Any, str]
 
@@ -38,7 +38,7 @@ class SharedSlots:
         """Return the offset of a shared number in bytes, assigned at its first use: 8 for each turn of its loops."""
         if node not in self.places:
             self.places[node] = self.size
-            self.size += 8 * count_turns(node.block)
+            self.size += 8 * node.block.count_turns()
         return self.places[node]
 
     def load(self, writer: "FunctionWriter", node: Node) -> str:
@@ -61,16 +61,6 @@ class SharedSlots:
         return writer.write_address_of_turn(start, node.block, 8)
 
 
-def list_loops_around(block: Block) -> list[Loop]:
-    """Return the loops around a block's nodes, innermost first."""
-    return [b.owner for b in block.list_enclosing_blocks() if isinstance(b.owner, Loop)]
-
-
-def count_turns(block: Block) -> int:
-    """Return how many turns the loops around a block's nodes make together; of unknown length one."""
-    return math.prod(loop.length or 1 for loop in list_loops_around(block))
-
-
 class FunctionWriter:
     """Writer of one of a program's two functions: of those of its operations that are in the set `mine`.
 
@@ -87,7 +77,7 @@ class FunctionWriter:
         self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
-        self.label = "entry"  # of LLVM's block that is being written
+        self.label, self.first_line = "entry", 0  # of LLVM's basic block that is being written
         self.count = 0  # of names made so far, which are %1, %2, ...
         self.called: set[str] = set()  # functions that must be declared
         self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
@@ -113,13 +103,15 @@ class FunctionWriter:
     def start_basic_block(self, label: str) -> None:
         """Begin a basic block."""
         self.lines.append(f"{label}:")
-        self.label = label
+        self.label, self.first_line = label, len(self.lines)
 
     def write_block(self, block: Block) -> None:
         """Write the operations and statements of a block that this function computes (`self.mine`), in order."""
         for statement in block.items:
             if statement not in self.mine:
                 continue
+            if len(self.lines) - self.first_line > LONGEST_BASIC_BLOCK:
+                self._go_on_in_new_basic_block()
             if isinstance(statement, Node):
                 if statement not in self.products:  # those are written with the sum that they are fused with
                     self._note_name(statement, self._write_node(statement))
@@ -129,6 +121,12 @@ class FunctionWriter:
                 self._write_loop(statement)
             elif isinstance(statement, Guard):
                 self._write_guard(statement)
+
+    def _go_on_in_new_basic_block(self) -> None:
+        """End the basic block, and begin one that nothing else jumps to."""
+        self.count += 1
+        self.line(f"br label %next{self.count}")
+        self.start_basic_block(f"next{self.count}")
 
     def _note_name(self, node: Node, name: str) -> None:
         """Note the LLVM name of a node's value; in the function of what runs share, store it if the other loads it."""
@@ -222,7 +220,7 @@ class FunctionWriter:
     def write_address_of_turn(self, start: str, block: Block, bytes_: int) -> str:
         """Return the address from `start` on for this turn of the loops around a block, so many bytes for each turn."""
         index = ""
-        for loop in list_loops_around(block):
+        for loop in block.list_loops():
             assert loop.counter is not None
             step = self.add(f"mul i64 {self.write_scalar(loop.counter)}, {bytes_}")
             index = self.add(f"add i64 {index}, {step}") if index else step

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
-from straightline.llvm.function_writer import count_turns, list_loops_around
 from straightline.llvm.operations import BITS
 from straightline.nodes import REAL, Buffer, Node, Unsupported
 from straightline.program import Program, SummedOutputs, find_differing_items, list_used_nodes
@@ -135,7 +134,7 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
     differing = [b for b in owners if b in parts.spread and b not in sums and b not in used_in_place]
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
-    turning = {b for b in common if list_loops_around(b.block)}  # filled anew in each turn of a loop
+    turning = {b for b in common if b.block.list_loops()}  # filled anew in each turn of a loop
     turning &= _find_read_buffers(mine) if turning else turning
     scratch, in_scratch = _place_buffers(differing, parts.width)
     shared, in_shared = _place_buffers(common, width=1, turning=turning)
@@ -168,7 +167,7 @@ def _place_buffers(
     start, places = 0, dict[Buffer, int]()
     for buffer in buffers:
         places[buffer] = start
-        copies = count_turns(buffer.block) if buffer in turning else 1
+        copies = buffer.block.count_turns() if buffer in turning else 1
         bits = buffer.size * copies * width * BITS[buffer.type]
         start += divide_rounded_up(bits, 8 * LINE) * LINE  # up to the next cache line
     return start, places

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from straightline.constant_folding import DTYPES
-from straightline.llvm.function_writer import FunctionWriter, SharedSlots, count_turns
+from straightline.llvm.function_writer import FunctionWriter, SharedSlots
 from straightline.llvm.memory_layout import (
     FILLED,
     LINE,
@@ -223,7 +223,7 @@ def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[
     Helpers write the functions that the text calls: `others`, and those that the writer noted.
     """
     counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
-    turns = {block: count_turns(block) for block in counts}
+    turns = {block: block.count_turns() for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
     helpers: list[Callable[[int], str]] = [*others, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
