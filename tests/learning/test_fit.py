@@ -232,3 +232,19 @@ def test_a_plant_is_learned_from_its_true_states_where_nothing_arrived():
 
     found = hg.fit(build, {"node": np.full((200, 1), np.nan)}, truth=x, starts=1)
     assert abs(found.values["a"] - 0.8) < 0.12
+
+
+def test_a_list_of_rows_is_one_recording_and_not_one_of_each_row():
+    def build():
+        plant, sensor = hg.LinearPlant([[0.9]], hg.free(0.1), [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+        return hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})
+
+    z = np.random.default_rng(0).normal(size=(40, 1))
+    forms = z, z.tolist(), z[:, 0].tolist(), [z], {"a": z}
+    found = {hg.fit(build, form, starts=1).log_likelihood for form in forms}
+    assert len(found) == 1
+    halves = hg.fit(build, [z[:20, 0].tolist(), z[20:, 0].tolist()], starts=1)
+    assert halves.log_likelihood not in found
+    for seed in (-1, True, 1.5, "a"):
+        with pytest.raises(hg.InputError, match="seed: expected a whole number from 0"):
+            hg.learning.identifiable(build, horizon=20, seed=seed)

@@ -260,7 +260,7 @@ def fit(
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
-            one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
+            one node alone, an array or a list of its rows; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
         inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
             none).
         starts: number of starts: the given one, and others drawn around it (default 6).
@@ -277,18 +277,19 @@ def fit(
     """
     check_count("starts", starts)
     check_progress(progress, "a line of text")
+    seed = check_seed("seed", seed)
     description = describe(network)
     report = progress or (lambda line: None)
     recording, delays = _convert_event_tables(recording)
     if has_deciding_sender(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
-        sender = fit_sender(description, recording, inputs, starts, check_seed("seed", seed), report)
+        sender = fit_sender(description, recording, inputs, starts, seed, report)
         return replace(sender, delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # The likelihood over the free numbers in each form, where to begin, and what the data identify at all.
     surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
-    points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
+    points = _choose_starts(surfaces[0], starts, seed)
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)

@@ -91,6 +91,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     Raises:
         ValueError: as `fit`; numbers that messages tell, of which no law is known.
     """
+    seed = check_seed("seed", seed)
     description = describe(network)
     objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
@@ -100,7 +101,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     points = _draw_points_near(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
-        z = _draw_measurements(objective, x, u, check_seed("seed", seed) + i)
+        z = _draw_measurements(objective, x, u, seed + i)
         data = LikelihoodData(measurements=z[None], inputs=u[None], lengths=(len(z),))
         ranks.append(find_information_rank(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
     return _judge_identifiability(description.parameters, points, ranks)
