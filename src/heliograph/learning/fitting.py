@@ -259,9 +259,8 @@ def fit(
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
-        recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
-            one node alone, an array or a list of its rows; a `Recording`; a `Record` with all its runs; an
-            `EventTable`; or a list of these.
+        recording: what `hg.run` takes, measurements (steps, received) by node, or rows of the one node alone, NaN for
+            what did not arrive; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
         inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
             none).
         starts: number of starts: the given one, and others drawn around it (default 6).
@@ -372,10 +371,10 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
         expected = "numbers under which the recording is possible"
         raise fail("start of the fit", expected, f"a log-likelihood of {total} from step {step} on")
     # Others are drawn uniformly around it: logarithms and logits within SPREAD, real numbers within half their size or
-    # AWAY standard errors, whichever is more.
+    # AWAY standard errors, whichever is more; of one that is 0 and of which the data tell nothing there, within SPREAD.
     free, deviation = surface.domains.free, surface.standard_errors(start)
     far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
-    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free, far, SPREAD)
+    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD)
     points = surface.move_to_finite_likelihood(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
     _require_information_on_each_number(surface, points)
     return points

@@ -80,7 +80,7 @@ def _are_rows(network: Network, entries: object) -> bool:
         values = np.asarray(entries)
     except ValueError:  # of other lengths
         return False
-    if len(network.names) > 1 or values.dtype.kind not in "biuf":
+    if len(network.names) > 1 or not values.size or values.dtype.kind not in "biuf":
         return False
     return values.ndim == 1 or values.shape[1:] == (network.nodes[network.names[0]].received,)
 
