@@ -114,8 +114,8 @@ class Store:
     def _check_network(self, mine: Identity) -> None:
         """Raise ValueError, which names what differs, if the store's state is of another network than `mine`."""
         # Without the descriptions, whose numbers the other parts have as hashes.
-        both = [{name: part for name, part in one.items() if name != DESCRIPTION} for one in (mine, self.identity)]
-        if both[0] == both[1]:
+        here, there = ({key: part for key, part in one.items() if key != DESCRIPTION} for one in (mine, self.identity))
+        if here == there:
             return
         try:
             differs = list_changes(mine, self.identity)
@@ -125,7 +125,7 @@ class Store:
             more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
             got = f"one that differs: {'; '.join(differs[:LISTED])}{more}"
             raise fail(f"store {self.name}", "the state of what is here", got)
-        check_same_network(f"store {self.name}", *both)
+        check_same_network(f"store {self.name}", here, there)
 
     @contextmanager
     def _name_store_in_errors(self, expected: str) -> Iterator[None]:
@@ -165,7 +165,7 @@ class Store:
                 connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
                 return mine
         try:
-            return {LAYOUT_KEY: "1"} | json.loads(stored)  # the first layout did not name itself
+            return dict({LAYOUT_KEY: "1"} | json.loads(stored))  # the first layout did not name itself
         except (ValueError, TypeError):  # no JSON, or no table
             raise self._make_unreadable_error("no network that it is of") from None
 
