@@ -24,6 +24,7 @@ from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.filters.wrappers.sensor_inputs import FilterOfInputs
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.forecasting.forecast_result import Prediction
@@ -161,6 +162,8 @@ def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
     """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
     if isinstance(filter, LimitedFilter):
         return _expect(filter.base, filter.hold(prior), k)
+    if isinstance(filter, FilterOfInputs):
+        return _expect(filter.make_filter_under(prior.u, k), prior.base, k)
     if isinstance(filter, ToldFilter):  # part of z says which law of noise holds: zeros would say one
         return filter.expect(prior, k)
     _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
@@ -296,7 +299,9 @@ def find_received_claim(filter: AbstractFilter) -> Claim:
     ToldFilter: some of the numbers that arrive say the law of noise. What they will be is not known ahead; typical
     ones are put for them unless their own law is known.
     """
-    base = filter.base if isinstance(filter, LimitedFilter) else filter
+    base = filter
+    while isinstance(base, LimitedFilter | FilterOfInputs):
+        base = base.base
     if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
         return weakest([filter.claim, "nominal"])
     return filter.claim
