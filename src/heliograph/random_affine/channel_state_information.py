@@ -49,7 +49,7 @@ class AbstractFreshDraw(AbstractMemory):
             ValueError: always.
         """
         expected = "a filter that takes what a message tells, such as linear_filter or extended_filter"
-        raise fail("filter of a link whose gain or noise is told", expected, "one of joint modes")
+        raise fail("link whose gain or noise is told", expected, "what takes it for a mode that nobody is told")
 
 
 class FreshNumbers(AbstractFreshDraw):
