@@ -285,6 +285,47 @@ def test_dates_written_as_numbers_are_said(tmp_path, times, date):
     assert len(found) == (date is not None) and all(text.endswith(f"a date is written as {date}") for text in found)
 
 
+@pytest.mark.parametrize("times", [(1.7e9, 1.7e9 + 1, 1.7e12 + 2000), (1.7e12, 1.7e15 + 1e6), (1e8, 1.5e10)])
+def test_two_units_in_one_column_of_times_are_said(tmp_path, times):
+    """A clock that has counted for years does not count for a hundred times as long in one row."""
+    rows = [repr(int(time)) for time in times]
+    (tmp_path / "mixed.csv").write_text("time,y\n" + "".join(f"{time},1\n" for time in rows))
+    with pytest.warns(
+        UserWarning, match=rf"row {len(rows)}, column 'time': .* seconds and milliseconds, or such, in one"
+    ):
+        h.files.read_recording(tmp_path / "mixed.csv", WALK)
+    lines = [f"node,{i},{time},1\n" for i, time in enumerate(rows)]
+    (tmp_path / "events.csv").write_text("node,sequence,time,y\n" + "".join(lines))
+    drift = h.LinearPlant([[1.0]], 0.1, [0.0], 1.0, [[0.0]], inputs=["dt"])
+    network = h.Network(drift, {"node": h.Node(h.LinearSensor([[1.0]], 0.1, ["y"]), h.perfect(), {})})
+    notes = h.files.read_messages(tmp_path / "events.csv", network).notes
+    assert sum("seconds and milliseconds, or such, in one column" in note for note in notes) == 1
+
+
+@pytest.mark.parametrize("times", [(0.0, 1e-3, 1e6), (1.7e9, 1.8e9), (5.0, 1.7e9)])
+def test_one_unit_is_not_taken_for_two(tmp_path, times):
+    (tmp_path / "one.csv").write_text("time,y\n" + "".join(f"{time!r},1\n" for time in times))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        h.files.read_recording(tmp_path / "one.csv", WALK)
+
+
+def test_nanoseconds_keep_their_digits_also_with_a_point(tmp_path):
+    """As text with .0 they were doubles, 256 apart: steps of 100 were 0 and 256."""
+    times = [f"{1_700_000_000_000_000_123 + 100 * i}.0" for i in range(4)]
+    drift = h.LinearPlant([[1.0]], 0.1, [0.0], 1.0, [[0.0]], inputs=["dt"])
+    network = h.Network(drift, {"node": h.Node(h.LinearSensor([[1.0]], 0.1, ["y"]), h.perfect(), {})})
+    (tmp_path / "rows.csv").write_text("time,y\n" + "".join(f"{time},1\n" for time in times))
+    (tmp_path / "events.csv").write_text(
+        "node,sequence,time,y\n" + "".join(f"node,{i},{time},1\n" for i, time in enumerate(times))
+    )
+    for steps in (
+        h.files.read_recording(tmp_path / "rows.csv", network).inputs,
+        h.files.read_messages(tmp_path / "events.csv", network).recording().inputs,
+    ):
+        assert steps[:, 0].tolist() == [0, 100, 100, 100]
+
+
 def test_doubled_columns_are_refused_at_every_door(tmp_path):
     line = "expected distinct columns, got 'y' more than once"
     with pytest.raises(ValueError, match=line):

@@ -183,7 +183,7 @@ def test_modes_are_forecast_as_mixtures():
     low, high = states.interval(0.8)
     assert np.all(low < -7)
     assert np.all(high > 7)
-    weights, means, variances = states.weights[0], states.part_means[0, :, 0], states.part_variances[0, :, 0]
+    weights, means, variances = states.weights[0, :, 0], states.part_means[0, :, 0], states.part_variances[0, :, 0]
     mean = weights @ means
     assert states.covariance[0, 0, 0] == pytest.approx(weights @ (variances + (means - mean) ** 2), rel=1e-12)
     particles = hg.filters.particle_filter(plant, sensor, link, particles=50)

@@ -47,6 +47,18 @@ def test_limits_of_a_state_do_not_hide_that_its_gain_will_be_told():
     np.testing.assert_allclose(found.covariance[:, 0, 0], plain.covariance[:, 0, 0], rtol=1e-12)
 
 
+@pytest.mark.parametrize("build", [hg.linear_filter, hg.extended_filter])
+def test_inputs_of_a_sensor_do_not_hide_that_its_gain_will_be_told(build):
+    plant = hg.LinearPlant([[0.95]], 0.2, [5.0], 1.0, [[0.0]], inputs=["on"])
+    scaled = hg.LinearSensor(lambda u: u[0] * jnp.eye(1), 0.3, ["y0"], inputs=["on"])
+    link, rows, inputs = hg.hop(RAYLEIGH, 0.1, known=True), [[4.0, 0.9], [5.0, 1.1]], np.ones((2, 1))
+    found, plain = (
+        hg.forecast(build(plant, sensor, link).run(rows, inputs), 2, inputs).received for sensor in (scaled, SENSOR)
+    )
+    np.testing.assert_allclose(found.mean[:, 0], plain.mean[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(found.covariance[:, 0, 0], plain.covariance[:, 0, 0], rtol=1e-12)
+
+
 def test_a_variance_that_will_be_declared_has_its_law_or_is_typical():
     variances = {}
     for law in (hg.Discrete([1.0, 3.0], [0.25, 0.75]), None):

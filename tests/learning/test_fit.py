@@ -232,3 +232,44 @@ def test_a_plant_is_learned_from_its_true_states_where_nothing_arrived():
 
     found = hg.fit(build, {"node": np.full((200, 1), np.nan)}, truth=x, starts=1)
     assert abs(found.values["a"] - 0.8) < 0.12
+
+
+def test_a_list_of_rows_is_one_recording_and_not_one_of_each_row():
+    def build():
+        plant, sensor = hg.LinearPlant([[0.9]], hg.free(0.1), [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+        return hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})
+
+    z = np.random.default_rng(0).normal(size=(40, 1))
+    forms = z, z.tolist(), z[:, 0].tolist(), [z], {"a": z}
+    found = {hg.fit(build, form, starts=1).log_likelihood for form in forms}
+    assert len(found) == 1
+    halves = hg.fit(build, [z[:20, 0].tolist(), z[20:, 0].tolist()], starts=1)
+    assert halves.log_likelihood not in found
+    for seed in (-1, True, 1.5, "a"):
+        with pytest.raises(hg.InputError, match="seed: expected a whole number from 0"):
+            hg.learning.identifiable(build, horizon=20, seed=seed)
+
+
+SPREADS = {
+    "two gains that begin as one": lambda: hg.Discrete([hg.free(1.0, "a"), hg.free(1.0, "b")], [0.5, 0.5]),
+    "a deviation that begins as 0": lambda: hg.random_affine.GivenMoments([0.7, 0.49 + hg.free(0.0, "a") ** 2]),
+}
+NEARBY = {
+    "two gains that begin as one": lambda: hg.Discrete([hg.free(0.8, "a"), hg.free(1.1, "b")], [0.5, 0.5]),
+    "a deviation that begins as 0": lambda: hg.random_affine.GivenMoments([0.7, 0.49 + hg.free(0.2, "a") ** 2]),
+}
+
+
+@pytest.mark.parametrize("name", SPREADS)
+def test_a_gain_that_is_known_at_the_start_alone_is_learned_as_a_random_one(name):
+    rng = np.random.default_rng(0)
+    z = rng.choice([0.4, 1.0], 150) * (3 + 0.3 * rng.normal(size=150)) + 0.1 * rng.normal(size=150)
+
+    def build(law):
+        plant, sensor = hg.LinearPlant([[1.0]], 0.0, [3.0], 0.01), hg.LinearSensor([[1.0]], 0.09)
+        return hg.Network(plant, {"a": hg.Node(sensor, hg.hop(law(), 0.01), {})})
+
+    found, near = (hg.fit(lambda law=laws[name]: build(law), z, starts=3) for laws in (SPREADS, NEARBY))
+    assert [solution.form for solution in found.solutions] == ["linear", "conditional"]
+    assert found.log_likelihood == pytest.approx(near.log_likelihood, abs=1e-4)
+    assert "not identified" not in str(found)

@@ -48,11 +48,12 @@ def test_noise_as_a_function_of_what_is_declared():
 
 
 @pytest.mark.slow
-def test_before_data_it_is_known_that_messages_which_tell_their_gain_identify_the_noises():
+@pytest.mark.parametrize("limits", [{}, {"x0": (-9.0, None)}])
+def test_before_data_it_is_known_that_messages_which_tell_their_gain_identify_the_noises(limits):
     """What is told is drawn by its law: no number of the link is NaN for want of a message."""
 
     def behind_a_gain():
-        plant = hg.LinearPlant([[0.9]], hg.free(0.2, "plant noise"), [0.0], 1.0)
+        plant = hg.LinearPlant([[0.9]], hg.free(0.2, "plant noise"), [0.0], 1.0, limits=limits)
         link = hg.hop(hg.Rayleigh(0.8), hg.free(0.1, "link noise"), known=True)
         return hg.Network(plant, {"a": hg.Node(SENSOR, link, {"f": hg.linear_filter(plant, SENSOR, link)})})
 

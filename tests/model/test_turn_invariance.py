@@ -52,3 +52,13 @@ def test_what_a_turn_does_not_change_is_taken_anywhere():
         circular=["x0"],
     )
     assert plant.circular == ("x0",)
+
+
+def test_a_turn_is_tried_with_inputs_that_are_no_special_case():
+    """An angle times a whole number has whole turns more after a turn; times .6 it has not."""
+    with pytest.raises(ValueError, match=r"plant with circular states: .*a turn of state 0"):
+        hg.Plant(lambda x, u: u[0] * x, 0.01, [0.0], 1.0, inputs=["u"], circular=["x0"])
+    plant = hg.Plant(lambda x, u: x + u[0], 0.01, [0.0], 1.0, inputs=["u"], circular=["x0"])
+    scaled = hg.Sensor(lambda x, u: u[0] * x, 0.1, ["y0"], inputs=["u"], circular=["y0"])
+    with pytest.raises(ValueError, match="sensor of a plant with circular states"):
+        hg.cubature_filter(plant, scaled, hg.perfect())

@@ -161,3 +161,18 @@ def test_one_sensor_with_feedback_does_not_hide_that_another_grows():
     both = hg.power(hg.Network(plant, {"fed": fed, "plain": hg.Node(SENSOR, link, {})}), horizon=50)
     assert both.growth == pytest.approx(1.44, rel=1e-12) and "unstable" in both.words
     np.testing.assert_array_equal(both.over_time["fed.hop1"], alone.over_time["fed.hop1"])
+
+
+def test_what_messages_tell_of_a_link_changes_nothing_of_what_is_sent():
+    def sent(known, **horizon):
+        fading = hg.hop(hg.Rayleigh(0.8), 0.2, known=known)
+        return hg.power(network(hg.amplify_and_forward([fading, hg.hop(2.0, 0.1)])), **horizon).over_time
+
+    for horizon in ({}, {"horizon": 3}):
+        told, untold = sent(True, **horizon), sent(False, **horizon)
+        assert list(told) == ["node.hop1", "node.hop2"]
+        for name in told:
+            np.testing.assert_allclose(told[name], untold[name], rtol=1e-12)
+    declared = hg.model.told(lambda noise: hg.hop(1.0, noise * jnp.eye(1)), about=["variance"], typical=[2.0])
+    with pytest.raises(ValueError, match=r"power of a link .* told: expected a known law of what is told, got none"):
+        hg.power(network(declared))

@@ -155,6 +155,7 @@ def test_damage_is_one_line_with_what_to_do():
         ("update journal set process = 'other'", r"journal: expected .* damage in those up to number"),
         ("update numbers set value = value + 1 where name = 'journal'", "count 'journal': expected what was written"),
         ("update whose set value = substr(value, 2)", "damaged: no network that it is of"),
+        ("update whose set value = '[]'", "damaged: no network that it is of"),
         ("delete from whose", "damaged: no network that it is of"),
         ("drop table numbers", "damaged: no table numbers"),
     ],

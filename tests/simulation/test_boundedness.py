@@ -268,3 +268,10 @@ def test_a_link_that_delivers_late_is_refused_and_doubted():
 def test_a_network_in_which_nothing_is_measured_is_refused():
     with pytest.raises(ValueError, match="nodes: expected at least one that receives a sensor, got none"):
         hg.simulation.certify_boundedness(hg.Network(plant([[0.9]]), {"a": None}))
+
+
+def test_a_link_that_tells_its_gain_is_refused_in_words_that_fit():
+    plant, sensor = hg.LinearPlant([[1.1]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    link = hg.hop(hg.Rayleigh(0.8), 0.1, known=True)
+    with pytest.raises(ValueError, match="channel: expected one whose gain and noise no message tells"):
+        hg.simulation.certify_boundedness(hg.Network(plant, {"a": hg.Node(sensor, link, {})}))

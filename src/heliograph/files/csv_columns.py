@@ -16,7 +16,7 @@ from heliograph.numerics.times.dates import MISSING as NAT
 from heliograph.numerics.times.dates import looks_like_date, parse_moment
 from heliograph.numerics.types import Float
 
-WHOLE = re.compile(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}")  # numbers that 64 bits hold
+WHOLE = re.compile(r"([+-]?\d{1,18}|[+-]?[1-8]\d{18})(?:\.0*)?")  # numbers that 64 bits hold, also as 7.0
 
 
 def read_csv_blocks(
@@ -193,6 +193,8 @@ class CsvColumnReader:
             nanoseconds = [NAT if value != value else int(value) for value in values]
             return np.array(nanoseconds, dtype=np.int64).view("datetime64[ns]")
         numbers = np.array(values, dtype=np.float64)
-        if np.any(np.abs(numbers) >= EXACT) and all(map(WHOLE.fullmatch, cells)):
-            return np.array([int(cell) for cell in cells], dtype=np.int64)
+        if np.any(np.abs(numbers) >= EXACT):
+            found = [WHOLE.fullmatch(cell) for cell in cells]
+            if all(found):
+                return np.array([int(one[1]) for one in found if one], dtype=np.int64)
         return numbers

@@ -23,7 +23,7 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import read_compact_date, seconds_between
-from heliograph.numerics.times.row_times import backwards_text, find_backwards_row
+from heliograph.numerics.times.row_times import backwards_text, find_backwards_row, is_mix_of_units
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
@@ -256,6 +256,7 @@ def _make_inputs(
         raise fail(where, "a time that does not go backwards", backwards_text(time, row))
     _warn_of_equal_times(time, source)
     _warn_of_dates_as_numbers(time, source)
+    _warn_of_mixed_units(time, source, rows)
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
@@ -272,6 +273,21 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         warnings.warn(
             f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
             f"that lost their digits; {len(counts)} times in all",
+            stacklevel=7,
+        )
+
+
+def _warn_of_mixed_units(time: np.ndarray, source: str, rows: "RowsWithMissing") -> None:
+    """Warn where a clock that counts from long ago leaps a hundredfold in one row, as from seconds to milliseconds."""
+    if time.dtype.kind not in "fiu":
+        return
+    before, after = time[:-1].astype(float), time[1:].astype(float)
+    leaps = np.flatnonzero(is_mix_of_units(before, after))
+    if len(leaps):
+        row = int(leaps[0]) + 1
+        warnings.warn(
+            f"{source}, row {rows.numbers[row]}, column {TIME!r}: {time[row]:.14g} after {time[row - 1]:.14g}: "
+            "seconds and milliseconds, or such, in one column",
             stacklevel=7,
         )
 

@@ -56,6 +56,7 @@ class ReceivedNoise(Module):
     `share`, `mean`, `variance`: branches of the output's noise, before the gain; `late_mean`, `late_variance` what the
     last hop adds to each (m, branches). `output` (m, p) picks the output, `gain` is E[g] and `power` E[g^2] (m,).
     `center` and `covariance` (m, m): the same noise without outliers, as it arrives. `degrees` (m,): Student's.
+    `least_degrees` (m,): of all Student's noises in it, infinite without one. Of at most two there is no variance.
     """
 
     log_share: Matrix
@@ -69,6 +70,7 @@ class ReceivedNoise(Module):
     center: Vector
     covariance: Float[jax.Array | np.ndarray, "m m"]
     degrees: Vector
+    least_degrees: Vector
 
     def find_branches(self, sensor_mean: jax.Array) -> NoiseBranches:
         """Return mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensor_mean` (p,).
@@ -159,6 +161,7 @@ def describe_outlier_noise(
         log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,
         output=np.eye(p)[source], gain=plain.mean_gain[rows, source], power=squares[rows, source],
         center=center, covariance=covariance, degrees=_student_degrees(sensed, late)[source],
+        least_degrees=_find_least_degrees(sensed, late, source),
     )  # fmt: skip
 
 
@@ -230,6 +233,18 @@ def _pair_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Ar
     log_share = repeat(sensed.log_share, axis=2) + repeat(late.log_share, axis=1)
     sensed_moments = repeat(sensed.mean, axis=2), repeat(sensed.variance, axis=2)
     return log_share, *sensed_moments, repeat(late.mean, axis=1), repeat(late.variance, axis=1)
+
+
+def _find_least_degrees(sensed: AbstractNoise, late: AbstractNoise | None, source: np.ndarray) -> Vector:
+    """Return the least degrees of freedom of Student's noises in each received number (m,), infinite where none is.
+
+    `late`: noise of the last hop, None if there is none; `source`: output whose noise each number brings.
+    """
+    laws = [_student_degrees(sensed, None)[source], *([] if late is None else [_student_degrees(late, None)])]
+    xp = library(laws)
+    finite = [xp.where(xp.isnan(degrees), xp.inf, degrees) for degrees in laws]
+    least: Vector = xp.min(xp.stack(finite), axis=0)
+    return least
 
 
 def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:

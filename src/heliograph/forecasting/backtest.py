@@ -12,7 +12,8 @@ from typing_extensions import TypeAliasType
 from heliograph.engine.choice import compute_once
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.forecasting.forecast import ForecastTarget, list_targets
-from heliograph.forecasting.multistep_prediction import Moments, MultistepPredictor
+from heliograph.forecasting.mixture_moments import Moments
+from heliograph.forecasting.multistep_prediction import MultistepPredictor
 from heliograph.forecasting.scores import (
     LEVELS,
     MixtureLaws,
@@ -298,10 +299,10 @@ def _roll_segments(
 
 def _select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
     """Return the law of one number at one horizon (its index), from each row."""
-    means, variances = np.asarray(moments.means), np.asarray(moments.covariances)
-    return MixtureLaws(
-        np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number]
-    )
+    if moments.laws is not None:
+        return MixtureLaws(*(np.asarray(one)[:, horizon, :, number] for one in moments.laws))
+    means, variances = (np.asarray(one)[:, horizon, :, number] for one in (moments.means, moments.covariances))
+    return MixtureLaws(np.asarray(moments.weights)[:, horizon], means, variances)
 
 
 def _score_number(
@@ -371,12 +372,12 @@ def _forecast_from_each_row(
     """
     filter, length = outlook.filter, windows.shape[1]
 
-    def select(moments: Moments | None) -> Moments | None:
+    def select(moments: Moments | None) -> PyTree:
         """Return the moments at `places`, the horizons among all rows ahead, with variances in place of covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
-        return Moments(moments.weights[places], moments.means[places], variances[places])
+        return jax.tree.map(lambda leaf: leaf[places], moments._replace(covariances=variances))
 
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the filter's state after row k, and the moments that it forecasts from there.
@@ -385,11 +386,10 @@ def _forecast_from_each_row(
         """
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
-        steps_ahead = k + 1 + jnp.arange(length)
-        _, (states, _, received) = jax.lax.scan(
-            lambda s, ahead: outlook.predict_step(s, *ahead), after, (window, steps_ahead)
-        )
-        return after, (select(states), select(received))
+        ahead = window, k + 1 + jnp.arange(length)
+        _, (states, _, received) = jax.lax.scan(lambda s, row: outlook.predict_step(s, *row), after, ahead)
+        moments_alone = states and states._replace(laws=None)  # states are scored by these also where they have limits
+        return after, (select(moments_alone), select(received))
 
     start = jax.tree.map(jnp.asarray, filter.init())
     rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(windows)

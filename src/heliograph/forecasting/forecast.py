@@ -11,12 +11,12 @@ from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
 from heliograph.forecasting.forecast_result import Forecast
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_inputs_ahead, find_rows_ahead
+from heliograph.forecasting.mixture_moments import make_prediction
 from heliograph.forecasting.multistep_prediction import (
     MultistepPredictor,
     find_output_claim,
     find_received_claim,
     make_multistep_predictor,
-    make_prediction,
     predict_moments,
     predict_moments_of_each,
 )
@@ -225,7 +225,7 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
     return Forecast(
         steps=ahead.steps,
         time=ahead.time,
-        states=make_prediction(states, filter.states, filter.claim, angles.states),
+        states=make_prediction(states, filter.states, filter.claim, angles.states, outlook.limits),
         outputs=measured,
         received=arriving,
         inputs=ahead.inputs,

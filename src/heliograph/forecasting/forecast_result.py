@@ -23,10 +23,12 @@ InputsAhead: TypeAlias = Literal["none", "given", "held"]
 class Prediction:
     """The law of some numbers at each horizon: a Gaussian, or a mixture of K of them, of which each part is Gaussian.
 
-    Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. The quantiles of an
-    angle go on from its mean, so that a band about pi stays a band. Of several sources all arrays have one more axis,
-    of sources, before that of horizons. Of what nothing has been heard yet (`hg.diffuse`), and behind noise that has no
-    variance (`StudentT` of at most two degrees), the deviation is infinite, and so are the ends of intervals; a
+    Quantiles and probabilities are of the mixture, cut to the limits of states that have some; mean and covariance are
+    the first two moments, and the claim is about these alone. Noise with outliers (`StudentT`, `Contaminated`) of the
+    sensor and of the last hop is in the law of what is measured and received as the mixture that it is. The quantiles
+    of an angle go on from its mean, so that a band about pi stays a band. Of several sources all arrays have one more
+    axis, of sources, before that of horizons. Of what nothing has been heard yet (`hg.diffuse`), and behind noise that
+    has no variance (`StudentT` of at most two degrees), the deviation is infinite, and so are the ends of intervals; a
     probability there is none, NaN.
 
     Args:
@@ -34,9 +36,10 @@ class Prediction:
         mean: (horizons, m), angles between -pi and pi.
         covariance: of the error (horizons, m, m); NaN where nothing is claimed.
         claim: what the covariance is: "exact", "upper", "nominal" or "none".
-        weights: of the parts (horizons, K).
-        part_means: (horizons, K, m), angles within half a turn of the mean's.
-        part_variances: (horizons, K, m).
+        weights: of the parts of each number (horizons, K, m).
+        part_means: (horizons, K, m), angles within half a turn of the mean's; before they are cut to limits.
+        part_variances: (horizons, K, m), likewise.
+        limits: lowest and highest value of each number, infinite where there is no limit.
     """
 
     names: tuple[str, ...]
@@ -46,6 +49,7 @@ class Prediction:
     weights: Array = field(repr=False)
     part_means: Array = field(repr=False)
     part_variances: Array = field(repr=False)
+    limits: tuple[tuple[float, float], ...] = field(repr=False)
 
     @property
     def deviation(self) -> Float[np.ndarray, "horizons m"]:
@@ -63,8 +67,10 @@ class Prediction:
         if not 0 < p < 1:
             raise fail("level of a quantile", "a probability between 0 and 1", level)
         means, deviations = self.part_means, np.sqrt(self.part_variances)
+        low_end, high_end = np.transpose(self.limits)
         with np.errstate(invalid="ignore"):  # no median of what is unknown
-            each = means + ndtri(p) * deviations
+            below, above = self._find_part_probabilities(low_end), self._find_part_probabilities(high_end)
+            each = np.clip(means + ndtri(below + p * (above - below)) * deviations, low_end, high_end)
         # The mixture's lies between the least and the greatest of its parts': halve that interval.
         low, high = each.min(axis=-2), each.max(axis=-2)
         for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
@@ -107,22 +113,35 @@ class Prediction:
             self,
             mean=change(self.mean, 1),
             covariance=change(self.covariance, 2),
-            weights=change(self.weights, 1),
+            weights=change(self.weights, 2),
             part_means=change(self.part_means, 2),
             part_variances=change(self.part_variances, 2),
         )
 
-    def _find_probability_below(self, limits: np.ndarray) -> np.ndarray:
-        """Return P(number < limit) (horizons, m), the sum of weight_k P(part k < limit).
+    def _find_probability_below(self, values: np.ndarray) -> np.ndarray:
+        """Return P(number < value) (horizons, m), the sum of weight_k P(part k < value | part k within the limits)."""
+        low, high = np.transpose(self.limits)
+        below, least, most = map(self._find_part_probabilities, (np.clip(values, low, high), low, high))
+        inside = most - least
+        share = np.where(inside > 0, (below - least) / np.where(inside > 0, inside, 1.0), below)
+        # Nothing is beyond the limits, also of a part that is as good as certain to be there.
+        share = np.where((values <= low)[..., None, :], 0.0, np.where((values > high)[..., None, :], 1.0, share))
+        total: np.ndarray = np.sum(self.weights * share, axis=-2)
+        return total
 
-        A part without variance is its mean, which counts half at the limit itself.
+    def _find_part_probabilities(self, values: np.ndarray) -> np.ndarray:
+        """Return P(part k < value) (horizons, K, m) without regard to limits.
+
+        A part without variance is its mean, which counts half at the value itself.
         """
-        away = limits[..., None, :] - self.part_means
+        away = values[..., None, :] - self.part_means
         spread = np.sqrt(self.part_variances)
         certain = np.where(away > 0, np.inf, np.where(away < 0, -np.inf, 0.0))
-        units = np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), certain)
-        total: np.ndarray = np.einsum("...k,...km->...m", self.weights, ndtr(units))
-        return total
+        with np.errstate(invalid="ignore"):
+            units = np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), certain)
+        beyond_all = np.isinf(values)[..., None, :]  # also beyond parts whose variance is infinite
+        probabilities: np.ndarray = ndtr(np.where(beyond_all, values[..., None, :], units))
+        return probabilities
 
 
 @readable

@@ -4,7 +4,7 @@ A filter's claim is what it says of its covariance: "exact", "upper", "nominal" 
 """
 
 from dataclasses import replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compile_on_call, compute_once
-from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
@@ -24,18 +23,23 @@ from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.filters.received_outlier_noise import ReceivedNoise, separate_outlier_noise
+from heliograph.filters.truncation import PlacedLimits
+from heliograph.filters.wrappers.sensor_inputs import FilterOfInputs
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.filters.wrappers.told_link_law import ToldFilter
-from heliograph.forecasting.forecast_result import Prediction
+from heliograph.forecasting.mixture_moments import MarginalLaws, Moments, has_branches, spread_over_branches
 from heliograph.model.estimate import Claim, Innovation, weakest
-from heliograph.model.over_time import at, first
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import OverTime, at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
+from heliograph.random_affine.moments.mixture_components import GaussianBranches
+from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.outlier_noise import StudentT
 
 BLOCK = 128  # plants side by side under XLA
@@ -50,14 +54,6 @@ class HasComponents(Protocol):
         """Weights of a mixture's components, and the components as Gaussians."""
 
 
-class Moments(NamedTuple):
-    """Weights (K,), means (K, m) and covariances (K, m, m) of a mixture."""
-
-    weights: jax.Array
-    means: jax.Array
-    covariances: jax.Array
-
-
 class MultistepPredictor(Module):
     """How a filter's states are read ahead: by its plant and sensor (None: outputs are not), and its own correction."""
 
@@ -66,15 +62,36 @@ class MultistepPredictor(Module):
     sensor: AnySensor | None
     transform: AbstractTransform
     receives: bool = eqx.field(static=True)
+    received_noise: ReceivedNoise | OverTime | None
 
     def compute_state_moments(self, state: PyTree) -> Moments:
         """Return the moments of the states as a mixture: the filter's own if it has one, else of one part.
 
-        Covariances are zero where the filter claims nothing.
+        Covariances are zero where the filter claims nothing. Of states with limits they are those within the limits.
         """
         filter = self.filter
-        if isinstance(filter, LimitedFilter):  # each part within the limits
-            state, filter = filter.condition_on_limits(state), filter.base
+        if not isinstance(filter, LimitedFilter):
+            return self._read_moments(filter, state)
+        moments = self._read_moments(filter.base, filter.condition_on_limits(state))
+        # Each limited state given the limits of the others: the Gaussians that are cut to its own.
+        means, variances = moments.means, jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
+        for place, *_ in filter.limits:
+            beside = self._read_moments(filter.base, filter.condition_on_limits(filter.hold(state), without=place))
+            means = means.at[:, place].set(beside.means[:, place])
+            variances = variances.at[:, place].set(beside.covariances[:, place, place])
+        weights = jnp.broadcast_to(moments.weights[:, None], means.shape)
+        return moments._replace(laws=MarginalLaws(weights=weights, means=means, variances=variances))
+
+    def compute_moments_before_limits(self, state: PyTree) -> Moments:
+        """Return the moments of the states without regard to their limits, but for the parts' weights."""
+        filter = self.filter
+        if not isinstance(filter, LimitedFilter):
+            return self._read_moments(filter, state)
+        weights = self._read_moments(filter.base, filter.condition_on_limits(state)).weights
+        return self._read_moments(filter.base, filter.hold(state))._replace(weights=weights)
+
+    def _read_moments(self, filter: AbstractFilter, state: PyTree) -> Moments:
+        """Return the moments of the states as the state of a filter has them."""
         if isinstance(state, HasComponents):
             weights, parts = state.components
             parts = take_leading(parts, len(self.filter.states))
@@ -85,8 +102,13 @@ class MultistepPredictor(Module):
         claimed = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
         return Moments(weights=jnp.ones(1), means=jnp.asarray(estimate.mean)[None], covariances=claimed[None])
 
+    @property
+    def limits(self) -> PlacedLimits:
+        """Index, lowest and highest value of each state with limits that the filter knows."""
+        return self.filter.limits if isinstance(self.filter, LimitedFilter) else ()
+
     def moments(self, state: PyTree) -> Moments:
-        """Return the moments of the states as they are now, as NumPy arrays."""
+        """Return the moments of the states as they are now, without regard to limits, as NumPy arrays."""
         return _compute_moments_now(self, state)
 
     def predict_measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
@@ -111,15 +133,14 @@ class MultistepPredictor(Module):
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
         if isinstance(prior, Diffuse):
-            covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
-            noise = jnp.asarray(sensor.noise.covariance)
-            mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
-            return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
+            return _measure_unknown_state(prior, sensor)
 
         # The sensor's noise, as it was learned where the filter learns it.
+        deviations = None
         learned_noise: WeightedColumns | None = None
         if isinstance(self.filter, AdaptiveFilter):
-            learned_noise = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
+            deviations = jnp.asarray(self.filter.noise_deviations(prior, k))
+            learned_noise = sensor.noise.columns.through(jnp.diag(deviations))
 
         def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return mean and covariance of the outputs, from those of the states, one component of the mixture.
@@ -133,18 +154,56 @@ class MultistepPredictor(Module):
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(predict_outputs)(states.means, states.covariances)
+        outputs = Moments(states.weights, means, covariances)
+        laws = self._find_output_laws(states, outputs, sensor.noise, deviations)
         # Student's law of at most two degrees has no variance.
         if isinstance(sensor.noise, StudentT):
             endless = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
             covariances = jax.vmap(lambda covariance: mark_unknown(covariance, endless))(covariances)
-        return Moments(weights=states.weights, means=means, covariances=covariances)
+        return outputs._replace(covariances=covariances, laws=laws)
 
-    def predict_received(self, prior: PyTree, k: jax.Array) -> Moments | None:
-        """Return the moments of what would arrive at step k, by the predicted state; None if the filter cannot tell."""
+    def _find_output_laws(
+        self, states: Moments, outputs: Moments, noise: AbstractNoise, deviations: jax.Array | None
+    ) -> MarginalLaws | None:
+        """Return the law of each output where the sensor's noise is a mixture of Gaussians; None where it is Gaussian.
+
+        Args:
+            states: moments of the states.
+            outputs: moments of the outputs, with the noise.
+            noise: that of the step.
+            deviations: how much wider it is than was said (m,), where the filter learns it; else None.
+        """
+        branches = noise.branches()
+        if not has_branches(branches):
+            return None
+        variance = noise.columns.diagonal
+        if deviations is not None:
+            variance = variance * deviations**2
+            wider = jnp.asarray(deviations)[:, None]
+            branches = branches._replace(mean=branches.mean * wider, variance=branches.variance * wider**2)
+        rest = jnp.maximum(jnp.diagonal(outputs.covariances, axis1=-2, axis2=-1) - variance, 0.0)
+        return spread_over_branches(states.weights, outputs.means, rest, branches)
+
+    def predict_received(self, prior: PyTree, outputs: Moments | None, k: jax.Array) -> Moments | None:
+        """Return the moments of what would arrive at step k, by the predicted state; None if the filter cannot tell.
+
+        `outputs`: moments of what the sensor would measure; None where that is not known.
+        """
         if not self.receives:
             return None
         innovation = _expect(self.filter, prior, k)
-        return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], jnp.asarray(innovation.covariance)[None])
+        mean, covariance = -jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        moments = Moments(jnp.ones(1), mean[None], covariance[None])
+        noise = self.received_noise
+        if noise is None or outputs is None:
+            return moments
+        # The noise's variance, which is in the covariance, in branches.
+        branches = at(noise, k).find_branches(outputs.weights @ outputs.means)
+        center, variance = branches.mean_and_variance()
+        rest = jnp.maximum(jnp.diagonal(covariance) - variance, 0.0)
+        gaussians = GaussianBranches(branches.log_share, branches.mean, branches.variance)
+        laws = spread_over_branches(moments.weights, (mean - center)[None], rest[None], gaussians)
+        return moments._replace(laws=laws)
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
@@ -152,19 +211,29 @@ class MultistepPredictor(Module):
         states = self.compute_state_moments(prior)
         outputs = self.predict_measured(prior, states, u, k)
         # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
-        received = outputs if isinstance(prior, Diffuse) else self.predict_received(prior, k)
+        received = outputs if isinstance(prior, Diffuse) else self.predict_received(prior, outputs, k)
         return prior, (states, outputs, received)
+
+
+def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
+    """Return the moments of the outputs of a state of which not all is known: some variances are infinite."""
+    covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
+    noise = jnp.asarray(sensor.noise.covariance)
+    mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
+    return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
 
 def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
     """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
     if isinstance(filter, LimitedFilter):
         return _expect(filter.base, filter.hold(prior), k)
+    if isinstance(filter, FilterOfInputs):
+        return _expect(filter.make_filter_under(prior.u, k), prior.base, k)
     if isinstance(filter, ToldFilter):  # part of z says which law of noise holds: zeros would say one
         return filter.expect(prior, k)
     _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
     if isinstance(filter, RobustFilter):  # whose law of noise may have no variance
-        has_none = jnp.asarray(at(filter.noise, k).degrees) <= 2
+        has_none = jnp.asarray(at(filter.noise, k).least_degrees) <= 2
         return replace(innovation, covariance=mark_unknown(jnp.asarray(innovation.covariance), has_none))
     return innovation
 
@@ -185,13 +254,38 @@ def make_multistep_predictor(
         sensor=believed if plant is not None else None,
         transform=transform if isinstance(transform, AbstractTransform) else Cubature(),
         receives=bool(filter.received) and not filter.silence_tells and not flagged,
+        received_noise=_find_received_noise(filter),
     )
+
+
+def _find_received_noise(filter: AbstractFilter) -> ReceivedNoise | OverTime | None:
+    """Return the noise with outliers in what a filter receives, of sensor and last hop; None where there is none.
+
+    Nor is there one to be told apart where the channel mixes the noises of several outputs, brings past ones, or
+    tells numbers.
+    """
+    premise = filter.premise
+    sensor, channel = (None, None) if premise is None else (premise.sensor, premise.channel)
+    if sensor is None or channel is None or memories(sensor):
+        return None
+    link, law = first(channel), first(sensor).noise
+    is_described = isinstance(law, AbstractNoise) and not link.past and not first(sensor).inputs
+    if not is_described or not (law.has_outliers or link.detach_outliers()[1] is not None):
+        return None
+    try:
+        # A channel that loses, as it is given that what it sends arrives.
+        fresh = without_memory(channel)
+        arriving = at_each_step(lambda step: step.condition_on_arrival() if step.erases else step, fresh)
+        noise = separate_outlier_noise(sensor, arriving, independent=False)[1]
+    except ValueError:
+        return None
+    return noise if len(first(noise).center) == filter.received else None
 
 
 @compile_on_call
 def _compute_moments_now(outlook: MultistepPredictor, state: PyTree) -> Moments:
     """Return the moments of the states at the row where the outlook begins."""
-    return outlook.compute_state_moments(state)
+    return outlook.compute_moments_before_limits(state)
 
 
 def predict_moments(
@@ -251,34 +345,6 @@ def _predict_moments_of_each(outlook: MultistepPredictor, states: PyTree, u: jax
 _by_xla, _each_by_xla = quickly_compiled(_predict_moments), quickly_compiled(_predict_moments_of_each)
 
 
-def make_prediction(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
-    """Return the prediction of a mixture of K Gaussians at each horizon, its angles between -pi and pi.
-
-    `moments`: weights (..., horizons, K), means (..., horizons, K, m) and covariances (..., horizons, K, m, m).
-    """
-    weights, means, covariances = map(np.asarray, moments)
-    variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
-    means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
-    # First two moments of the mixture: within its parts, and between their means.
-    mean = np.einsum("...k,...km->...m", weights, means)
-    apart = means - mean[..., None, :]
-    within = np.einsum("...k,...kij->...ij", weights, covariances)
-    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
-    if claim == "none":
-        covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
-    wrapped = wrap_angles(mean, angles)
-    whole_turns = (wrapped - mean)[..., None, :]
-    return Prediction(
-        names=names,
-        mean=wrapped,
-        covariance=covariance,
-        claim=claim,
-        weights=weights,
-        part_means=means + whole_turns,
-        part_variances=variances,
-    )
-
-
 def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Claim:
     """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most.
 
@@ -295,7 +361,9 @@ def find_received_claim(filter: AbstractFilter) -> Claim:
     ToldFilter: some of the numbers that arrive say the law of noise. What they will be is not known ahead; typical
     ones are put for them unless their own law is known.
     """
-    base = filter.base if isinstance(filter, LimitedFilter) else filter
+    base = filter
+    while isinstance(base, LimitedFilter | FilterOfInputs):
+        base = base.base
     if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
         return weakest([filter.claim, "nominal"])
     return filter.claim

@@ -12,12 +12,12 @@ from heliograph.filters.run_over_data import check_data
 from heliograph.forecasting.backtest import list_single_filters, select_measurements
 from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.forecast_result import Forecast
+from heliograph.forecasting.mixture_moments import make_prediction
 from heliograph.forecasting.multistep_prediction import (
     MultistepPredictor,
     find_output_claim,
     find_received_claim,
     make_multistep_predictor,
-    make_prediction,
 )
 from heliograph.forecasting.start_states import find_origin
 from heliograph.model.over_time import first
@@ -102,7 +102,7 @@ def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, na
     return Forecast(
         steps=np.ones(len(z), int),
         time=np.arange(float(len(z))),
-        states=make_prediction(states, filter.states, filter.claim, angles.states),
+        states=make_prediction(states, filter.states, filter.claim, angles.states, outlook.limits),
         outputs=measured,
         received=arriving,
         inputs="given" if filter.inputs else "none",

@@ -10,6 +10,7 @@ from heliograph.filters.gaussian.adaptive import AdaptiveFilter
 from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
 from heliograph.forecasting.forecast import ForecastTarget, check_steps_covered, find_target
 from heliograph.forecasting.horizons import Horizons, Inputs, check_inputs_ahead, find_rows_ahead
+from heliograph.forecasting.paths_within_limits import StateLimits, draw_limited_components
 from heliograph.forecasting.start_states import find_origin
 from heliograph.model.forecast_origin import HasOrigin
 from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, transition_over
@@ -80,6 +81,9 @@ def draw_paths(
 ) -> Paths:
     """Draw paths of states and outputs: the last state from its estimate, then the plant with its noises.
 
+    Where a filter knows limits of the states, paths keep them: the start is drawn given that it lies within them; what
+    moves beyond one stays at it, and noise that leads beyond is mirrored there.
+
     Where plant or sensor have modes, the present mode is drawn from its probabilities, and moves by its chain along the
     path: what a filter merges when it predicts, as `gpb1_filter` does with all modes, is not merged here.
 
@@ -116,7 +120,8 @@ def draw_paths(
     learned = None
     if isinstance(believer, AdaptiveFilter):
         learned = np.asarray(believer.noise_deviations(target.state, origin.step))
-    x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, _find_switching(target), learned)
+    limits, switching = StateLimits(target.outlook.limits), _find_switching(target)
+    x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, switching, learned, limits)
     return Paths(
         steps=ahead.steps,
         time=ahead.time,
@@ -178,7 +183,7 @@ def _draw_initial_states(
     filter = target.outlook.filter
     if filter.claim == "none":
         raise fail("paths", "a filter that claims a covariance", f"{type(filter).__name__}, which claims none")
-    weights, means, covariances = (np.asarray(part) for part in target.outlook.moments(target.state))
+    weights, means, covariances = (np.asarray(part) for part in target.outlook.moments(target.state)[:3])
     if not np.isfinite(covariances).all():
         raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
@@ -188,11 +193,13 @@ def _draw_initial_states(
         cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
         uniform = generator.random(draws)[:, None] * cumulated[:, -1:]  # weights of a part need not sum to 1
         modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
-    # The state: the part's mean, plus a root of its covariance times standard normal numbers. Attitudes are turned.
+    # States with limits first, then the others given these: the part's mean, plus a root of its covariance times
+    # standard normal numbers. Attitudes are turned.
+    center, covariances = draw_limited_components(part, means, covariances, target.outlook.limits, generator)
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
-    drawn: np.ndarray = Manifold((), filter.attitude).settle(means[part], means[part] + changes)
+    drawn: np.ndarray = Manifold((), filter.attitude).settle(center, center + changes)
     return drawn, modes
 
 
@@ -206,6 +213,7 @@ def _draw_paths_from_states(
     step: Array,
     switching: ModeSwitching | None,
     learned: Array | None,
+    limits: StateLimits,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (draws, rows, n) and outputs (draws, rows, m) of drawn paths; m = 0 without a sensor.
 
@@ -218,6 +226,7 @@ def _draw_paths_from_states(
         step: number of the first row.
         switching: how modes move; None where there are none.
         learned: deviations of the sensor's noise in units of its own (m,), where a filter learned them; else None.
+        limits: within which states keep.
     """
 
     def draw_row(
@@ -236,7 +245,8 @@ def _draw_paths_from_states(
             key_of_mode = jax.random.fold_in(key_of_row, 2)  # 0 and 1 may be the keys of plant and sensor
             mode = switching.draw_next(key_of_mode, mode, u_k, k, is_first=k == jnp.asarray(step))
             plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
-        x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(key_of_plant, u_k))
+        moved = limits.hold(plant_k.transition(x, u_k))
+        x = limits.hold(limits.mirror(plant_k.plus(moved, plant_k.sample_noise(key_of_plant, u_k))))
         if sensor_k is None:
             return (x, mode), (x, jnp.zeros(0))
         sensor_k = sensor_k.under(plant_k.inputs, u_k)

@@ -34,10 +34,9 @@ def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     LOG_TURN: log(2 pi). The largest term is taken out of the sum, lest every exponential is 0.
     """
-    terms = (
-        np.log(law.weights)
-        - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2
-    )
+    with np.errstate(divide="ignore"):  # a part of no weight has no density
+        log_weights = np.log(law.weights)
+    terms = log_weights - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2
     top = terms.max(axis=1)
     return np.asarray(top + np.log(np.sum(np.exp(terms - top[:, None]), axis=1)))
 

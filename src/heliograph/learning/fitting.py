@@ -258,8 +258,8 @@ def fit(
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
-        recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
-            one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
+        recording: what `hg.run` takes, measurements (steps, received) by node, or rows of the one node alone, NaN for
+            what did not arrive; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
         inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
             none).
         starts: number of starts: the given one, and others drawn around it (default 6).
@@ -276,18 +276,19 @@ def fit(
     """
     check_count("starts", starts)
     check_progress(progress, "a line of text")
+    seed = check_seed("seed", seed)
     description = describe(network)
     report = progress or (lambda line: None)
     recording, delays = _convert_event_tables(recording)
     if has_deciding_sender(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
-        sender = fit_sender(description, recording, inputs, starts, check_seed("seed", seed), report)
+        sender = fit_sender(description, recording, inputs, starts, seed, report)
         return replace(sender, delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # The likelihood over the free numbers in each form, where to begin, and what the data identify at all.
     surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
-    points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
+    points = _choose_starts(surfaces[0], starts, seed)
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
@@ -369,10 +370,10 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
         expected = "numbers under which the recording is possible"
         raise fail("start of the fit", expected, f"a log-likelihood of {total} from step {step} on")
     # Others are drawn uniformly around it: logarithms and logits within SPREAD, real numbers within half their size or
-    # AWAY standard errors, whichever is more.
+    # AWAY standard errors, whichever is more; of one that is 0 and of which the data tell nothing there, within SPREAD.
     free, deviation = surface.domains.free, surface.standard_errors(start)
     far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
-    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free, far, SPREAD)
+    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD)
     points = surface.move_to_finite_likelihood(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
     _require_information_on_each_number(surface, points)
     return points

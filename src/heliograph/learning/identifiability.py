@@ -13,7 +13,7 @@ from heliograph.learning.likelihood.objective import Objective, join_all_nodes, 
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.long_run_covariance import student_quantile
 from heliograph.learning.parametric_network import Build, describe
-from heliograph.learning.told_numbers import TellsNumbers
+from heliograph.learning.told_numbers import find_told_filter
 from heliograph.learning.unidentified_directions import (
     WEAK,
     ConfoundedNumbers,
@@ -91,6 +91,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     Raises:
         ValueError: as `fit`; numbers that messages tell, of which no law is known.
     """
+    seed = check_seed("seed", seed)
     description = describe(network)
     objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
@@ -100,7 +101,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     points = _draw_points_near(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
-        z = _draw_measurements(objective, x, u, check_seed("seed", seed) + i)
+        z = _draw_measurements(objective, x, u, seed + i)
         data = LikelihoodData(measurements=z[None], inputs=u[None], lengths=(len(z),))
         ranks.append(find_information_rank(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
     return _judge_identifiability(description.parameters, points, ranks)
@@ -245,6 +246,7 @@ def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed:
 def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before."""
     filter = objective.filter(jnp.asarray(x))
+    told = find_told_filter(filter)
 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         """Return the filter's state after row k, and the measurement drawn for it."""
@@ -252,16 +254,16 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
         prior, zeros = filter.predict(state, u_k, k), jnp.zeros(filter.received)
         # What a message tells of its link is drawn first: it gives the law of the rest.
         numbers = jnp.zeros(0)
-        if isinstance(filter, TellsNumbers):
-            numbers = filter.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
-            zeros = filter.with_numbers(zeros, numbers)
+        if told is not None:
+            numbers = told.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
+            zeros = told.with_numbers(zeros, numbers)
         # The innovation of z = 0 is -E z, with covariance S; of what is told both are NaN.
         received = filter.correct(prior, zeros, k)[1]
         is_value = ~jnp.isnan(received.value)
         S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
         z = cholesky(S) @ noise - received.value
-        if isinstance(filter, TellsNumbers):
-            z = filter.with_numbers(z, numbers)
+        if told is not None:
+            z = told.with_numbers(z, numbers)
         return filter.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, filter.init())

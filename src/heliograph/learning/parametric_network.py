@@ -1,7 +1,7 @@
 """Networks with free numbers: a function that returns one, built again with others in the places of its marks."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,6 +36,8 @@ from heliograph.simulation.network import Network
 
 Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
 Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
+
+ASIDE, IRRATIONAL = 0.1, 0.6180339887498949  # how far near the start is on the line; multiples of it differ
 
 DOMAINS: dict[Kind, Domain] = {
     "real": REAL,
@@ -229,6 +231,20 @@ class Description:
     def start(self) -> Network:
         """Network with every free number at its start."""
         return self.at({parameter.name: to_plain_number(parameter.start) for parameter in self.parameters.every})
+
+    @cached_property
+    def near_start(self) -> Network:
+        """Network at a point near the start that is no special case, as one where two free gains are equal or one is 0.
+
+        Whether a gain is random at all is asked here, since it may be known at the start alone. The start itself where
+        no network can be built on either side of it.
+        """
+        start = self.parameters.start
+        away = ASIDE * (1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0])  # another one for each number
+        for direction in (1.0, -1.0):
+            with suppress(ValueError):
+                return self.at_point(start + direction * away)
+        return self.start
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
         """Return the network, of plain numbers, at a point x (p,) of the line."""

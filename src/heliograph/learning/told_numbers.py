@@ -4,6 +4,8 @@ from typing import Protocol, runtime_checkable
 
 import jax
 
+from heliograph.filters.base import AbstractFilter
+
 
 @runtime_checkable
 class TellsNumbers(Protocol):
@@ -20,3 +22,13 @@ class TellsNumbers(Protocol):
 
     def with_numbers(self, z: jax.Array, numbers: jax.Array) -> jax.Array:
         """Return a message with these numbers in the place of its own."""
+
+
+def find_told_filter(filter: AbstractFilter) -> TellsNumbers | None:
+    """Return the filter that reads told numbers: `filter`, or that within it, as within limits of states; else None.
+
+    What stands around it leaves the message as it is.
+    """
+    while not isinstance(filter, TellsNumbers) and isinstance(within := getattr(filter, "base", None), AbstractFilter):
+        filter = within
+    return filter if isinstance(filter, TellsNumbers) else None

@@ -20,6 +20,7 @@ from heliograph.model.input_dependent_sensor import (
 )
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, MatrixOfInputs, NoiseFunction
+from heliograph.model.turn_invariance import SOME_INPUTS
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
@@ -82,15 +83,15 @@ class AbstractSensor(Module):
         return _sensor_under_inputs(self, u[places])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
-        """Return the sensor under inputs of 1, which stand for any; raise ValueError where the plant lacks its inputs.
+        """Return the sensor under inputs that stand for any; raise ValueError where the plant lacks its inputs.
 
-        `names`: of the plant's inputs.
+        They are not whole, lest an angle times one is whole turns. `names`: of the plant's inputs.
         """
         lacking = [name for name in self.inputs if name not in names]
         if lacking:
             expected = f"some of the plant's, {list(names)} (it may have ones that move nothing)"
             raise fail("inputs of a sensor", expected, lacking)
-        return self.under(names, np.ones(len(names)))
+        return self.under(names, np.resize(SOME_INPUTS, len(names)))
 
     def refuse_inputs(self, name: str) -> None:
         """Raise ValueError, with the name of what needs a constant sensor, where this one depends on inputs."""

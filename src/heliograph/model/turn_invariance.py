@@ -16,6 +16,7 @@ from heliograph.random_affine.noise import Vector
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
 SOME_TURN = (0.3, -0.2, 0.5)  # radians, about the three axes or of any states: no attitude is at rest there
+SOME_INPUTS = (0.6, 0.9, 0.7)  # above 0, as a time is; not whole, lest a full turn times one is full turns
 
 Turned = tuple[np.ndarray, Sequence[np.ndarray] | np.ndarray, tuple[np.ndarray, ...]]  # a state, its forms, the rest
 
@@ -46,18 +47,18 @@ def check_turn_invariance(
     # A state that is no special case, with rates that are not 0: at 0 sin(angle / 2) and angle * rate hide.
     center = np.asarray(center)
     general_state = given.plus(center, np.resize(SOME_TURN, len(center)))
-    ones = tuple(np.ones_like(values) for values in rest)
+    some = tuple(np.resize(SOME_INPUTS, len(values)) for values in rest)
     # Angles: a full turn more in each of them, at the center too.
     turns = TURN * np.eye(len(center))[list(given.angles)]
     if len(turns):
-        at_both = [(center, center + turns, rest), (general_state, general_state + turns, ones)]
+        at_both = [(center, center + turns, rest), (general_state, general_state + turns, some)]
         _compare_turned(f"{name} with circular states", function, at_both, results)
     # Attitudes: by the other rotation vector of each.
     attitudes = [given.rotations[i : i + 3] for i in range(0, len(given.rotations), 3)]
     others = [_turn_attitude_long_way_round(general_state, places) for places in attitudes]
     if others:
         kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
-        _compare_turned(kind, function, [(general_state, others, ones)], results)
+        _compare_turned(kind, function, [(general_state, others, some)], results)
 
 
 def _compare_turned(name: str, function: Callable[..., jax.Array], places: Sequence[Turned], results: Manifold) -> None:

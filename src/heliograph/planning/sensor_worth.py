@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.filter_for_likelihood import likelihood_filter
-from heliograph.learning.told_numbers import TellsNumbers
+from heliograph.learning.told_numbers import find_told_filter
 from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.sensor import is_linear
@@ -249,7 +249,8 @@ def _compute_squares_at_end(
     squares, used = [], filter.angles_used()
     # What arrives decides the variances, and what a message tells of its link: where both are the same in all runs,
     # so are they.
-    is_number = np.isin(np.arange(z.shape[-1]), filter.numbers if isinstance(filter, TellsNumbers) else ())
+    told = find_told_filter(filter)
+    is_number = np.isin(np.arange(z.shape[-1]), () if told is None else told.numbers)
     deciding = np.where(is_number, z, np.isnan(z))
     alike = exact and np.array_equal(deciding, np.broadcast_to(deciding[:1], z.shape), equal_nan=True)
     for row, x in zip(z, truth, strict=True):

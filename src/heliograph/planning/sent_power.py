@@ -7,6 +7,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.channel import Channel
+from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.relays import RECEIVER, SENSOR
@@ -20,6 +21,7 @@ from heliograph.numerics.random_keys import seed_key
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.plant_moments import measured_moment_with_one, moments_with_one_over, steady_moment_with_one
 from heliograph.planning.transmitters import compute_sent_powers, compute_steady_powers
+from heliograph.random_affine.untold_law import believe_untold, has_untold_law
 from heliograph.relays.design import given_design
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -166,10 +168,12 @@ def _compute_hop_powers(
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
     """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
-    channel_now = at(channel, k)
-    if horizon is None:
-        return compute_steady_powers(channel_now, moment)
-    return compute_sent_powers(channel_now, moment, step=k)
+    link, _, told = separate_told_numbers(at(channel, k))
+    if told:  # to be told a link's gain or noise changes nothing of what is sent
+        if not has_untold_law(link):
+            raise fail("power of a link whose gain or noise is told", "a known law of what is told", "none")
+        link = believe_untold(link)
+    return compute_steady_powers(link, moment) if horizon is None else compute_sent_powers(link, moment, step=k)
 
 
 def _list_sources(network: Network) -> Sources:

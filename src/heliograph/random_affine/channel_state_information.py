@@ -45,7 +45,7 @@ class AbstractFreshDraw(AbstractMemory):
     def nodes(self, degree: int) -> MemoryStates:
         """Raise ValueError: what a message tells is no hidden mode, whose states a filter would weigh."""
         expected = "a filter that takes what a message tells, such as linear_filter or extended_filter"
-        raise fail("filter of a link whose gain or noise is told", expected, "one of joint modes")
+        raise fail("link whose gain or noise is told", expected, "what takes it for a mode that nobody is told")
 
 
 class FreshNumbers(AbstractFreshDraw):

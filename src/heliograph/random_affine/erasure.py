@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.numpy_or_jax import plain
+from heliograph.numerics.numpy_or_jax import library, plain
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome, check_maps
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, write_percentage
@@ -85,5 +85,5 @@ def second_moments(
     Under the nominal law.
     """
     moments = channel.moments(2)
-    tensor = moments.second
-    return np.asarray(moments.mean[:-1]), np.asarray(tensor)
+    xp = library(moments.mean, moments.second)
+    return xp.asarray(moments.mean[:-1]), xp.asarray(moments.second)

@@ -23,6 +23,7 @@ from heliograph.linear.known_loss_stability import (
 )
 from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
+from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
@@ -96,8 +97,8 @@ def certify_boundedness(network: Network) -> Boundedness:
         network: linear, of nodes that receive their sensors over channels that do not vary.
 
     Raises:
-        ValueError: a plant, sensor or channel that varies or is not linear, a channel that delivers late, relays that
-            filter, too many sets of losses.
+        ValueError: a plant, sensor or channel that varies or is not linear, a channel that delivers late or tells its
+            gain, relays that filter, too many sets of losses.
 
     Source: Sinopoli et al. (2004), Theorems 2 to 5; Xie and Xie, Stability of a random Riccati equation with Markovian
         binary switching (2008); Liu and Goldsmith, Kalman filtering with partial observation losses (2004).
@@ -170,11 +171,13 @@ def _join_links(network: Network, states: int) -> JointLinks:
 
 
 def _read_constant_channel(channel: Channel) -> AbstractRandomAffine:
-    """Return a channel that neither varies nor delays as it is; raise ValueError for another."""
+    """Return a channel that neither varies nor delays nor tells its gain as it is; raise ValueError for another."""
     if isinstance(channel, OverTime):
         raise fail("channel", "one that does not vary", "one that varies")
     if channel.past:
         raise fail("channel", "one without delays", f"one that is late by up to {channel.past} steps")
+    if separate_told_numbers(channel).numbers:
+        raise fail("channel", "one whose gain and noise no message tells", "one whose messages tell of it")
     return channel
 
 

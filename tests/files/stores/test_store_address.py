@@ -34,3 +34,12 @@ def test_what_is_no_address_is_one_line(url):
 def test_what_is_asked_must_be_said():
     with pytest.raises(ValueError, match=r"expected \?query=SELECT\.\.\. or \?table=NAME behind it, got neither"):
         files.read_store("influx://host/db")
+
+
+@pytest.mark.parametrize("password", ["se/cret", "12/cret", "12#cret", "12?cret"])
+def test_a_slash_in_a_password_does_not_end_the_host(password):
+    """The user would be taken for the host, the password's beginning for a port, and its end for the database."""
+    for kind in ("influx", "postgresql"):
+        with pytest.raises(ValueError, match=r"^store") as error:
+            files.read_store(f"{kind}://me:{password}@127.0.0.1:1/db?table=t")
+        assert "cret" not in str(error.value) and ("%2F" in str(error.value) or password[2] in "#?")

@@ -357,3 +357,17 @@ def test_refusals():
         hg.monte_carlo(network, 5, 10, 0)
     with pytest.raises(ValueError, match="a filter that takes what a message tells"):
         hg.filters.particle_filter(PLANT, SENSOR, LINKS["gain"][0])
+
+
+@pytest.mark.parametrize("build", [hg.filters.imm_filter, hg.filters.gpb1_filter, hg.filters.gpb2_filter])
+def test_filters_of_modes_are_told_gains_too(build):
+    """Beside the modes of a plant: as if each gain had been known beforehand."""
+    slow, fast = (hg.LinearPlant([[a]], 0.1, [1.0], 1.0) for a in (0.9, 0.5))
+    plant, sensor = hg.markov_plant([slow, fast], [[0.9, 0.1], [0.2, 0.8]]), hg.LinearSensor([[1.0]], 0.1)
+    z = np.array([[0.5, 0.9], [0.4, 1.1], [1.0, 2.0]])
+    found = build(plant, sensor, hg.hop(hg.Rayleigh(0.8), 0.1, known=True)).run(z)
+    right = build(plant, sensor, hg.model.over_time([hg.hop(gain, 0.1) for gain in z[:, 1]])).run(z[:, :1])
+    np.testing.assert_allclose(found.means, right.means, rtol=1e-12)
+    np.testing.assert_allclose(found.covariances, right.covariances, rtol=1e-12)
+    ahead = hg.forecast(found, 1).received
+    assert np.isfinite(ahead.mean[0, 0]) and ahead.claim == "nominal"

@@ -1,6 +1,8 @@
 """Exactly once in effect: a service that dies anywhere goes on from its store as if it had not."""
 
 import json
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -145,6 +147,18 @@ def test_the_state_of_something_else_is_refused(tmp_path):
         new.begin_from(str(place), mine)
     with pytest.raises(ValueError, match="inputs"):
         Store(str(tmp_path / "c.db"), identity(fleet(moving()))).begin_from(str(place), identity(fleet(moving())))
+
+
+def test_a_store_begins_from_nothing_but_a_state(tmp_path):
+    """An empty database is no state with no plants: it is a wrong name, and gets no tables."""
+    empty, mine = tmp_path / "empty.db", identity(fleet(stepping()))
+    sqlite3.connect(empty).close()
+    new = Store(str(tmp_path / "new.db"), mine)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"empty\.db: expected plants to begin from, got an empty one"):
+            new.begin_from(str(empty), mine)
+    with closing(sqlite3.connect(empty)) as connection:
+        assert not connection.execute("select name from sqlite_master").fetchall()
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import looks_like_date, parse_moment
+from heliograph.numerics.times.row_times import is_mix_of_units
 from heliograph.simulation.network import Network
 
 EXACT = 2**53  # up to here doubles hold every whole number
@@ -100,6 +101,9 @@ class OwnMessageCollector:
         if self._reader.rounded is not None:
             digits = f"from {self._reader.rounded} on times are rounded to the nearest double"
             self._table.notes.append(f"{self.source}: {digits}, as the first, counted from, is far from them")
+        if is_mix_of_units(self._reader.least, self._reader.most):
+            span = f"from {self._reader.least:.14g} to {self._reader.most:.14g}"
+            self._table.notes.append(f"{self.source}: times {span}: seconds and milliseconds, or such, in one column")
         self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
         return self._table
 
@@ -133,6 +137,8 @@ class HeliographMessageReader:
         numbers: whether times are numbers, and not dates; None before the first.
         zero: what whole numbers are counted from that doubles could not tell apart; 0 or None for others.
         rounded: the first whole number that doubles do not hold, where the first of all was small; None of none.
+        least: the least time that is a number.
+        most: the largest one.
     """
 
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
@@ -149,6 +155,7 @@ class HeliographMessageReader:
         self.numbers: bool | None = None
         self.zero: int | None = None
         self.rounded: int | None = None
+        self.least, self.most = np.inf, -np.inf
         self._zoned: bool | None = None
         self._columns: Set[str] = frozenset()
 
@@ -240,6 +247,7 @@ class HeliographMessageReader:
                 self.rounded = cell
         if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
+        self.least, self.most = min(self.least, number), max(self.most, number)
         return number
 
 

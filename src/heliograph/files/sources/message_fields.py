@@ -22,6 +22,7 @@ TimeUnit = Literal["s", "ms", "us", "ns", "step"]
 STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
 NUMBER = "a number, true or false, or null for what did not arrive"
+EXACT, DIGITS = 2**53, 20  # up to here doubles hold every whole number; as many digits at most have 64 bits
 # Bare words that C, C++ and JavaScript print for what is no number, outside of texts.
 NO_NUMBERS = re.compile(
     r'"(?:[^"\\]|\\.)*"|[-+]?\b(?:nan\([a-z0-9]*\)|(?:nan|inf(?:inity)?)\b|1\.#(?:q?nan|snan|ind|inf)\d*)',
@@ -183,10 +184,17 @@ def convert_number(value: Any, name: str, quoted: bool = False) -> float:
 
 
 def parse_number(text: str) -> int | float | str:
-    """Return the number that a text is, whole ones with every digit; a text that is none as it is."""
+    """Return the number that a text is, whole ones with every digit; a text that is none as it is.
+
+    A whole number that ends in .0 is a double, but where that would lose digits.
+    """
     digits = text.strip()
     if "_" in digits:  # Python's own way to write a number, and nobody else's
         return text
+    whole, point, zeros = digits.partition(".")
+    is_whole = point and not zeros.strip("0") and whole.lstrip("+-").isdecimal() and len(whole) <= DIGITS
+    if is_whole and abs(int(whole)) >= EXACT:
+        digits = whole
     try:
         return int(digits) if digits.lstrip("+-").isdecimal() else float(digits)
     except ValueError:

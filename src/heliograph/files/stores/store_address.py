@@ -68,6 +68,7 @@ def is_store(location: object) -> bool:
 
 
 ASKED = "one of table=NAME and query=SELECT..."
+ESCAPED = "a user and a password in which / ? # and @ are written %2F %3F %23 and %40"
 
 
 def parse_store(url: str) -> StoreAddress:
@@ -88,7 +89,9 @@ def parse_store(url: str) -> StoreAddress:
         parts = urlsplit(location)
         host, _ = parts.hostname, parts.port  # `port` is read because it raises at one that is no number
     except ValueError:
-        raise fail("store", SHAPE, "an address that cannot be read") from None
+        raise fail("store", ESCAPED if "@" in location else SHAPE, "an address that cannot be read") from None
+    if "@" in parts.path:  # the first / ends the host, so that what stands before it is none
+        raise fail("store", ESCAPED, "an address with an @ behind its first /")
     database = unquote(parts.path).strip("/")
     is_influx = parts.scheme in INFLUX
     if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (is_influx and not host):

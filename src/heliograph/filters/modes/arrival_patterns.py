@@ -9,6 +9,7 @@ import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
@@ -75,27 +76,33 @@ def _describe_step_by_pattern(
     some_map = outcomes[0][0].map
     m, p = some_map.outputs, some_map.inputs + 1  # (G, n) is (m, p)
     shape = (len(outcomes), len(patterns))
-    # Sums over the outcomes of each mode and pattern: P, P E[(G, n)] and P E[(G, n) x (G, n)].
-    chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
+    # Sums over the outcomes of each mode and pattern: P, P E[(G, n)] and P E[(G, n) x (G, n)]; moments may be traced.
+    chance = np.zeros(shape)
+    firsts: list[Array] = [np.zeros((m, p))] * chance.size
+    seconds: list[Array] = [np.zeros((m, m, p, p))] * chance.size
     for j, of_mode in enumerate(outcomes):
         for outcome in of_mode:
             a = patterns.index(tuple(outcome.arrived))
             first_order, second_order = second_moments(outcome.map)
             chance[j, a] += outcome.probability
-            mean[j, a] += outcome.probability * first_order
-            second[j, a] += outcome.probability * second_order
+            place = j * len(patterns) + a
+            firsts[place] = firsts[place] + outcome.probability * first_order
+            seconds[place] = seconds[place] + outcome.probability * second_order
     # Moments given mode and pattern; where the pattern cannot occur they are 0.
-    divisor = np.where(chance > 0, chance, 1.0)
-    mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
-    spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
-    gains, noises = zip(*(split_off_noise(part) for row in spread for part in row), strict=True)
-    noise = WeightedColumns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
+    xp, divisor = library(firsts, seconds), np.where(chance > 0, chance, 1.0)
+    means = [one / share for one, share in zip(firsts, divisor.flat, strict=True)]
+    parts = [one / share - symmetric_product(gain, gain)
+             for one, share, gain in zip(seconds, divisor.flat, means, strict=True)]  # fmt: skip
+    gains, noises = zip(*map(split_off_noise, parts), strict=True)
+    noise = WeightedColumns(
+        *(xp.reshape(xp.stack(part), (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True))
+    )
     return ChannelByPattern(
         transition=before.transition,
         present=np.array(patterns).reshape(len(patterns), m),
         chance=chance,
-        mean=mean,
-        gain_spread=np.reshape(gains, spread.shape),
+        mean=xp.reshape(xp.stack(means), (*shape, m, p)),
+        gain_spread=xp.reshape(xp.stack(gains), (*shape, m, m, p, p)),
         noise=noise,
         flags=flags,
     )

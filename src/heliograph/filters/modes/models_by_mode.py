@@ -14,6 +14,7 @@ from heliograph.model.over_time import OverTime, first, unstack, vary_over_steps
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
 
@@ -38,8 +39,12 @@ def describe_joint_modes(
 def _check_density(channel: ChannelByPattern) -> None:
     """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one.
 
+    What is traced, as by what a message tells, has no numbers to judge: it was judged by typical ones.
+
     `present`: which components arrive; `mean`, `spread`: moments of (G, n), z = G y + n.
     """
+    if is_traced((channel.mean, channel.gain_spread, channel.noise)):
+        return
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.
         arriving, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]

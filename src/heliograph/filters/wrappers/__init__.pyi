@@ -8,6 +8,7 @@ from .delay import deliver_line_as_current as deliver_line_as_current
 from .delay import late_filter as late_filter
 from .fed_back import FedBackFilter as FedBackFilter
 from .fed_back import PredictionFilter as PredictionFilter
+from .sensor_inputs import FilterOfInputs as FilterOfInputs
 from .state_limits import LimitedFilter as LimitedFilter
 from .told_link_law import ToldFilter as ToldFilter
 from .told_link_law import believe_typical as believe_typical

@@ -72,12 +72,12 @@ class FilterOfInputs(AbstractWrapper):
     @corrects
     def correct(self, state: StateUnderInputs, z: ArrayLike, k: Step = 0) -> tuple[StateUnderInputs, Innovation]:
         """Correct by the filter of the sensor under the inputs of this step."""
-        after, innovation = self._make_filter_under(state.u, k).correct(state.base, jnp.asarray(z), k)
+        after, innovation = self.make_filter_under(state.u, k).correct(state.base, jnp.asarray(z), k)
         return state._replace(base=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the sensor under the inputs of this step."""
-        filter = self._make_filter_under(jnp.asarray(step.u), step.k)
+        filter = self.make_filter_under(jnp.asarray(step.u), step.k)
         return filter.smoother_step(step.map_states(self.within))
 
     @property
@@ -85,7 +85,7 @@ class FilterOfInputs(AbstractWrapper):
         """Return the places of attitudes among the states of the filter within."""
         return self.base.attitude
 
-    def _make_filter_under(self, u: Array, k: Step) -> AbstractFilter:
+    def make_filter_under(self, u: Array, k: Step) -> AbstractFilter:
         """Return the filter within, of the sensor that the inputs u (inputs,) give at step k.
 
         `self.inputs`: their names, of which the sensor takes its own.

@@ -91,9 +91,13 @@ class LimitedFilter(AbstractSizedFilter):
         """Return the state from which the filter within corrects: the mean of a Gaussian held within the limits."""
         return state if _holds_particles(state) else self._hold_means(state)
 
-    def condition_on_limits(self, state: PyTree) -> PyTree:
-        """Return the state of the filter within, given that the plant's state lies within the limits."""
-        return self._condition_with_log_probability(state)[1]
+    def condition_on_limits(self, state: PyTree, without: int | None = None) -> PyTree:
+        """Return the state of the filter within, given that the plant's state lies within the limits.
+
+        `without`: index of a state of which the limits are left out; None for none.
+        """
+        others = self if without is None else replace(self, limits=tuple(x for x in self.limits if x[0] != without))
+        return others._condition_with_log_probability(state)[1]
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter within, whose estimates are then conditioned on the limits."""

@@ -1,7 +1,7 @@
 """Recordings of a fit, gathered and checked against the network."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -44,8 +44,9 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
         ValueError: recordings of other shapes, too short, or without any change.
     """
     several: Sequence[object] = [recording]
-    if isinstance(recording, list | tuple) and not hasattr(recording, "measurements"):  # a Recording is a tuple too
-        several = recording
+    is_list = isinstance(recording, list | tuple) and not hasattr(recording, "measurements")  # a Recording is a tuple
+    if is_list and not _are_rows(network, recording):
+        several = cast(Sequence[object], recording)
     if not len(several):
         raise fail("recordings", "at least one", "none")
     # Measurements z (steps, received) and inputs u (steps, inputs) of every run of every recording.
@@ -68,6 +69,20 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     )
     _check_enough_data(data, free)
     return data
+
+
+def _are_rows(network: Network, entries: object) -> bool:
+    """Return whether the entries of a list are the rows of one recording, and not recordings.
+
+    They are where each is a number, or has as many numbers as the only node receives: what `tolist` makes of an array.
+    """
+    try:
+        values = np.asarray(entries)
+    except ValueError:  # of other lengths
+        return False
+    if len(network.names) > 1 or not values.size or values.dtype.kind not in "biuf":
+        return False
+    return values.ndim == 1 or values.shape[1:] == (network.nodes[network.names[0]].received,)
 
 
 def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.learning.likelihood.data import LikelihoodData
-from heliograph.learning.likelihood.objective import Objective, make_filter_of_form
+from heliograph.learning.likelihood.objective import Objective, choose_typical_network, make_filter_of_form
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.gaussian_density import differentiate_log_density
 from heliograph.numerics.types import Array, Float
@@ -194,9 +194,11 @@ def _differentiate_errors(
 
 @lru_cache
 def _find_linear_filter(objective: Objective) -> Any:
-    """Return the filter at the objective's start if it is linear and has `score_rows`; else None."""
-    start = make_filter_of_form(objective.description.start, objective.form)
-    return start if start.has_score_recursion else None
+    """Return the filter of the objective, at or near its start, if it is linear and has `score_rows`; else None."""
+    description, is_linear = objective.description, objective.form == "linear"
+    network = choose_typical_network(description) if is_linear else description.start
+    filter = make_filter_of_form(network, objective.form)
+    return filter if filter.has_score_recursion else None
 
 
 _by_xla = quickly_compiled(evaluate_recording)

@@ -155,7 +155,7 @@ def make_objectives(network: Description, by_truth: bool = False) -> list[Object
     if by_truth:
         find_sole_filter(network.start)
         return [_reuse_equal_objective(Objective(network, "truth"))]
-    return [_reuse_equal_objective(Objective(network, form)) for form in list_forms(network.start)]
+    return [_reuse_equal_objective(Objective(network, form)) for form in list_forms(network)]
 
 
 @lru_cache
@@ -164,23 +164,37 @@ def _reuse_equal_objective(objective: Objective) -> Objective:
     return objective
 
 
-def list_forms(network: Network) -> list[Form]:
+def choose_typical_network(description: Description) -> Network:
+    """Return the network at its start, but near it if a gain is random there that is known at the start itself.
+
+    So is one whose spread is free and 0 at the start, as that of two free gains which begin as one.
+    """
+    start = description.start
+    if _has_random_gain(start) or not _has_random_gain(description.near_start):
+        return start
+    return description.near_start
+
+
+def _has_random_gain(network: Network) -> bool:
+    """Return whether what all nodes receive together depends on the signal through a random gain."""
+    link = first(join_all_nodes(network)[-1])
+    return not (link.remembers or link.past or link.has_known_gain) and has_random_gain(link, second_order(link))
+
+
+def list_forms(description: Description) -> list[Form]:
     """Return the forms of the likelihood that a network allows, "linear" before "conditional".
 
     `circular`: with angles; `past`: packets come late; `remembers`: a channel with memory. Linear: by the unconditional
     moments of the state; conditional: by those given the data.
     """
-    plant, sensor, channel = join_all_nodes(network)
+    plant, sensor, channel = join_all_nodes(description.start)
     link = first(channel)
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
         if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
     # Without a random gain both forms are the same; behind memory or delay there is no conditional one.
-    has_linear_alone = link.remembers or link.past or link.has_known_gain
-    if has_linear_alone or not has_random_gain(link, second_order(link)):
-        return ["linear"]
-    return ["linear", "conditional"]
+    return ["linear", "conditional"] if _has_random_gain(choose_typical_network(description)) else ["linear"]
 
 
 def make_filter_of_form(network: Network, form: Form) -> AbstractFilter:

@@ -12,6 +12,7 @@ from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates,
 from heliograph.numerics.types import ArrayLike
 
 NANOSECONDS = np.dtype("datetime64[ns]")
+LONG_AGO, LEAP = 1e8, 100.0  # of a clock that has counted for long, and how many times its time no later one is
 
 
 def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
@@ -145,6 +146,14 @@ def _is_date_label(label: object) -> bool:
     if isinstance(label, str):
         return looks_like_date(label)
     return _is_date(label)
+
+
+def is_mix_of_units(earlier: Any, later: Any) -> Any:
+    """Return whether two times of one clock, numbers or arrays, are in two units, as seconds and milliseconds.
+
+    Of a clock that has counted for long (seconds since 1970 are 1.7e9) a hundredfold leap is no time that went by.
+    """
+    return (earlier >= LONG_AGO) & (later > LEAP * earlier)
 
 
 def find_backwards_row(clock: np.ndarray) -> int | None:

@@ -54,6 +54,7 @@ class Store:
         journal: number of outputs that the journal keeps at least (default 100,000).
         opened: a store open on the same location, which has already looked for damage.
         carrier: carries the plants of another network over; None refuses these.
+        begun: whether it must hold a state already, since another store begins from it.
 
     Raises:
         ValueError: a location that cannot be opened; a database that is damaged as a whole; the state of another
@@ -70,9 +71,10 @@ class Store:
         journal: int = 100_000,
         opened: "Store | None" = None,
         carrier: PlantMigration | None = None,
+        begun: bool = False,
     ):
         """Open the database at `location`, or make it, and check that it is of `mine`; the class says all else."""
-        self.process, self.journal = process, journal
+        self.process, self.journal, self._begun = process, journal, begun
         self.identity: Identity = {}
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         self._engine = open_database(location)
@@ -113,7 +115,9 @@ class Store:
 
     def _check_network(self, mine: Identity) -> None:
         """Raise ValueError, which names what differs, if the store's state is of another network than `mine`."""
-        if _strip_description(mine) == _strip_description(self.identity):
+        # Without the descriptions, whose numbers the other parts have as hashes.
+        here, there = ({key: part for key, part in one.items() if key != DESCRIPTION} for one in (mine, self.identity))
+        if here == there:
             return
         try:
             differs = list_changes(mine, self.identity)
@@ -123,7 +127,7 @@ class Store:
             more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
             got = f"one that differs: {'; '.join(differs[:LISTED])}{more}"
             raise fail(f"store {self.name}", "the state of what is here", got)
-        check_same_network(f"store {self.name}", _strip_description(mine), _strip_description(self.identity))
+        check_same_network(f"store {self.name}", here, there)
 
     @contextmanager
     def _name_store_in_errors(self, expected: str) -> Iterator[None]:
@@ -148,23 +152,24 @@ class Store:
         tables = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
         if tables and tables != set(TABLES.tables):
             raise self._make_unreadable_error(f"no table {', '.join(sorted(set(TABLES.tables) - tables))}")
+        empty = fail(f"store {self.name}", "plants to begin from", "an empty one")
+        if self._begun and not tables:  # nothing is written into what is only read
+            raise empty
         TABLES.create_all(self._engine)
         with self._engine.begin() as connection:
-            this = select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
-            stored = connection.execute(this).scalar()
+            stored = connection.scalar(select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY))
             if stored is None:
                 # A store without an identity is new, unless it has counted something.
                 if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
                     raise self._make_unreadable_error("no network that it is of")
-                if mine is None:
-                    raise fail(f"store {self.name}", "plants to begin from", "an empty one")
+                if mine is None or self._begun:
+                    raise empty
                 connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
                 return mine
         try:
-            identity = dict(json.loads(stored))
-        except (ValueError, TypeError):
+            return dict({LAYOUT_KEY: "1"} | json.loads(stored))  # the first layout did not name itself
+        except (ValueError, TypeError):  # no JSON, or no table
             raise self._make_unreadable_error("no network that it is of") from None
-        return {LAYOUT_KEY: "1"} | identity  # the first layout did not name itself
 
     def _check_layout(self, carried: bool) -> None:
         """Raise ValueError at a store of another layout, unless its plants are `carried` over and its layout can be."""
@@ -349,7 +354,7 @@ class Store:
 
     def begin_from(self, location: str, mine: Identity, carrier: PlantMigration | None = None) -> None:
         """Copy the plants of another store, which stays, into this empty one; `carrier` fits them to this network."""
-        other = Store(location, mine if carrier is None else None)
+        other = Store(location, mine if carrier is None else None, begun=True)
         name_store = self._name_store_in_errors(f"a database that takes the plants of {other.name}")
         with name_store, self._engine.begin() as here, other._engine.connect() as there:
             if here.execute(select(func.count()).select_from(PLANTS)).scalar():
@@ -392,8 +397,3 @@ class Store:
         insert = self._insert(table)
         new_values = {column.name: insert.excluded[column.name] for column in table.c if not column.primary_key}
         connection.execute(insert.on_conflict_do_update(index_elements=["name"], set_=new_values), rows)
-
-
-def _strip_description(identity: Identity) -> Identity:
-    """Return an identity without the description, whose numbers its other parts have as hashes."""
-    return {name: value for name, value in identity.items() if name != DESCRIPTION}

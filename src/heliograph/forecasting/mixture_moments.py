@@ -1,0 +1,108 @@
+"""Moments of forecast numbers as a mixture, the law of each number by itself, and the prediction that both are.
+
+The branches of a noise that is not Gaussian are the Gaussians of which it is a mixture: without and with outliers, or
+of Student's law those of each precision.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.truncation import PlacedLimits
+from heliograph.forecasting.forecast_result import Prediction
+from heliograph.model.estimate import Claim
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.types import Array
+from heliograph.random_affine.moments.mixture_components import GaussianBranches
+
+
+class MarginalLaws(NamedTuple):
+    """Mixture of K Gaussians for each of m numbers: weights, means and variances, (K, m) each."""
+
+    weights: jax.Array
+    means: jax.Array
+    variances: jax.Array
+
+
+class Moments(NamedTuple):
+    """Weights (K,), means (K, m) and covariances (K, m, m) of a mixture.
+
+    `laws`: the law of each number by itself, where it is not the mixture of Gaussians of these moments: with a noise
+    that is not Gaussian, or of a state before it is cut to its limits.
+    """
+
+    weights: jax.Array
+    means: jax.Array
+    covariances: jax.Array
+    laws: MarginalLaws | None = None
+
+
+def spread_over_branches(weights: Array, means: Array, variances: Array, branches: GaussianBranches) -> MarginalLaws:
+    """Return the laws of numbers to which a noise is added that is a mixture of Gaussians: all pairs of both.
+
+    Args:
+        weights: of the parts that the numbers have without the noise (K,).
+        means: of each number in each part (K, m), with the mean of the noise.
+        variances: of each number in each part, without the noise (K, m).
+        branches: of the noise about its mean, (m, J) each.
+    """
+    share, mean, variance = (jnp.asarray(one).T for one in branches)  # (J, m)
+    pairs = (len(weights) * len(share), means.shape[-1])
+    return MarginalLaws(
+        weights=(jnp.asarray(weights)[:, None, None] * jnp.exp(share)).reshape(pairs),
+        means=(jnp.asarray(means)[:, None] + mean).reshape(pairs),
+        variances=(jnp.asarray(variances)[:, None] + variance).reshape(pairs),
+    )
+
+
+def has_branches(branches: GaussianBranches) -> bool:
+    """Return whether a noise has several branches, so that it is not Gaussian."""
+    return int(np.shape(branches.mean)[1]) > 1
+
+
+def make_prediction(
+    moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles, limits: PlacedLimits = ()
+) -> Prediction:
+    """Return the prediction of a mixture of K Gaussians at each horizon, its angles between -pi and pi.
+
+    Args:
+        moments: weights (..., horizons, K), means (..., horizons, K, m) and covariances (..., horizons, K, m, m).
+        names: of the m numbers.
+        claim: what the covariance is.
+        angles: indices of angles among them.
+        limits: index, lowest and highest value of those that have some, to which their laws are cut.
+    """
+    weights, means, covariances = map(np.asarray, moments[:3])
+    variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
+    means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
+    # First two moments of the mixture: within its parts, and between their means.
+    mean = np.einsum("...k,...km->...m", weights, means)
+    apart = means - mean[..., None, :]
+    within = np.einsum("...k,...kij->...ij", weights, covariances)
+    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
+    if claim == "none":
+        covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
+    # The law of each number by itself: of these parts, or one of its own; without end where there is no variance.
+    law_weights, law_means = np.broadcast_to(weights[..., None], means.shape), means
+    if moments.laws is not None:
+        law_weights, law_means, law_variances = map(np.asarray, moments.laws)
+        law_means = wrap_near(law_means, mean[..., None, :], angles)
+        known = np.diagonal(covariance, axis1=-2, axis2=-1)[..., None, :]
+        variances = np.where(np.isfinite(known), np.maximum(law_variances, 0.0), known)
+    wrapped = wrap_angles(mean, angles)
+    whole_turns = (wrapped - mean)[..., None, :]
+    ends = np.tile([-np.inf, np.inf], (len(names), 1))
+    for place, *interval in limits:
+        ends[place] = interval
+    return Prediction(
+        names=names,
+        mean=wrapped,
+        covariance=covariance,
+        claim=claim,
+        weights=law_weights,
+        part_means=law_means + whole_turns,
+        part_variances=variances,
+        limits=tuple((low, high) for low, high in ends.tolist()),
+    )

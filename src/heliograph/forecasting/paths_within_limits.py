@@ -1,0 +1,77 @@
+"""How drawn paths keep the limits of states: where they begin, and at each step."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from heliograph.filters.truncation import PlacedLimits
+from heliograph.numerics.module import Module
+
+
+class StateLimits(Module):
+    """Limits within which states of a path keep: index, lowest and highest value of each limited one."""
+
+    limits: PlacedLimits = eqx.field(static=True)
+
+    def hold(self, x: jax.Array) -> jax.Array:
+        """Return a state (n,) whose limited components are held at the limits that they are beyond."""
+        for place, low, high in self.limits:
+            x = x.at[place].set(jnp.clip(x[place], low, high))
+        return x
+
+    def mirror(self, x: jax.Array) -> jax.Array:
+        """Return a state (n,) whose limited components lie as far within the limits as they were beyond them.
+
+        So noise that is symmetric has, at a limit, the law that it has given that it does not lead beyond.
+        """
+        for place, low, high in self.limits:
+            value = x[place]
+            mirrored = jnp.where(value < low, 2 * low - value, jnp.where(value > high, 2 * high - value, value))
+            x = x.at[place].set(mirrored)
+        return x
+
+
+def draw_limited_components(
+    part: np.ndarray, means: np.ndarray, covariances: np.ndarray, limits: PlacedLimits, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return means (draws, n) and covariances (K, n, n) of Gaussians given their limited components, which are drawn.
+
+    One component after the other is drawn from its normal law, given those before it, cut to its limits. Where there
+    are several, each draw has the product of the probabilities of being within as its weight, by which it is drawn
+    anew.
+
+    Args:
+        part: the Gaussian of each draw (draws,).
+        means: of the Gaussians (K, n).
+        covariances: of them (K, n, n).
+        limits: index, lowest and highest value of each limited component.
+        generator: of the random numbers.
+
+    Source: the simulator of Geweke, Hajivassiliou and Keane; Genz and Bretz, Computation of multivariate normal and t
+        probabilities (2009), 4.2.
+    """
+    center, left, weight = means[part], covariances, np.ones(len(part))
+    for place, low, high in limits:
+        # A number between the least and the most of its distribution function; a component without variance stays.
+        variance = left[:, place, place]
+        is_random = variance > 0
+        divisor = np.where(is_random, variance, 1.0)
+        deviation = np.sqrt(divisor)[part]
+        least, most = (ndtr((end - center[:, place]) / deviation) for end in (low, high))
+        units = ndtri(least + generator.random(len(part)) * (most - least))
+        moved = np.where(is_random[part], deviation * units, 0.0)
+        drawn = np.clip(center[:, place] + moved, low, high)
+        weight *= np.where(is_random[part], most - least, 1.0)
+        # The others given this one.
+        slopes = np.where(is_random[:, None], left[:, :, place] / divisor[:, None], 0.0)
+        center = center + slopes[part] * (drawn - center[:, place])[:, None]
+        center[:, place] = drawn
+        left = left - slopes[:, :, None] * left[:, None, place]
+    if len(limits) > 1 and np.ptp(weight) > 0:
+        for number in np.unique(part):
+            own = np.flatnonzero(part == number)
+            share = weight[own] / weight[own].sum() if weight[own].any() else None
+            center[own] = center[generator.choice(own, size=len(own), p=share)]
+    return center, left
