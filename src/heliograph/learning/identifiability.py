@@ -89,9 +89,11 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
         seed: seed of the data and of the points (default 0).
 
     Raises:
-        ValueError: as `fit`; numbers that messages tell, of which no law is known.
+        ValueError: as `fit`; numbers that messages tell, of which no law is known; senders that decide when to
+            transmit.
     """
     description = describe(network)
+    description.start.check_sends_each_step("identifiability")
     objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
     if inputs is None and count:
