@@ -293,6 +293,9 @@ def fit(
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
     try:
+        if identified.sentences:  # far from the maximum rounding may hide what the data tell near it
+            identified = identified.or_sharper(identify_by_recording(surfaces[-1], solutions[-1].top.x, seed))
+            solutions = [replace(solution, ridges=identified.ridges) for solution in solutions]
         identified = identified.at(solutions[-1])
     except KeyboardInterrupt:  # without these intervals the fit is whole
         stopped = True
@@ -313,10 +316,7 @@ def _maximise_forms(
 
     Returns:
         The solutions, log-likelihoods at the ends of the first form's climbs, and whether Ctrl-C stopped the search:
-        then the last solution is the best point so far.
-
-    Raises:
-        KeyboardInterrupt: before there was a first point.
+        then the last solution is the best point so far. Before there is one, KeyboardInterrupt is raised.
     """
     ends, solutions = np.zeros(0), list[Solution]()
     for surface in surfaces:
