@@ -260,7 +260,8 @@ def fit(
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
-            one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
+            one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these. Readings
+            that a node refuses count as not arrived.
         inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
             none).
         starts: number of starts: the given one, and others drawn around it (default 6).
