@@ -230,3 +230,25 @@ def test_a_slower_sender_loses_what_was_due_and_did_not_come(tmp_path):
     assert cli.main(["fit", str(tmp_path / "net.py"), *arguments]) == 0
     page = (tmp_path / "out" / "report.html").read_text()
     assert f"loss {3 / 148:.3g} " in page and "fast</" not in page[page.index("How measurements are lost") :]
+
+
+def test_readings_that_a_node_refuses_are_neither_learned_from_nor_judged_by(folder, tmp_path):
+    """A code of -999 in a learned row and in a held-out one was a measurement of the fit and of its comparison."""
+    network = (folder / "cart.py").read_text()
+    (tmp_path / "plain.py").write_text(network)
+    (tmp_path / "codes.py").write_text(network.replace("0.9), filters)", "0.9), filters, invalid=-999)"))
+    lines = (folder / "data.csv").read_text().splitlines()[:121]
+    place = lines[0].split(",").index("far")
+    for value, name in (("", "plain"), ("-999", "codes")):
+        rows = [line.split(",") for line in lines]
+        rows[20][place] = rows[110][place] = value
+        (tmp_path / f"{name}.csv").write_text("\n".join(",".join(row) for row in rows))
+
+    def fit(name):
+        command = ["fit", str(tmp_path / f"{name}.py"), "--measurements", str(tmp_path / f"{name}.csv")]
+        assert cli.main([*command, "--out", str(tmp_path / name), "--starts", "1"]) == 0
+        return json.loads((tmp_path / name / "fitted.json").read_text())["values"]
+
+    with pytest.warns(UserWarning, match="2 of 110 values count as not arrived, by code; row 20: far -999 is a code"):
+        found = fit("codes")
+    assert found == fit("plain")

@@ -97,3 +97,41 @@ def test_what_has_no_rate_before_data_is_refused_in_one_line():
     ):
         with pytest.raises(ValueError, match=words):
             build()
+
+
+def test_what_an_unstable_plant_drives_away_while_losses_last_is_in_the_error():
+    """With delta near 0 each step sends: j losses in a row of probability (1 - l) l^j leave s^2 (a^2j - 1) / (a^2 - 1).
+
+    Their sum is s^2 l / (1 - l a^2). The line used to end 12 deviations of a step away: 3.53 was said where it is 5.0.
+    """
+    a, loss = 1.3, 0.5
+    p = 1.0
+    for _ in range(200):
+        before = a * a * p + 1
+        p = before * 0.5 / (before + 0.5)
+    s2, j = before**2 / (before + 0.5), np.arange(2000)
+    sum_of_losses = np.sum((1 - loss) * (loss * a * a) ** j - (1 - loss) * loss**j) * s2 / (a * a - 1)
+    unstable, sensor = hg.LinearPlant([[a]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.5)
+    result = prediction_error_rate(unstable, sensor, 1e-6, loss)
+    assert result.rate == pytest.approx(1, abs=1e-5) and result.error[0] == pytest.approx(p + sum_of_losses, rel=1e-5)
+    assert prediction_error_rate(unstable, sensor, 1.0, 0.7).error[0] == np.inf  # .7 * 1.3^2 > 1
+
+
+@pytest.mark.parametrize("law", [hg.Contaminated(0.1, 0.05, 10.0), hg.StudentT(0.3, 3.0)])
+def test_other_than_gaussian_noise_is_refused(law):
+    """By its variance alone send-on-delta behind this contaminated noise had a rate of .511, which is .433."""
+    plant = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0)
+    for compute in (send_on_delta_rate, delta_for_rate, prediction_error_rate, least_error):
+        with pytest.raises(hg.InputError, match=r"Gaussian noises \(simulate_rate takes any\), got Gaussian and"):
+            compute(plant, hg.LinearSensor([[1.0]], law), 0.3)
+        with pytest.raises(hg.InputError, match="expected Gaussian noises"):
+            compute(hg.LinearPlant([[0.9]], law, [0.0], 1.0), NOISY, 0.3)
+
+
+def test_a_plant_that_inputs_move_has_no_rate_of_send_on_delta():
+    driven = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0, [[1.0]])
+    for compute in (send_on_delta_rate, delta_for_rate):
+        with pytest.raises(hg.InputError, match="expected a plant without inputs"):
+            compute(driven, NOISY, 0.3)
+    still = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0)  # both ends know what inputs do to a prediction
+    assert prediction_error_rate(driven, NOISY, 1.0).rate == prediction_error_rate(still, NOISY, 1.0).rate

@@ -275,3 +275,22 @@ def test_a_link_that_tells_its_gain_is_refused_in_words_that_fit():
     link = hg.hop(hg.Rayleigh(0.8), 0.1, known=True)
     with pytest.raises(ValueError, match="channel: expected one whose gain and noise no message tells"):
         hg.simulation.certify_boundedness(hg.Network(plant, {"a": hg.Node(sensor, link, {})}))
+
+
+@pytest.mark.parametrize("chosen", [{"trigger": hg.Periodic(8)}, {"trigger": hg.SendOnDelta(3.0)}, {"limits": (-5, 5)}])
+def test_what_values_decide_to_hold_back_certifies_nothing(chosen):
+    """Such nodes were taken to deliver every value: a bound of 2.95 where all is refused once |y| > 5."""
+    sensor, silent = hg.LinearSensor([[1.0]], 2.5), hg.LinearSensor([[0.0]], 1.0)
+    alone = hg.Node(sensor, hg.perfect(), {}, **chosen)
+    beside = hg.Node(hg.LinearSensor([[1.0]], 10.0), hg.perfect(), {})
+
+    def judge(a, /, **nodes):
+        return hg.simulation.certify_boundedness(hg.Network(plant([[a]]), nodes))
+
+    unjudged = judge(1.2, a=alone)
+    assert unjudged.verdict == "undecided" and "nodes ['a'] show is not counted" in unjudged.reason
+    # The other node alone certifies, with the steady variance P- = q + a^2 P- r / (P- + r) behind it.
+    found, b = judge(1.2, a=alone, b=beside), 10 * (1 - 1.2**2) - 1
+    assert found.verdict == "certified" and found.bound[0, 0] == pytest.approx((-b + np.sqrt(b * b + 40)) / 2)
+    assert judge(0.9, a=alone).bound[0, 0] == pytest.approx(1 / (1 - 0.9**2))
+    assert judge(1.2, a=hg.Node(silent, hg.perfect(), {}, **chosen)).verdict == "impossible"

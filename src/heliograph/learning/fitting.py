@@ -260,6 +260,7 @@ def fit(
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, or rows of the one node alone, NaN for
             what did not arrive; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
+            Readings that a node refuses count as not arrived.
         inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
             none).
         starts: number of starts: the given one, and others drawn around it (default 6).
@@ -293,6 +294,9 @@ def fit(
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
     try:
+        if identified.sentences:  # far from the maximum rounding may hide what the data tell near it
+            identified = identified.or_sharper(identify_by_recording(surfaces[-1], solutions[-1].top.x, seed))
+            solutions = [replace(solution, ridges=identified.ridges) for solution in solutions]
         identified = identified.at(solutions[-1])
     except KeyboardInterrupt:  # without these intervals the fit is whole
         stopped = True
@@ -313,10 +317,7 @@ def _maximise_forms(
 
     Returns:
         The solutions, log-likelihoods at the ends of the first form's climbs, and whether Ctrl-C stopped the search:
-        then the last solution is the best point so far.
-
-    Raises:
-        KeyboardInterrupt: before there was a first point.
+        then the last solution is the best point so far. Before there is one, KeyboardInterrupt is raised.
     """
     ends, solutions = np.zeros(0), list[Solution]()
     for surface in surfaces:

@@ -67,6 +67,13 @@ class Identifiability:
         lost = {index for group in self.groups for index in group.places}
         return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
 
+    def or_sharper(self, other: "Identifiability") -> "Identifiability":
+        """Return the one of this and another with fewer ridges, or as many and the larger `weakest`.
+
+        What data tell at one point they tell almost everywhere, so that more ridges are rounding.
+        """
+        return min(self, other, key=lambda known: (known.ridges, -known.weakest))
+
     def at(self, solution: "Solution") -> "Identifiability":
         """Return the identifiability with estimates and intervals of what is identified."""
         return replace(self, sentences=describe_unidentified(self, solution))
@@ -89,10 +96,12 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
         seed: seed of the data and of the points (default 0).
 
     Raises:
-        ValueError: as `fit`; numbers that messages tell, of which no law is known.
+        ValueError: as `fit`; numbers that messages tell, of which no law is known; senders that decide when to
+            transmit.
     """
     seed = check_seed("seed", seed)
     description = describe(network)
+    description.start.check_sends_each_step("identifiability")
     objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
     if inputs is None and count:

@@ -101,7 +101,7 @@ def samples_to_tell(
 
 def _find_only_node(network: Network) -> tuple[str, Node]:
     """Return name and node of the network's only node, which receives a sensor through a channel; refuse all others."""
-    instance("network", network, Network, "a Network")
+    instance("network", network, Network, "a Network").check_sends_each_step("samples to tell two laws")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
         raise fail("network", "one node that receives its sensor through a channel", f"{len(network.nodes)} nodes")

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
@@ -17,6 +16,7 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.numerics.module import readable
+from heliograph.random_affine.noise import Gaussian
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo
@@ -135,45 +135,49 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
 
         v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de),  kappa = 1 within delta, `loss` beyond.
 
-    With the mean length T = 1 + int v of such a cycle the rate is (1 + int_{|e| > delta} v) / T and the error
-    P + int e^2 v / T. Both are exact.
+    Let V and M be int v and int e^2 v within delta. Integrals of the equation and of e^2 times it over the whole line
+    give the mean length T of such a cycle, the rate and the error, whatever is left beyond:
+
+        T = V + 1 / (1 - loss),  rate = 1 / ((1 - loss) T),
+        error = P + (loss s^2 + (1 - loss) M / T) / (1 - loss a^2),  infinite where loss a^2 >= 1.
 
     Args:
-        plant: of one state.
-        sensor: of one output.
+        plant: linear, of one state, with Gaussian noise.
+        sensor: linear, of one output, with Gaussian noise.
         delta: distance beyond which is sent, in the unit of the state.
         loss: probability that a transmission is lost (default 0).
 
     Raises:
-        ValueError: a plant or sensor of more than one state and output; a loss of 1 or more.
+        ValueError: another plant or sensor; a loss of 1 or more.
     Source: Lipsa and Martins, Remote state estimation with communication costs for first-order LTI systems (2011).
     """
     system = _require_scalar_system(plant, sensor)
     a, q, c, r = system
     delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
-    if not loss < 1:
+    if loss == 1:
         raise fail("loss", "a number below 1", loss)
     posterior = system.kalman_variance
-    prior = a * a * posterior + q
-    s = prior / np.sqrt(prior + r / c**2)
+    s = (a * a * posterior + q) / np.sqrt(a * a * posterior + q + r / c**2)
     # The line in parts, within delta and beyond, with nodes and weights of an integral over it. Beyond delta e stays
     # only where what is sent is lost, so that without losses there is nothing.
     far = delta + REACH * s / np.sqrt(1 - loss)
     edges = [-far, -delta, delta, far] if loss else [-delta, delta]
     if far > LONGEST * s:
-        raise fail(
-            "delta and loss", f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}", f"{far:.3g}"
-        )
+        most = f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}"
+        raise fail("delta and loss", most, f"{far:.3g}")
     nodes, weights = _make_quadrature(edges, s)
     # The integral equation of v at the nodes (Nystrom's method), then the sums over a cycle.
     is_within = np.abs(nodes) <= delta
     kappa = np.where(is_within, 1.0, loss)
     kernel = kappa[:, None] * _normal_density(nodes[:, None] - a * nodes, s * s) * weights  # [to, from]
     visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal_density(nodes, s * s)) * weights  # v de
-    cycle = 1 + visits.sum()
-    rate = (1 + visits[~is_within].sum()) / cycle
-    error = posterior + nodes**2 @ visits / cycle
-    return MessageRate(rate=float(rate), error=np.array([error]), rate_error=0.0, error_error=np.zeros(1))
+    # Summed is what lies within delta: what an unstable plant drives beyond the ends of the line does not come back.
+    cycle = visits[is_within].sum() + 1 / (1 - loss)
+    second = nodes[is_within] ** 2 @ visits[is_within] / cycle
+    decay = 1 - loss * a * a
+    error = posterior + (loss * s * s + (1 - loss) * second) / decay if decay > 0 else np.inf
+    rate = float(1 / ((1 - loss) * cycle))
+    return MessageRate(rate=rate, error=np.array([error]), rate_error=0.0, error_error=np.zeros(1))
 
 
 def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0.0) -> float:
@@ -184,8 +188,8 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
     is computed, not proved.
 
     Args:
-        plant: a linear plant of one state.
-        sensor: a linear sensor of one output.
+        plant: as of the rate.
+        sensor: as of the rate.
         rate: transmissions a step.
         loss: probability that a transmission is lost (default 0).
 
@@ -206,16 +210,17 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
     of itself where one step in a hundred sends, to 1 % at one in 2,500.
 
     Args:
-        plant: of one state, stable.
-        sensor: of one output.
+        plant: linear, of one state, stable, without inputs, with Gaussian noise.
+        sensor: linear, of one output, with Gaussian noise.
         delta: distance from the value sent last beyond which is sent, in the unit of y.
 
     Raises:
-        ValueError: a plant or sensor of more than one state and output; a plant that is not stable; a delta so large
+        ValueError: another plant or sensor; a plant that is not stable; a delta so large
             that less than one message in a million steps is sent; a grid that is too fine, or a rate that converges
             too slowly to be computed.
     """
-    rate = _send_on_delta_rate(_require_scalar_system(plant, sensor), float(scalar("delta", delta, TINY)))
+    system = _require_scalar_system(plant, sensor, without_inputs=True)
+    rate = _send_on_delta_rate(system, float(scalar("delta", delta, TINY)))
     if rate < RAREST:
         raise fail("delta", f"one at which more than {RAREST:g} messages are sent a step", f"{delta:g}")
     return rate
@@ -335,14 +340,14 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
     """Return the delta with which send-on-delta transmits at a rate, by bisection of `send_on_delta_rate`.
 
     Args:
-        plant: a linear plant of one state.
-        sensor: a linear sensor of one output.
+        plant: as of the rate.
+        sensor: as of the rate.
         rate: transmissions a step.
 
     Raises:
         ValueError: as `send_on_delta_rate`; a rate that is not between 0 and 1.
     """
-    system = _require_scalar_system(plant, sensor)
+    system = _require_scalar_system(plant, sensor, without_inputs=True)
     return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, GRID_ACCURACY)
 
 
@@ -362,8 +367,8 @@ def _find_threshold(
     return float(brentq(lambda delta: rate_at(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
 
 
-def _require_scalar_system(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
-    """Return a, q, c and r of a linear plant and sensor; ValueError unless they have one state and one output."""
+def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: bool = False) -> _ScalarSystem:
+    """Return a, q, c, r of a linear plant and sensor of one number and Gaussian noise each; ValueError for others."""
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         raise fail("rate before any data", expected, f"{type(plant).__name__} and {type(sensor).__name__}")
@@ -371,9 +376,14 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
         raise fail("rate before any data", expected, "several states")
     if len(sensor.outputs) != 1:
         raise fail("rate before any data", "one output", f"{len(sensor.outputs)}")
+    if without_inputs and plant.inputs:  # what is measured moves as they do
+        raise fail("rate before any data", "a plant without inputs", list(plant.inputs))
+    if not (isinstance(plant.noise, Gaussian) and isinstance(sensor.noise, Gaussian)):
+        laws = f"{type(plant.noise).__name__} and {type(sensor.noise).__name__}"
+        raise fail("rate before any data", "Gaussian noises (simulate_rate takes any)", laws)
     return _ScalarSystem(
         a=float(np.asarray(plant.matrix)[0, 0]),
-        q=float(np.asarray(plant.noise_covariance(jnp.zeros(0)))[0, 0]),
+        q=float(np.asarray(plant.noise.covariance)[0, 0]),
         c=float(np.asarray(sensor.matrix)[0, 0]),
         r=float(np.asarray(sensor.noise.covariance)[0, 0]),
     )

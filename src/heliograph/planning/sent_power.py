@@ -97,9 +97,9 @@ def power(
 
     Raises:
         ValueError: no horizon for a plant that is not stable or not linear, or for a sensor with feedback; inputs of
-            another shape, or without a horizon.
+            another shape, or without a horizon; a sender that decides when to transmit.
     """
-    instance("network", network, Network, "a Network")
+    instance("network", network, Network, "a Network").check_sends_each_step("power before any data")
     if horizon is None and inputs is not None:
         raise fail("inputs", "a horizon beside them, as the steady power is that of inputs of 0", "none")
     plant = first(network.plant)

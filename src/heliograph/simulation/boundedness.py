@@ -21,20 +21,18 @@ from heliograph.linear.known_loss_stability import (
     find_gains,
     is_excited_by_noise,
 )
-from heliograph.linear.steady_state import plant_matrices, sensor_matrices
-from heliograph.model.channel import Channel, parallel
-from heliograph.model.channel_side_information import separate_told_numbers
-from heliograph.model.over_time import OverTime, first
-from heliograph.numerics.check import fail, instance
+from heliograph.linear.steady_state import plant_matrices
+from heliograph.model.over_time import first
+from heliograph.numerics.check import instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
+from heliograph.random_affine.base import ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
-from heliograph.random_affine.memories_of_channels import memories
-from heliograph.random_affine.modes import joint_modes, long_run_law
+from heliograph.random_affine.modes import long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.transmission.joint_links import JointLinks, join_links
 
 CERTAIN = 1e-13  # of a row's second moment: a variance of its gain that is rounding
 
@@ -63,26 +61,6 @@ class Boundedness(NamedTuple):
     bound: Float[np.ndarray, "n n"] | None
 
 
-class JointLinks(NamedTuple):
-    """Joint model of all links: a chain of modes, the outcomes of each, and the sensors, one above the other.
-
-    Args:
-        initial: probabilities of the modes at the first step.
-        chain: [i, j]: probability that mode j follows mode i.
-        outcomes: what may arrive in each mode, a list for each.
-        sensing: H, m measured components of all nodes by n states.
-        sensor_mean: E v.
-        sensor_noise: Cov v.
-    """
-
-    initial: Float[np.ndarray, "modes"]
-    chain: Float[np.ndarray, "modes modes"]
-    outcomes: list[list[ArrivalOutcome]]
-    sensing: Float[np.ndarray, "m n"]
-    sensor_mean: Float[np.ndarray, "m"]
-    sensor_noise: Float[np.ndarray, "m m"]
-
-
 def certify_boundedness(network: Network) -> Boundedness:
     """Judge E P of the best filter that receives every node of `network`, linear in what arrives, knowing what arrived.
 
@@ -92,6 +70,8 @@ def certify_boundedness(network: Network) -> Boundedness:
     impossible.
     Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
     are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
+    Nodes of which a trigger, limits or `stuck` decide what is used are not counted on: certified is what the others
+    show; impossible is what all could not show though they sent everything; all else is undecided.
 
     Args:
         network: linear, of nodes that receive their sensors over channels that do not vary.
@@ -105,7 +85,20 @@ def certify_boundedness(network: Network) -> Boundedness:
     """
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
-    links = _join_links(network, len(a))
+    chosen = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.chosen_by_value]
+    found = _judge_links(network, a, q, join_links(network, len(a), counts_all=False))
+    if not chosen or found.verdict == "certified":
+        return found
+    # The other nodes certify nothing. What grows though all nodes sent everything grows in any case.
+    complete = _judge_links(network, a, q, join_links(network, len(a), counts_all=True))
+    if complete.verdict == "impossible":
+        return complete
+    unjudged = f"what nodes {chosen} show is not counted, as values decide what of it is used"
+    return found._replace(verdict="undecided", reason=f"{found.reason}; {unjudged}")
+
+
+def _judge_links(network: Network, a: np.ndarray, q: np.ndarray, links: JointLinks) -> Boundedness:
+    """Return the verdict for a plant x+ = A x + N(0, Q) that these links show."""
     # Used are the sums of what arrives whose gain on all of x is known. If that certifies nothing: the sums whose gain
     # on the modes that do not decay is known, of which there are more.
     growing = _find_unstable_modes(a)
@@ -129,56 +122,6 @@ def certify_boundedness(network: Network) -> Boundedness:
     return Boundedness(
         verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=known.map_gains(gains), bound=None
     )
-
-
-def _join_links(network: Network, states: int) -> JointLinks:
-    """Return the joint model of all nodes' links: sensors stacked, channels in parallel, modes that occur.
-
-    `states`: number of the plant's.
-
-    Raises:
-        ValueError: no node that receives a sensor; relays that filter; channels that vary, deliver late or have
-            uncertain probabilities.
-    """
-    if network.relays is not None:
-        raise fail("nodes", "ones that receive the sensors over channels", "relays that filter")
-    # Sensors one above the other.
-    nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
-    if not nodes:
-        raise fail("nodes", "at least one that receives a sensor", "none")
-    matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
-    means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
-    channels = [_read_constant_channel(node.channel) for node in nodes]
-    # Channels in parallel, as one chain of modes.
-    joint = parallel(channels) if len(channels) > 1 else channels[0]
-    for memory in memories(joint).values():
-        if memory.is_uncertain:
-            raise fail("chain of a channel", "one of known transition", "one whose probabilities are uncertain")
-    # A drifting gain is put on a grid of two values: enough to know that it is random.
-    modes = joint_modes(joint, 2)
-    initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
-    # Modes that can occur. Entry j of p (I + T)^M, with p the initial law, T the chain and M its number of modes, sums
-    # the weights of all ways to mode j in at most M steps; it is positive if there is one.
-    happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
-    return JointLinks(
-        initial=initial[happens],
-        chain=chain[np.ix_(happens, happens)],
-        outcomes=[mode.list_outcomes() for mode, ever in zip(modes.maps, happens, strict=True) if ever],
-        sensing=np.concatenate(matrices),
-        sensor_mean=np.concatenate(means),
-        sensor_noise=scipy.linalg.block_diag(*noises),
-    )
-
-
-def _read_constant_channel(channel: Channel) -> AbstractRandomAffine:
-    """Return a channel that neither varies nor delays nor tells its gain as it is; raise ValueError for another."""
-    if isinstance(channel, OverTime):
-        raise fail("channel", "one that does not vary", "one that varies")
-    if channel.past:
-        raise fail("channel", "one without delays", f"one that is late by up to {channel.past} steps")
-    if separate_told_numbers(channel).numbers:
-        raise fail("channel", "one whose gain and noise no message tells", "one whose messages tell of it")
-    return channel
 
 
 def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:

@@ -368,6 +368,12 @@ class Network(Module):
         one_of_each = [self.nodes[names[0]] for names in self.groups]  # a group's nodes cover the same steps
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
 
+    def check_sends_each_step(self, what: str) -> None:
+        """Raise ValueError if a node has a trigger: `what` is computed for senders that transmit at each step."""
+        deciding = [name for name, node in self.nodes.items() if isinstance(node, Node) and node.trigger is not None]
+        if deciding:
+            raise fail(what, "senders that transmit at each step", f"triggers of {deciding}")
+
 
 readable(Network)
 Network.__repr__ = write_short_diagram  # type: ignore[method-assign, assignment]

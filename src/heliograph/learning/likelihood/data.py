@@ -1,5 +1,6 @@
 """Recordings of a fit, gathered and checked against the network."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -12,6 +13,7 @@ from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
+from heliograph.simulation.screened_recording import screen_recording
 
 FEWEST = 10  # least count of numbers that arrived for each free number
 
@@ -163,19 +165,23 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
 
     `run`: an array (steps, received by it) for each node, in the network's order; `inputs`: None if there are none.
     """
-    columns: list[np.ndarray] = []
+    measured: dict[str, np.ndarray] = {}
     for name, z in zip(network.names, run, strict=True):
-        length = len(columns[0]) if columns else None  # that of the first node
-        measured = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
-        columns.append(np.asarray(measured))
-    steps, count = len(columns[0]), len(network.inputs)
+        length = len(measured[network.names[0]]) if measured else None  # that of the first node
+        rows = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
+        measured[name] = np.asarray(rows)
+    steps, count = len(measured[network.names[0]]), len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
     u = np.zeros((steps, 0))
     if inputs is not None:
         u = np.array(check_rows("inputs", inputs, steps, count, missing=False, names=network.inputs))
     check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
-    return np.concatenate(columns, axis=1), u
+    # Readings that the nodes refuse, by limits, codes or as stuck, count as not arrived, as where filters run.
+    screened = screen_recording(network, measured, u, {})
+    for line in screened.said:
+        warnings.warn(line, stacklevel=2)
+    return np.concatenate([screened.measurements[name] for name in network.names], axis=1), u
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:

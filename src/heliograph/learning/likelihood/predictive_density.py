@@ -262,7 +262,11 @@ def _weigh_combinations(
     both = present[..., None] & present[..., None, :]
     total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
     total = np.where(both, total, np.where(np.eye(z.shape[1], dtype=bool), 1.0, 0.0))
-    root = np.linalg.cholesky(total)
+    try:
+        root = np.linalg.cholesky(total)
+    except np.linalg.LinAlgError as why:
+        expected = "one behind which every measurement has a density, whatever the gain"
+        raise fail("channel of a predictive density", expected, "one that delivers a number without noise") from why
     value = np.where(present, z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     error = np.linalg.solve(root, value[..., None])[..., 0]
     scale = np.diagonal(root, axis1=-2, axis2=-1)

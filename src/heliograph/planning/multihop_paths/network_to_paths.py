@@ -93,9 +93,7 @@ def _require_plain_nodes(network: Network) -> dict[str, Node]:
     if network.common is not None:
         raise _make_no_paths_error("nodes that share a channel (give a function of free numbers)")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    deciding = [name for name, node in nodes.items() if node.trigger is not None]
-    if deciding:
-        raise fail("design", "senders that transmit at each step", f"triggers of {deciding}")
+    network.check_sends_each_step("design")
     return nodes
 
 

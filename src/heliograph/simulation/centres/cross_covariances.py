@@ -151,7 +151,8 @@ def cross_covariances(
         inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Raises:
-        ValueError: a network that is not linear, filters whose gains depend on data, channels with memory.
+        ValueError: a network that is not linear, filters whose gains depend on data, channels with memory, senders that
+            decide when to transmit.
 
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
@@ -198,9 +199,10 @@ def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | No
     """Return the network's filters, planned for the inputs, and the inputs (horizon, inputs).
 
     Raises:
-        ValueError: no informed fusion, or filters whose gains depend on data.
+        ValueError: no informed fusion, senders that decide when to transmit, or filters whose gains depend on data.
     """
     network.check_horizon(check_horizon(horizon))
+    network.check_sends_each_step("covariances before data")
     u = read_plant_inputs(network, inputs, horizon)
     filters = AllFilters(network)
     if not filters.centres:

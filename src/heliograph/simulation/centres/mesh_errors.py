@@ -349,7 +349,9 @@ def find_mesh(network: Network, fusion: str) -> Mesh:
 
     It raises also for one of over 2,000 nodes (SPARSE), whose joint covariance would not fit in memory.
     """
-    instance("network", network, Network, "a Network")
+    instance("network", network, Network, "a Network").check_sends_each_step(
+        "errors between neighbours before any data"
+    )
     if not isinstance(fusion, str) or fusion not in network.meshes:
         raise fail("fusion", f"one between neighbours, of {list(network.meshes)}", repr(fusion))
     if len(network.mesh_nodes(fusion)) > SPARSE:

@@ -116,6 +116,7 @@ def relay_tree(
         (name,) = leaf.filters
         one_leaf = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
         one_leaf.check_horizon(steps)
+        one_leaf.check_sends_each_step("covariances before data")
         u = read_plant_inputs(one_leaf, inputs, steps)
         # Leaves in blocks of about BLOCK, each of them all leaves of some relays; of each block the covariances, the
         # weights, and the errors of the relays above.
