@@ -11,6 +11,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.model.checks.plant_inputs import do_inputs_spoil
 from heliograph.model.estimate import Innovation
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.types import PyTree
 
 ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
@@ -77,7 +78,7 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
+        implausible = is_implausible(innovation, z, received_angles(filter), real) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
 
@@ -116,9 +117,9 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         after, innovation = filter.correct(prior, z, k)
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
         judgement = Judgement.judge_correction(
-            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms
+            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, received_angles(filter)
         )
-        implausible = is_implausible(innovation, z, ROUNDING[real])
+        implausible = is_implausible(innovation, z, received_angles(filter), real)
         beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
@@ -126,15 +127,25 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     return correct
 
 
-def is_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
+def received_angles(filter: AbstractFilter) -> Angles:
+    """Return which of the numbers that a filter receives it takes for angles."""
+    used = filter.angles_used()
+    return used.received if used else ()
+
+
+def is_implausible(innovation: Innovation, z: jax.Array, angles: Angles, real: str) -> jax.Array:
     """Return whether some component of z is larger than expected, and too many of its own deviations away from that.
 
+    Or whether one of its `angles` has too many turns for numbers of type `real`.
+
     The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
-    z, such as a neighbour's measurement, every component that is so far away counts. A difference within `rounding`,
+    z, such as a neighbour's measurement, every component that is so far away counts. A difference within ROUNDING,
     relative to z, counts nothing.
     """
     far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if differs.shape == z.shape:
         larger = jnp.abs(z) > jnp.abs(z - innovation.value)
-        far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+        far &= larger & (differs > ROUNDING[real] * jnp.maximum(jnp.abs(z), 1e-33))
+        if angles:
+            far |= Judgement.find_unreadable(innovation, z, angles, float(np.finfo(PRECISION[real]).eps))
     return jnp.any(far)

@@ -326,7 +326,9 @@ def step_with_judgement(
     estimate = filter.after_step(after, k)
     estimates = filter.estimate(state), filter.estimate(prior), estimate
     spoilt = do_inputs_spoil(filter, filter.inputs, u, k)
-    judgement = judge_step(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, spoilt)
+    angles = used.received if (used := filter.angles_used()) else ()
+    states = state, prior, after
+    judgement = judge_step(filter.claim, states, estimates, innovation, z, filter.of_atoms, angles, spoilt)
     return after, estimate, judgement, innovation
 
 
