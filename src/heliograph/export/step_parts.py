@@ -15,7 +15,7 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.types import PyTree
 
 ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
-PRECISION = {"double": np.float64, "float": np.float32}
+PRECISION: dict[str, type[np.floating]] = {"double": np.float64, "float": np.float32}
 
 
 class PartOfStep(NamedTuple):

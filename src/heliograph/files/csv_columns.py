@@ -16,7 +16,7 @@ from heliograph.numerics.times.dates import MISSING as NAT
 from heliograph.numerics.times.dates import looks_like_date, parse_moment
 from heliograph.numerics.types import Float
 
-WHOLE = re.compile(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}")  # numbers that 64 bits hold
+WHOLE = re.compile(r"([+-]?\d{1,18}|[+-]?[1-8]\d{18})(?:\.0*)?")  # numbers that 64 bits hold
 
 
 def read_csv_blocks(
@@ -186,12 +186,16 @@ class CsvColumnReader:
     def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
         """Return a column as dates, as int64 if its cells are whole numbers that doubles cannot tell apart, or floats.
 
-        `values` of dates are nanoseconds since 1970, NAT for an empty cell; EXACT: 2^53, up to which doubles are exact.
+        `values` of dates are nanoseconds since 1970, NAT for an empty cell; it stands for one among int64 too. EXACT:
+        2^53, up to which doubles are exact.
         """
         if self._dated.get(name):
             whole = [NAT if value != value else int(value) for value in values]  # before the first date all are empty
             return np.array(whole, dtype=np.int64).view("datetime64[ns]")
         numbers = np.array(values, dtype=np.float64)
-        if np.any(np.abs(numbers) >= EXACT) and all(map(WHOLE.fullmatch, cells)):
-            return np.array([int(cell) for cell in cells], dtype=np.int64)
-        return numbers
+        if not np.any(np.abs(numbers) >= EXACT):
+            return numbers
+        found = [WHOLE.fullmatch(cell) for cell in cells]
+        if not all(match or np.isnan(number) for match, number in zip(found, numbers, strict=True)):
+            return numbers
+        return np.array([int(match[1]) if match else NAT for match in found], dtype=np.int64)
