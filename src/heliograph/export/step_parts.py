@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.angle_indices import FilterAngles
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.model.checks.plant_inputs import do_inputs_spoil
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.angle import Angles
 from heliograph.numerics.types import PyTree
 
 ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
@@ -78,7 +78,7 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = is_implausible(innovation, z, received_angles(filter), real) | (judgement.input > 0)
+        implausible = is_implausible(innovation, z, filter.angles_used(), real) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
 
@@ -117,9 +117,9 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         after, innovation = filter.correct(prior, z, k)
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
         judgement = Judgement.judge_correction(
-            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, received_angles(filter)
+            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, filter.angles_used()
         )
-        implausible = is_implausible(innovation, z, received_angles(filter), real)
+        implausible = is_implausible(innovation, z, filter.angles_used(), real)
         beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
@@ -127,13 +127,7 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     return correct
 
 
-def received_angles(filter: AbstractFilter) -> Angles:
-    """Return which of the numbers that a filter receives it takes for angles."""
-    used = filter.angles_used()
-    return used.received if used else ()
-
-
-def is_implausible(innovation: Innovation, z: jax.Array, angles: Angles, real: str) -> jax.Array:
+def is_implausible(innovation: Innovation, z: jax.Array, angles: FilterAngles | None, real: str) -> jax.Array:
     """Return whether some component of z is larger than expected, and too many of its own deviations away from that.
 
     Or whether one of its `angles` has too many turns for numbers of type `real`.
@@ -147,5 +141,5 @@ def is_implausible(innovation: Innovation, z: jax.Array, angles: Angles, real: s
         larger = jnp.abs(z) > jnp.abs(z - innovation.value)
         far &= larger & (differs > ROUNDING[real] * jnp.maximum(jnp.abs(z), 1e-33))
         if angles:
-            far |= Judgement.find_unreadable(innovation, z, angles, float(np.finfo(PRECISION[real]).eps))
+            far |= Judgement.find_unreadable(innovation, z, angles.received, float(np.finfo(PRECISION[real]).eps))
     return jnp.any(far)

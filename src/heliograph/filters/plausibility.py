@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.angle_indices import FilterAngles
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.angle import TURN, Angles
 from heliograph.numerics.linalg import (
@@ -98,12 +99,12 @@ class Judgement(NamedTuple):
         (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
         empty = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
         three = estimate_before, prediction, prediction  # before, after prediction, after a correction by nothing
-        return judge_step(claim, (before, prior, prior), three, empty, no_data, False, (), spoilt)
+        return judge_step(claim, (before, prior, prior), three, empty, no_data, False, None, spoilt)
 
     @staticmethod
     def judge_correction(
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
-        z: Float[Array, " m"], of_atoms: bool, angles: Angles,
+        z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
     ) -> "Judgement":  # fmt: skip
         """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
         (prior, after), (expected, corrected) = states, estimates
@@ -215,7 +216,8 @@ def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
 
 def judge_step(
     claim: Claim, states: tuple[PyTree, PyTree, PyTree], estimates: tuple[Estimate, Estimate, Estimate],
-    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, angles: Angles, spoilt: Array | bool = False,
+    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
+    spoilt: Array | bool = False,
 ) -> Judgement:  # fmt: skip
     """Judge a step by its innovation, and by the states and estimates before it, after prediction and after correction.
 
@@ -233,11 +235,11 @@ def judge_step(
         innovation: of the measurement.
         z: the measurement (m,), NaN for what did not arrive.
         of_atoms: whether the filter is a mixture, of which no atom may produce z.
-        angles: which components of z are angles.
+        angles: which components of z the filter takes for angles; None where it does not say.
         spoilt: whether the inputs of the prediction were no numbers already.
     """
     (state_before, state_prior, state_after), (before, prior, after) = states, estimates
-    of_value = _judge_value(innovation, z, of_atoms, angles)
+    of_value = _judge_value(innovation, z, of_atoms, angles.received if angles else ())
     # States that stop being numbers, by the correction or already by the prediction.
     is_sound = _is_sound_correction(after, claim, prior)
     loses_soundness = _is_sound_correction(prior, claim, before) & ~is_sound
