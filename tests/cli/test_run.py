@@ -54,6 +54,22 @@ def test_a_row_without_a_stamp_does_not_cost_the_digits_of_others(folder, capsys
     assert np.isnan(read_table(name)["time"][3])  # for whoever reads the table, which is of float64 then
 
 
+def test_rows_that_could_not_be_read_do_not_share_the_time_of_others(folder, capsys):
+    """Their times are made up: "3 of 3 rows share their time, as stamps do that lost their digits" was said of them."""
+    (folder / "net.py").write_text(
+        """import heliograph as hg
+plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states=["x"])
+sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["t"])
+network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
+"""
+    )
+    (folder / "data.csv").write_text('time,t,truth.x\n0,"20,5",\n1,"21,5",\n2,22,\n')
+    assert cli.main(run_arguments()) == 0
+    said = capsys.readouterr()
+    assert "rows that could not be read: 2" in said.err and "share their time" not in said.err
+    assert "nan" not in said.out
+
+
 @pytest.mark.slow
 def test_run_writes_what_later_rows_say_too(folder, capsys):
     assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0

@@ -254,8 +254,8 @@ def _make_inputs(
     if row is not None:
         where = f"{source}, row {rows.numbers[row]}, column {TIME!r}"
         raise fail(where, "a time that does not go backwards", backwards_text(time, row))
-    _warn_of_equal_times(time, source)
-    _warn_of_dates_as_numbers(time, source)
+    _warn_of_equal_times(time[rows.arrived], source)
+    _warn_of_dates_as_numbers(time[rows.arrived], source)
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
