@@ -3,6 +3,7 @@
 import os
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import heliograph as h
@@ -38,6 +39,35 @@ def test_run_writes_what_the_library_computes(folder, capsys):
 def test_a_lag_is_refused_of_rows_before_they_are_read(folder, capsys):
     (folder / "data.csv").write_text("time,push,pos\n0,0,no number\n")
     refused(folder, capsys, [*run_arguments(), "--lag", "1"], "--lag", "expected messages or events, got rows of time")
+
+
+@pytest.mark.parametrize("name", ["data.csv", "data.parquet"])
+def test_a_row_without_a_stamp_does_not_cost_the_digits_of_others(folder, capsys, name):
+    """The row is refused alone; all stamps were doubles with it, which are 256 apart here."""
+    stamps = [1_700_000_000_000_000_000 + step for step in (0, 1, 2, 4)]
+    time = pd.array([*stamps[:3], None, stamps[3]], dtype="Int64")
+    table = pd.DataFrame({"time": time, "push": 0.0, "pos": [1.0, 1.1, 1.2, 1.3, 1.4]})
+    table.to_csv(folder / name, index=False) if name.endswith("csv") else table.to_parquet(folder / name)
+    assert cli.main(["run", "net.py", "--measurements", name, "--out", "out.parquet"]) == 0
+    assert "row 4, column 'time': expected a finite number, got an empty cell" in capsys.readouterr().err
+    assert read_table("out.parquet")["time"].tolist() == stamps
+    assert np.isnan(read_table(name)["time"][3])  # for whoever reads the table, which is of float64 then
+
+
+def test_rows_that_could_not_be_read_do_not_share_the_time_of_others(folder, capsys):
+    """Their times are made up: "3 of 3 rows share their time, as stamps do that lost their digits" was said of them."""
+    (folder / "net.py").write_text(
+        """import heliograph as hg
+plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states=["x"])
+sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["t"])
+network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
+"""
+    )
+    (folder / "data.csv").write_text('time,t,truth.x\n0,"20,5",\n1,"21,5",\n2,22,\n')
+    assert cli.main(run_arguments()) == 0
+    said = capsys.readouterr()
+    assert "rows that could not be read: 2" in said.err and "share their time" not in said.err
+    assert "nan" not in said.out
 
 
 @pytest.mark.slow

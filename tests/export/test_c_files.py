@@ -122,6 +122,17 @@ def test_a_relay_s_schedule(precision, most, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.parametrize(("precision", "turns"), [("double", 1e5), ("float", 10)])
+def test_an_angle_whose_turns_leave_it_no_digits_is_refused(precision, turns, tmp_path):
+    plant = hg.Plant(lambda x, u: x + 0.1, 0.1, [3.0], 1.0, states=["heading"], circular=["heading"])
+    sensor = hg.Sensor(lambda x: x, 0.1, outputs=["compass"], circular=["compass"])
+    device = Device(hg.extended_filter(plant, sensor, hg.perfect()), tmp_path, precision=precision)
+    assert device.step([3.0 + 2 * np.pi * turns]) == 0
+    before = device.mean()
+    assert [device.step([z]) for z in (1e20, -1e30)] == [5, 5] and np.array_equal(device.mean(), before)
+
+
+@needs_compiler
 def test_what_is_refused_leaves_the_state(tmp_path):
     device = Device(changing(), tmp_path)
     assert device.step([1.0], [0.1]) == 0

@@ -355,3 +355,24 @@ def test_names_of_any_characters_are_read_as_they_were_written(tmp_path, name):
 def test_thousands_and_decimals_are_told_from_dates():
     with pytest.raises(ValueError, match="column 'y': expected numbers or dates, got '1,120'"):
         h.files.read_recording({"time": [0.0], "y": ["1,120"]}, WALK)
+
+
+STAMPS = [1_700_000_000_000_000_000 + 100 * k for k in range(5)]  # doubles are 256 apart here
+
+
+@pytest.mark.parametrize(
+    "time",
+    [
+        np.array(STAMPS, dtype=np.uint64),
+        np.array(STAMPS, dtype=object),
+        np.ma.array(STAMPS, mask=False),
+        pd.array(STAMPS, dtype="Int64"),
+        pd.array(STAMPS, dtype="UInt64"),
+        pd.Series(STAMPS, dtype=object),
+        pa.array(STAMPS, pa.uint64()),
+    ],
+)
+def test_stamps_in_nanoseconds_keep_their_digits(time):
+    measured = read_recording({"time": time, "pos": [1.0, 2, 3, 4, 5]}, network({"a": ("pos",)}))
+    np.testing.assert_array_equal(measured.inputs[:, 0], [0, 100, 100, 100, 100])
+    assert measured.time.tolist() == STAMPS

@@ -25,6 +25,7 @@ TEXTS = {
     "dates": "time,a\n2026-11-21T23:25:00+01:00,1\n2026-11-21T23:25:01+01:00,2\n\n,3\n2026-11-22T00:00:00+01:00,\n",
     "dates behind empty cells": "time,a\n,1\n,2\n,\n,3\n2026-11-21,4\n2026-11-22,5\n,6\n,7\n8,8\n",
     "whole numbers beyond doubles": "time,a\n1,1\n9007199254740991,2\n9007199254740993,3\n9007199254740995,4\n",
+    "whole numbers beyond doubles and empty cells": "time,a\n,1\n9007199254740993,2\n-,3\n9007199254740995.0,4\n1,5\n",
     "large numbers and a fraction": "time,a\n9007199254740993,1\n9007199254740995,2\n1.5,3\n",
     "zeros with a sign": "time,a\n-0,1\n1,-0.0\n2,-0\n",
     "another table": "#group,false\ntime,a\n0,1\n1,2\n\n#group,false\ntime,b\n2,3\n3,4\n",
@@ -100,12 +101,15 @@ def test_parquet_in_blocks_of_any_size(tmp_path):
         "at": pa.array(np.arange(5).astype("datetime64[s]")),
         "a": pa.array([None, None, 3.5, None, 4], pa.float64()),
         "b": pa.array([1, None, 3, 4, 5]),
+        "d": pa.array([1, None, 2**60 + 1, None, 2**60 + 3]),
+        "e": pa.array([1, 2, 3, 4, 2**60 + 1], pa.uint64()),
         "c": pa.array([None] * 5),
     }
     path = tmp_path / "data.parquet"
     pq.write_table(pa.table(columns), path, row_group_size=3)
     whole = outcome(path)
     assert whole[0]["time"][0] == "<i8" and whole[0]["b"][0] == "<f8"
+    assert whole[0]["d"][0] == whole[0]["e"][0] == "<i8"
     for rows in (1, 2, 3, 4):
         assert outcome(path, tables.BlockSize(rows=rows)) == whole
     far = pa.array(np.array([0, 1, 2, 10**12], dtype="datetime64[s]"))

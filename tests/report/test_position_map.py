@@ -10,14 +10,18 @@ STEPS = 30
 
 
 def figures_of(states, truth=True):
-    """Figures of a recording of four states, and its record; a place of which the two axes err together."""
+    """Figures of a recording of four states, and its record; a place of which the two axes err together.
+
+    `truth`: whether it is known, or what is known of it.
+    """
     move = np.block([[np.eye(2), np.eye(2)], [np.zeros((2, 2)), np.eye(2)]])
     plant = hg.LinearPlant(move, 0.1 * np.eye(4), np.zeros(4), np.eye(4), states=states)
     sensor = hg.LinearSensor(np.eye(2, 4), [[1.0, 0.6], [0.6, 0.5]])
     item = hg.kalman_filter(plant, sensor)
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(2), {"k": item})})
     drawn = hg.simulate(network, STEPS, 0)
-    record = hg.run(network, drawn.measurements, truth=drawn.truth if truth else None)
+    known = truth if isinstance(truth, np.ndarray) else drawn.truth if truth else None
+    record = hg.run(network, drawn.measurements, truth=known)
     return run_figures(examine(network, record, np.zeros((STEPS, 0)))), record
 
 
@@ -44,6 +48,13 @@ def test_paths_and_ellipses_are_those_of_the_estimates(states, places):
     off = off - np.asarray(estimate.mean)[-1, places]
     P = np.asarray(estimate.covariance)[-1][np.ix_(places, places)]
     np.testing.assert_allclose(np.einsum("ki,ij,kj->k", off, np.linalg.inv(P), off), 4.0, rtol=1e-9)
+
+
+def test_a_map_has_no_true_path_where_one_of_its_states_is_never_known():
+    truth = np.random.default_rng(0).normal(size=(STEPS, 4))
+    truth[:, 1] = np.nan
+    figures, _ = figures_of(["x", "y", "vx", "vy"], truth)
+    assert [line.get_label() for line in figures["map"].axes[0].lines] == ["k"]
 
 
 @pytest.mark.slow

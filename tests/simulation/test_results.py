@@ -1,6 +1,7 @@
 """Results leave and come back as they were: labelled arrays, tables, files, figures."""
 
 import copy
+import dataclasses
 import pickle
 
 import jax.numpy as jnp
@@ -217,6 +218,15 @@ def test_plots_draw_on_what_they_are_given(runs, result, tmp_path):
     )  # fmt: skip
     (line,) = turning.plot()[0].lines  # no line where the angle goes around
     np.testing.assert_array_equal(line.get_ydata(), [3, 3.1, np.nan, -3.1, -3, -2.9])
+    # With the truth estimates are within half a turn of it, so beyond pi where it is near that.
+    yaw = np.array([[3.0], [3.2], [-3.0], [-2.9], [-2.8]])
+    beside = dataclasses.replace(
+        turning, truth=np.array([[3.0], [3.1], [-3.1], [np.nan], [-2.9]]),
+        estimates={"n": {"f": hg.model.Estimate(yaw, np.full((5, 1, 1), 0.01), "exact")}},
+    )  # fmt: skip
+    line, true_line = beside.plot()[0].lines
+    np.testing.assert_array_equal(line.get_ydata(), [3, 3.2, np.nan, -3, -2.9, -2.8])
+    np.testing.assert_array_equal(true_line.get_ydata(), [3, 3.1, np.nan, -3.1, np.nan, -2.9])
     new[0].figure.savefig(tmp_path / "plot.png")
     plt.close(new[0].figure)
     for call in (lambda: runs.plot(node="no"), lambda: runs.plot(filters=["no"]), lambda: runs.plot(states=["no"]),

@@ -179,7 +179,8 @@ def _describe_estimation_errors(record: "Record") -> list[str]:
 
     lines = []
     for errors in compute_filter_errors(record):
-        parts = [f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()]
+        known = {state: value for state, value in errors.rmse.items() if not isnan(value)}
+        parts = [f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in known.items()]
         nees = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(parts)}{nees}")
     return lines

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.angle_indices import FilterAngles
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.model.checks.plant_inputs import do_inputs_spoil
@@ -14,7 +15,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.numerics.types import PyTree
 
 ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
-PRECISION = {"double": np.float64, "float": np.float32}
+PRECISION: dict[str, type[np.floating]] = {"double": np.float64, "float": np.float32}
 
 
 class PartOfStep(NamedTuple):
@@ -77,7 +78,7 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
+        implausible = is_implausible(innovation, z, filter.angles_used(), real) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
 
@@ -116,9 +117,9 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         after, innovation = filter.correct(prior, z, k)
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
         judgement = Judgement.judge_correction(
-            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms
+            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, filter.angles_used()
         )
-        implausible = is_implausible(innovation, z, ROUNDING[real])
+        implausible = is_implausible(innovation, z, filter.angles_used(), real)
         beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
@@ -126,15 +127,19 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     return correct
 
 
-def is_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
+def is_implausible(innovation: Innovation, z: jax.Array, angles: FilterAngles | None, real: str) -> jax.Array:
     """Return whether some component of z is larger than expected, and too many of its own deviations away from that.
 
+    Or whether one of its `angles` has too many turns for numbers of type `real`.
+
     The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
-    z, such as a neighbour's measurement, every component that is so far away counts. A difference within `rounding`,
+    z, such as a neighbour's measurement, every component that is so far away counts. A difference within ROUNDING,
     relative to z, counts nothing.
     """
     far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if differs.shape == z.shape:
         larger = jnp.abs(z) > jnp.abs(z - innovation.value)
-        far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+        far &= larger & (differs > ROUNDING[real] * jnp.maximum(jnp.abs(z), 1e-33))
+        if angles:
+            far |= Judgement.find_unreadable(innovation, z, angles.received, float(np.finfo(PRECISION[real]).eps))
     return jnp.any(far)

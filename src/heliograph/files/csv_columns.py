@@ -186,15 +186,17 @@ class CsvColumnReader:
     def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
         """Return a column as dates, as int64 if its cells are whole numbers that doubles cannot tell apart, or floats.
 
-        `values` of dates are nanoseconds since 1970, NAT for an empty cell; EXACT: 2^53, up to which doubles are exact.
+        `values` of dates are nanoseconds since 1970, NAT for an empty cell; it stands for one among int64 too. EXACT:
+        2^53, up to which doubles are exact.
         """
         if self._dated.get(name):
             # NaN, which alone differs from itself, is in all cells before the first date.
             nanoseconds = [NAT if value != value else int(value) for value in values]
             return np.array(nanoseconds, dtype=np.int64).view("datetime64[ns]")
         numbers = np.array(values, dtype=np.float64)
-        if np.any(np.abs(numbers) >= EXACT):
-            found = [WHOLE.fullmatch(cell) for cell in cells]
-            if all(found):
-                return np.array([int(one[1]) for one in found if one], dtype=np.int64)
-        return numbers
+        if not np.any(np.abs(numbers) >= EXACT):
+            return numbers
+        found = [WHOLE.fullmatch(cell) for cell in cells]
+        if not all(match or np.isnan(number) for match, number in zip(found, numbers, strict=True)):
+            return numbers
+        return np.array([int(match[1]) if match else NAT for match in found], dtype=np.int64)

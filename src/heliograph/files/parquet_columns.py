@@ -48,7 +48,7 @@ def read_parquet_blocks(
 
 
 def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, first: int) -> TableRows:
-    """Return the rows of a table of Arrow as numbers and dates; an empty cell is NaN or NaT.
+    """Return the rows of a table of Arrow as numbers and dates; an empty cell is NaN, NaT, or MISSING of int64.
 
     Args:
         table: the table, or a part of one.
@@ -72,8 +72,9 @@ def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, f
             days = column.cast(pa.date32()).to_numpy()
             columns[name] = convert_to_nanoseconds(days, f"{path}, column {name!r}", first)
             continue
-        if pa.types.is_integer(kind) and not column.null_count:
-            columns[name] = convert_to_numbers(column.to_numpy())
+        if pa.types.is_integer(kind):
+            missing = column.is_null().to_numpy()
+            columns[name] = convert_to_numbers(column.fill_null(0).to_numpy(), missing)
             continue
         is_number = pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)
         if not (is_number or pa.types.is_null(kind)):

@@ -254,9 +254,9 @@ def _make_inputs(
     if row is not None:
         where = f"{source}, row {rows.numbers[row]}, column {TIME!r}"
         raise fail(where, "a time that does not go backwards", backwards_text(time, row))
-    _warn_of_equal_times(time, source)
-    _warn_of_dates_as_numbers(time, source)
-    _warn_of_mixed_units(time, source, rows)
+    _warn_of_equal_times(time[rows.arrived], source)
+    _warn_of_dates_as_numbers(time[rows.arrived], source)
+    _warn_of_mixed_units(time[rows.arrived], source, rows.numbers[rows.arrived])
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
@@ -277,8 +277,11 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         )
 
 
-def _warn_of_mixed_units(time: np.ndarray, source: str, rows: "RowsWithMissing") -> None:
-    """Warn where a clock that counts from long ago leaps a hundredfold in one row, as from seconds to milliseconds."""
+def _warn_of_mixed_units(time: np.ndarray, source: str, numbers: np.ndarray) -> None:
+    """Warn where a clock that counts from long ago leaps a hundredfold in one row, as from seconds to milliseconds.
+
+    `numbers`: of the rows, from 1.
+    """
     if time.dtype.kind not in "fiu":
         return
     before, after = time[:-1].astype(float), time[1:].astype(float)
@@ -286,7 +289,7 @@ def _warn_of_mixed_units(time: np.ndarray, source: str, rows: "RowsWithMissing")
     if len(leaps):
         row = int(leaps[0]) + 1
         warnings.warn(
-            f"{source}, row {rows.numbers[row]}, column {TIME!r}: {time[row]:.14g} after {time[row - 1]:.14g}: "
+            f"{source}, row {numbers[row]}, column {TIME!r}: {time[row]:.14g} after {time[row - 1]:.14g}: "
             "seconds and milliseconds, or such, in one column",
             stacklevel=7,
         )

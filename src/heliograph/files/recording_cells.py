@@ -8,6 +8,7 @@ import numpy as np
 
 from heliograph.files.recording_rows import RecordingRows
 from heliograph.files.table import TIME
+from heliograph.files.table_rows import convert_to_doubles, find_missing
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network
@@ -147,7 +148,7 @@ def _read_column_without_gaps(columns: Mapping[str, np.ndarray], name: str, refu
     Integers stay such, since they may be larger than doubles hold exactly.
     """
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, refusals.source)
-    refusals.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
+    refusals.refuse(find_missing(values) | ~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
@@ -162,9 +163,9 @@ def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> 
     """Return a column as doubles; raise ValueError if it has dates."""
     if columns[name].dtype.kind == "M":
         raise fail(f"{source}, column {name!r}", "numbers", "dates")
-    return np.asarray(columns[name], dtype=np.float64)
+    return convert_to_doubles(columns[name])
 
 
 def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
     """Return a function that says what stands in a row of a column, by the number of the row."""
-    return lambda row: "an empty cell" if np.isnan(values[row]) else f"{values[row]}"
+    return lambda row: "an empty cell" if find_missing(values[row]) else f"{values[row]}"

@@ -11,7 +11,14 @@ from heliograph.disk.atomic_files import FORMATS, format_of
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.csv_columns import read_csv_blocks
 from heliograph.files.parquet_columns import read_parquet_blocks
-from heliograph.files.table_rows import TableRows, convert_to_nanoseconds, convert_to_numbers, join_rows
+from heliograph.files.table_rows import (
+    TableRows,
+    convert_to_doubles,
+    convert_to_nanoseconds,
+    convert_to_numbers,
+    find_missing,
+    join_rows,
+)
 from heliograph.files.table_writer import open_table
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress, find_extension
@@ -28,7 +35,8 @@ TIME = "time"
 def convert_to_columns(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
     """Return columns by name, missing values NaN or NaT: numbers as float64, dates as datetime64[ns] in UTC.
 
-    Whole numbers that float64 cannot tell apart stay int64. Columns that are not among `only` are left out unread.
+    Whole numbers that float64 cannot tell apart stay int64, missing ones MISSING. Columns that are not among `only` are
+    left out unread.
     """
     if isinstance(table, str | os.PathLike):
         return read_rows(Path(table), only, strict=True).columns
@@ -53,10 +61,16 @@ def convert_to_columns(table: object, name: str = "table", only: Container[str] 
 
 def _convert_column(values: Any, name: str) -> np.ndarray:
     """Return one column as numbers or dates; what its own kind marks as missing becomes NaN or NaT."""
-    missing = values.isna() if hasattr(values, "isna") else None
-    if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
-        return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
-    column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(fill_masked(values))
+    if hasattr(values, "isna") and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
+        kind = {"i": np.int64, "u": np.uint64}.get(values.dtype.kind, np.float64)
+        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=0), np.asarray(values.isna(), dtype=bool))
+    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
+        return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
+    if hasattr(values, "to_numpy"):
+        column = values.to_numpy()
+    else:
+        is_of_objects = type(values) is np.ndarray and values.dtype.kind == "O"
+        column = values if is_of_objects else np.asarray(fill_masked(values))
     if column.dtype.kind == "M":
         return convert_to_nanoseconds(column, name)
     if column.dtype.kind in "fiub":
@@ -81,7 +95,12 @@ def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:
     try:
         if texts:  # `float` would read some
             raise TypeError
-        return np.array([np.nan if value is None else float(value) for value in column])
+        absent = np.array([value is None for value in column], dtype=bool)
+        numbers = [0.0 if value is None else value for value in column]
+        doubles = np.array([float(value) for value in numbers])
+        if np.all(np.isfinite(doubles)) and all(int(value) == value for value in numbers):
+            return convert_to_numbers(np.array([int(value) for value in numbers]), absent)
+        return np.where(absent, np.nan, doubles)
     except (TypeError, ValueError, OverflowError):
         got = str(texts[0]) if texts and isinstance(texts[0], str) else first
         raise fail(name, "numbers or dates", show_value(got)) from None
@@ -105,7 +124,12 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
             Rows count from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    return read_rows(file_path("table", path), None, strict=True).columns
+    columns = read_rows(file_path("table", path), None, strict=True).columns
+    # Of a whole number that is missing a user knows NaN alone.
+    return {
+        name: convert_to_doubles(column) if column.dtype.kind == "i" and np.any(find_missing(column)) else column
+        for name, column in columns.items()
+    }
 
 
 def read_rows(path: Path, only: Container[str] | None, strict: bool) -> TableRows:

@@ -6,13 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.times.dates import round_to_nanoseconds
+from heliograph.numerics.times.dates import MISSING, round_to_nanoseconds
 
 EXACT = 2**53  # up to here doubles hold every whole number
 
 
 class TableRows(NamedTuple):
-    """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read."""
+    """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read.
+
+    Where a cell is empty stands NaN, NaT among dates, and MISSING, the number of NaT, in a column of int64.
+    """
 
     columns: dict[str, np.ndarray]
     numbers: np.ndarray
@@ -39,20 +42,52 @@ def _join_column(parts: list[np.ndarray]) -> np.ndarray:
     kinds = {part.dtype.kind for part in parts}  # of NumPy: M dates, i integers, f floats
     if "M" in kinds:  # a part without dates has empty cells alone, as those before the first date
         parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
-    elif kinds == {"i", "f"} and all(_are_whole_numbers(part) for part in parts):
-        parts = [part.astype(np.int64) for part in parts]
+    elif kinds == {"i", "f"}:
+        convert = _convert_to_whole if all(map(_are_whole_numbers, parts)) else convert_to_doubles
+        parts = [convert(part) for part in parts]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _are_whole_numbers(numbers: np.ndarray) -> bool:
-    """Return whether all numbers are whole, and of a size at which doubles hold each."""
-    return numbers.dtype.kind == "i" or bool(np.all((np.abs(numbers) < EXACT) & (numbers == np.trunc(numbers))))
+    """Return whether all numbers that are there are whole, and of a size at which doubles hold each."""
+    if numbers.dtype.kind == "i":
+        return True
+    numbers = numbers[~np.isnan(numbers)]
+    return bool(np.all((np.abs(numbers) < EXACT) & (numbers == np.trunc(numbers))))
 
 
-def convert_to_numbers(column: np.ndarray) -> np.ndarray:
-    """Return numbers as float64, or as int64 where that alone tells them apart."""
-    whole = column.dtype.kind in "iu" and column.size and np.abs(column.astype(np.float64)).max() >= EXACT
-    return np.asarray(column, dtype=np.int64 if whole and column.dtype != np.uint64 else np.float64)
+def _convert_to_whole(numbers: np.ndarray) -> np.ndarray:
+    """Return whole numbers as int64, MISSING where one is NaN."""
+    if numbers.dtype.kind == "i":
+        return numbers
+    return np.where(np.isnan(numbers), MISSING, np.nan_to_num(numbers).astype(np.int64))
+
+
+def convert_to_doubles(numbers: np.ndarray) -> np.ndarray:
+    """Return numbers as float64, NaN where one of int64 is MISSING."""
+    doubles = np.asarray(numbers, dtype=np.float64)
+    return np.where(numbers == MISSING, np.nan, doubles) if numbers.dtype.kind == "i" else doubles
+
+
+def find_missing(numbers: np.ndarray) -> np.ndarray:
+    """Return where numbers of float64 or int64 are missing."""
+    return np.asarray(numbers == MISSING if numbers.dtype.kind == "i" else np.isnan(numbers))
+
+
+def convert_to_numbers(column: np.ndarray, missing: np.ndarray | None = None) -> np.ndarray:
+    """Return numbers as float64, or as int64 where that alone tells them apart: NaN or MISSING where one is missing.
+
+    Args:
+        column: numbers of any type.
+        missing: where they mean nothing; None for nowhere.
+    """
+    absent = np.zeros(len(column), dtype=bool) if missing is None else missing
+    doubles = np.where(absent, np.nan, column.astype(np.float64))
+    present = column[~absent]
+    is_large = column.dtype.kind in "iu" and present.size and np.nanmax(np.abs(doubles)) >= EXACT
+    if not is_large or int(present.max()) > np.iinfo(np.int64).max:
+        return doubles
+    return np.where(absent, MISSING, column.astype(np.int64))
 
 
 def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.ndarray:

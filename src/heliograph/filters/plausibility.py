@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.angle_indices import FilterAngles
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.numerics.angle import TURN, Angles
 from heliograph.numerics.linalg import (
     NEGATIVE_TOLERANCE,
     rounding,
@@ -35,21 +37,29 @@ statistical gate, which locks a filter out after an outage. Streams, timelines, 
 
 
 class Reason(IntEnum):
-    """Reasons for which something is implausible, in the order of precedence."""
+    """Reasons for which something is implausible."""
 
     PLAUSIBLE = 0
     FAR = 1
     EXCLUDED = 2
     UNSOUND = 3
     PREDICTION = 4
+    UNREADABLE = 5
 
 
 WORDS = {
     Reason.EXCLUDED: "a value that the model excludes",
     Reason.UNSOUND: "with it the estimate is no number, or its covariance is none",
     Reason.PREDICTION: "the prediction to its time is no finite number, its covariance is none, or its inputs are none",
+    Reason.UNREADABLE: "an angle of so many turns that its digits do not say where it points",
 }
 INPUT = "with it the mean loses its digits to rounding"
+READABLE = 0.1
+"""Deviations of the innovation beyond which the rounding eps |z| of an angle z is not what a sensor says.
+
+An angle is used without its whole turns, which take none of its rounding with them. Rounding is uniform, so that at the
+bound it has a variance of READABLE^2 / 3 = 0.3 % of the innovation's: a claim does not see it.
+"""
 
 
 def largest_plausible_distance(dtype: np.dtype) -> float:
@@ -87,37 +97,53 @@ class Judgement(NamedTuple):
         """
         (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
         no_innovation = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
-        three_estimates = (
-            estimate_before,
-            prediction,
-            prediction,
-        )  # before, after prediction, after a correction by nothing
+        three_states = before, prior, prior  # before, after prediction, after a correction by nothing
+        three_estimates = estimate_before, prediction, prediction
         return judge_step(
             claim,
-            (before, prior, prior),
+            three_states,
             three_estimates,
             no_innovation,
             no_data,
             of_atoms=False,
+            angles=None,
             spoilt=are_inputs_invalid,
         )
 
     @staticmethod
     def judge_correction(
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
-        z: Float[Array, " m"], of_atoms: bool,
+        z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
     ) -> "Judgement":  # fmt: skip
         """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
         prior, after = states
         expected, corrected = estimates
         # A correction has no prediction: the state before it counts as before and after one.
-        return judge_step(claim, (prior, prior, after), (expected, expected, corrected), innovation, z, of_atoms)
+        three = expected, expected, corrected
+        return judge_step(claim, (prior, prior, after), three, innovation, z, of_atoms, angles)
 
     @staticmethod
     def find_far(innovation: Innovation) -> jax.Array:
         """Return which components e_j are beyond the bound of their own deviations, |e_j| > 1e6 sqrt(S_jj)."""
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))
         return jnp.abs(innovation.value) > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
+
+    @staticmethod
+    def find_unreadable(innovation: Innovation, z: Float[Array, " m"], angles: Angles, eps: float) -> jax.Array:
+        """Return which angles among z have so many turns that their rounding hides where they point.
+
+        eps |z_j| is more than READABLE deviations sqrt(S_jj), and more than half of a turn's digits.
+
+        Args:
+            innovation: of z.
+            z: the measurement (m,).
+            angles: places of angles.
+            eps: rounding of a number of the precision in which z was told.
+        """
+        variances = jnp.diagonal(jnp.asarray(innovation.covariance))
+        known = jnp.maximum(READABLE * jnp.sqrt(jnp.maximum(variances, 0.0)), np.sqrt(eps) * TURN)
+        is_angle = np.isin(np.arange(len(z)), angles)
+        return jnp.asarray(is_angle & (eps * jnp.abs(z) > known))
 
     @staticmethod
     def find_culprit(
@@ -201,15 +227,17 @@ def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
 
 def judge_step(
     claim: Claim, states: tuple[PyTree, PyTree, PyTree], estimates: tuple[Estimate, Estimate, Estimate],
-    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, spoilt: Array | bool = False,
+    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
+    spoilt: Array | bool = False,
 ) -> Judgement:  # fmt: skip
     """Judge a step by its innovation, and by the states and estimates before it, after prediction and after correction.
 
     A value is far where the components larger than expected are too many deviations off
     (`largest_plausible_distance`): a smaller one takes the mean to where it has more digits, so that an estimate which
-    is far off can return. It is excluded where all of it is determined and differs from the model, or where no atom of
-    a mixture produces it. A state is unsound where the one before it was not: a mean or variance that is no finite
-    number, a negative variance, an infinite number in it. So is a prediction.
+    is far off can return. It is unreadable where it is an angle of very many turns (`find_unreadable`). It is excluded
+    where all of it is determined and differs from the model, or where no atom of a mixture produces it. A state is
+    unsound where the one before it was not: a mean or variance that is no finite number, a negative variance, an
+    infinite number in it. So is a prediction.
 
     Args:
         claim: of the filter; "none" where it claims no covariance, and nothing is judged by one.
@@ -218,19 +246,22 @@ def judge_step(
         innovation: of the measurement.
         z: the measurement (m,), NaN for what did not arrive.
         of_atoms: whether the filter is a mixture, of which no atom may produce z.
+        angles: which components of z the filter takes for angles; None where it does not say.
         spoilt: whether the inputs of the prediction were no numbers already.
     """
     (state_before, state_prior, state_after), (before, prior, after) = states, estimates
-    of_value = _judge_value(innovation, z, of_atoms)
+    of_value = _judge_value(innovation, z, of_atoms, angles.received if angles else ())
     # States that stop being numbers, by the correction or already by the prediction.
     is_sound = _is_sound_correction(after, claim, prior)
     loses_soundness = _is_sound_correction(prior, claim, before) & ~is_sound
     by_correction = loses_soundness | _overflows(state_prior, state_after)
     loses_soundness = _are_finite(before, claim) & ~_is_sound_prediction(prior, claim)
     by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
-    # The reason. Where several apply, prediction goes before far, that before unsound, and that before excluded.
-    reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
-    reason = jnp.where(by_correction & of_value.came & ~of_value.far, Reason.UNSOUND, reason)
+    # The reason. Where several apply the last of these lines that does.
+    reason = jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE)
+    reason = jnp.where(by_correction & of_value.came, Reason.UNSOUND, reason)
+    reason = jnp.where(of_value.unreadable, Reason.UNREADABLE, reason)
+    reason = jnp.where(of_value.far, Reason.FAR, reason)
     reason = jnp.where(by_prediction, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
     distance, count = of_value.distance, of_value.arrived
@@ -247,7 +278,7 @@ def judge_step(
 
 
 class _JudgedValue(NamedTuple):
-    """Squared distance of what arrived and how much that is, whether it is far or excluded, and whether anything came.
+    """Squared distance of what arrived and how much that is, what is wrong with it, and whether anything came.
 
     Something came too where what was expected is no number.
     """
@@ -255,12 +286,13 @@ class _JudgedValue(NamedTuple):
     distance: Array
     arrived: Array
     far: Array
+    unreadable: Array
     excluded: Array
     came: Array
 
 
-def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) -> _JudgedValue:
-    """Judge a measurement z (m,) by its innovation e = z - expected and its covariance S.
+def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, angles: Angles) -> _JudgedValue:
+    """Judge a measurement z (m,), some of it `angles`, by its innovation e = z - expected and its covariance S.
 
     Far: components with |z| > |expected| whose squared distance e' S^-1 e exceeds `largest_plausible_distance`.
     Excluded: every component is determined by the model (no variance), and one of them differs; or, `of_atoms`, no
@@ -289,6 +321,7 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
         distance=distance,
         arrived=count,
         far=far,
+        unreadable=jnp.any(Judgement.find_unreadable(innovation, z, angles, float(np.finfo(value.dtype).eps))),
         excluded=excluded,
         came=(count > 0) | jnp.any(~jnp.isnan(z)),
     )

@@ -49,7 +49,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
             covariance = np.asarray(estimate.covariance)
             for k in np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).astype(int)):
                 _draw_ellipse(axes, mean[k], covariance[k][np.ix_([i, j], [i, j])], colour)
-    if record.truth is not None:
+    if record.truth is not None and not np.isnan(record.truth[:, [i, j]]).any(axis=1).all():
         axes.plot(record.truth[:, i], record.truth[:, j], color=INK, linestyle=":", label="truth")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(label_with_unit(record.states[i], record.units))

@@ -61,6 +61,46 @@ def test_a_latency_of_a_source_moves_its_measurements_and_not_their_arrival(tmp_
     assert np.allclose(events.lateness()["wheel"], 0.08, rtol=0, atol=2e-6)
 
 
+WORDS = """VERSION ""
+BU_: ECU
+BO_ 416 WheelSpeeds: 4 ECU
+ SG_ FrontLeft : 0|16@1+ (0.01,0) [0|655.35] "km/h" ECU
+ SG_ Signed : 16|8@1- (0.5,0) [-60|60] "m/s2" ECU
+ SG_ Gear : 24|3@1+ (1,0) [0|7] "" ECU
+VAL_ 416 FrontLeft 0 "standstill" 65534 "error" 65535 "SNA" ;
+VAL_ 416 Signed -128 "SNA" 125 "init" ;
+VAL_ 416 Gear 0 "park" 7 "reverse" ;
+"""
+
+
+@pytest.mark.parametrize(
+    ("signal", "raw", "right", "said"),
+    [
+        (
+            "FrontLeft",
+            [0, 100, 65534, 65535, 65535],
+            [0.0, 1.0],
+            "FrontLeft 'error' (1), WheelSpeeds.FrontLeft 'SNA' (2)",
+        ),
+        ("Signed", [-127, -128, 125, 120, 0], [-63.5, 60.0, 0.0], "Signed 'SNA' (1), WheelSpeeds.Signed 'init' (1)"),
+        ("Gear", [0, 1, 7, 2, 3], [0.0, 1.0, 7.0, 2.0, 3.0], None),
+    ],
+)
+def test_a_value_that_the_database_names_as_a_word_is_no_number(tmp_path, signal, raw, right, said):
+    """At the end of what the bits hold, or beyond the range; 655.35 km/h was used. A gear is one, by any name."""
+    shift, mask = {"FrontLeft": (0, 0xFFFF), "Signed": (16, 0xFF), "Gear": (24, 7)}[signal]
+    data = [((value & mask) << shift).to_bytes(4, "little") for value in raw]
+    path = logs.write_frames(tmp_path / "drive.blf", [logs.frame(k, each) for k, each in enumerate(data)])
+    field = hg.files.json_field(signal, node="wheel")
+    sources = hg.files.LogSources({"WheelSpeeds": field}, dbc=logs.database(tmp_path, WORDS))
+    events = hg.files.read_messages(path, logs.car(), sources)
+    values = [event.values[0] for event in events.sort_events()]
+    np.testing.assert_allclose([value for value in values if value == value], right, rtol=1e-12)
+    assert [f"WheelSpeeds.{said}" in note for note in events.notes if "in place of numbers" in note] == [True] * bool(
+        said
+    )
+
+
 def test_a_counter_of_four_bits_counts_what_was_lost_across_its_end(tmp_path):
     kept = [logs.frame(k) for k in range(logs.COUNT) if k not in (15, 16, 30)]
     path = logs.write_frames(tmp_path / "drive.blf", kept)

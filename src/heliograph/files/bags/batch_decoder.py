@@ -1,11 +1,12 @@
 """Messages of a bag decoded many at once: fields whose places are fixed by the lengths of texts and lists."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from heliograph.files.bags.no_value_marks import blank_columns, list_flags
 from heliograph.files.event_table import NONE, EventTable
 from heliograph.files.sources.derived_values import Computed
 from heliograph.files.sources.source_description import Source
@@ -166,6 +167,7 @@ class BatchDecoder:
         """Hold the bag's definitions of messages and the network's sources; no layout of a message is known yet."""
         self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
         self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
+        self.marked = Counter[str]()  # by topic: messages that say that something read of them has no value
 
     def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
         """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
@@ -173,9 +175,10 @@ class BatchDecoder:
         What `TopicReader.read` says of a message at a time is what it gives: the same numbers, in the same order.
         """
         try:
-            readings = self._read_by_node(batch)
+            readings, marked = self._read_by_node(batch)
         except LayoutNotFixedError:
             return False
+        self.marked += marked
         for node, blocks in readings.items():
             # In the order in which the messages came.
             rows = np.concatenate([block.rows for block in blocks])
@@ -191,8 +194,10 @@ class BatchDecoder:
             )
         return True
 
-    def _read_by_node(self, batch: Sequence[RawMessage]) -> "dict[str, list[NodeReadings]]":
+    def _read_by_node(self, batch: Sequence[RawMessage]) -> "tuple[dict[str, list[NodeReadings]], Counter[str]]":
         """Return the readings of each node, a block for the messages of one topic, size and layout.
+
+        And by topic how many messages say that something read of them has no value.
 
         Raises:
             LayoutNotFixedError: messages that need a look at each.
@@ -203,17 +208,21 @@ class BatchDecoder:
         groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[NodeReadings]](list)
         for i, message in enumerate(batch):
             groups[message.connection.topic, len(message.data)].append(i)
+        counts = Counter[str]()
         if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
             raise LayoutNotFixedError
         for (topic, _), numbers in groups.items():
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
-            for rows, columns in self._yield_rows_by_layout(batch[numbers[0]].connection, table):
+            connection = batch[numbers[0]].connection
+            for rows, fields in self._yield_rows_by_layout(connection, table):
+                columns, marked = blank_columns(connection.msgtype, fields)
+                counts[topic] += int(np.count_nonzero(marked))
                 for source, _, places in self._sources.of(topic):
                     # The node, and the places of its values: one, as `_list_paths_of_numbers` refuses others.
                     ((node, outputs),) = places.items()
                     size = len(self._sources.names[node])
                     results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
-        return results
+        return results, counts
 
     def _yield_rows_by_layout(
         self, connection: "Connection", table: np.ndarray
@@ -232,6 +241,7 @@ class BatchDecoder:
                 paths = {
                     path for source, *_ in self._sources.of(connection.topic) for path in _list_paths_of_numbers(source)
                 }
+                paths |= list_flags(connection.msgtype, paths)
                 known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
             yield left[fits], known[index].read_columns(table[left[fits]])

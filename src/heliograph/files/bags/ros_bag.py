@@ -3,7 +3,7 @@
 import os
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +13,7 @@ import numpy as np
 
 from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
+from heliograph.files.bags.no_value_marks import blank_message
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources.message_reading import Unread
 from heliograph.files.sources.topic_reader import TopicReader
@@ -85,10 +86,11 @@ def read_bag(
         _check_fields_of_sources(path, reader, sources)
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, BatchDecoder(reader, sources)
+        marked = Counter[str]()  # by topic: messages that say that something read of them has no value
         try:
             for batch in group_into_batches(read_raw_messages(path, reader, used)):
                 if not decoder.append_events(batch, events):
-                    _append_messages(path, reader, sources, batch, done, events, strict)
+                    marked += _append_messages(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
                 if progress is not None:
                     progress(done, total)
@@ -96,6 +98,11 @@ def read_bag(
             if strict:
                 raise
             events.broken = f"{error}; what was read before it stays"
+    if marked := decoder.marked + marked:
+        events.notes.append(
+            f"{path}: by their own word without a value (no fix, no estimate, out of range): "
+            f"{_format_topic_counts(marked)}"
+        )
     _note_unmatched_topics(path, sources, counts, events)
 
 
@@ -214,8 +221,10 @@ def _append_messages(
     done: int,
     table: EventTable,
     strict: bool,
-) -> None:
+) -> Counter[str]:
     """Append the events of messages one after another; what cannot be read is refused alone.
+
+    Returned is by topic how many say that something read of them has no value.
 
     Args:
         path: the bag, for errors.
@@ -226,6 +235,7 @@ def _append_messages(
         table: where the events go.
         strict: whether the first message that cannot be read is an error.
     """
+    marked = Counter[str]()
     for number, (connection, logged, data) in enumerate(batch, done + 1):
         topic, kind = connection.topic, connection.msgtype
         try:
@@ -234,6 +244,9 @@ def _append_messages(
             where = f"{path}, {topic}, logged at {format_moment(logged)}"
             table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
+        marked[topic] += blank_message(
+            kind, content, {field for single in sources.of(topic) for field in single.source.fields}
+        )
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):
                 where = f"{path}, message {number}, logged at {format_moment(logged)}"
@@ -241,6 +254,7 @@ def _append_messages(
                 table.note_unread(reading, logged)
             else:
                 table.add(reading, logged)
+    return marked
 
 
 def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
@@ -299,7 +313,7 @@ def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _format_topic_counts(counts: dict[str, int]) -> str:
+def _format_topic_counts(counts: Mapping[str, int]) -> str:
     """Return topics, each with its count in brackets."""
     return _join_names([f"{topic} ({count})" for topic, count in counts.items()])
 

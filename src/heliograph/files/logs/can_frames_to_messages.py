@@ -1,5 +1,6 @@
 """Frames of a CAN bus, of BLF, ASC and MDF4, to messages with the signals that a database describes."""
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -17,8 +18,10 @@ if TYPE_CHECKING:
     from can import Message
     from can.io.generic import MessageReader
     from cantools.database.can import Message as Description
+    from cantools.database.can import Signal
 
 LISTED = 8  # identifiers in one line
+CODES = 0xFB / 0xFF  # share of the range of a signal's bits from which on a named value is a code, as in J1939
 Database = dict[tuple[int, bool], "Description"]  # by identifier, and whether it has 29 bits
 
 
@@ -62,6 +65,30 @@ def read_can_database(path: Path) -> Database:
     return {(m.frame_id, m.is_extended_frame): m for m in loaded.messages if not m.is_container}
 
 
+def find_words(signal: "Signal") -> dict[float, str]:
+    """Return the values of a physical quantity that stand for words, such as "SNA", with these.
+
+    These are values that the database names and that are beyond the signal's least or greatest value, or at the end of
+    what its bits hold: from 0xFB.. of 0xFF.. on, of a signed one the least and the greatest. What has neither a unit
+    nor a scale nor an offset counts or enumerates, and its values are numbers, whatever their names; so is a named
+    value within the range, as 0 "standstill".
+    """
+    is_quantity = signal.unit or signal.scale != 1 or signal.offset != 0
+    if not is_quantity or not signal.choices or signal.is_float:
+        return {}
+    most = 2 ** (signal.length - signal.is_signed) - 1
+    codes = (-most - 1, most) if signal.is_signed else (math.ceil(CODES * most), most)
+    words = dict[float, str]()
+    for raw, word in signal.choices.items():
+        value: Any = signal.conversion.raw_to_scaled(raw, decode_choices=False)
+        is_beyond = signal.minimum is not None and value < signal.minimum
+        is_beyond |= signal.maximum is not None and value > signal.maximum
+        is_code = raw in codes if signal.is_signed else raw >= codes[0]
+        if is_beyond or is_code:
+            words[value] = str(word)
+    return words
+
+
 class FrameReader:
     """Reads frames as messages, and counts what is left out.
 
@@ -80,6 +107,9 @@ class FrameReader:
         self._decoded, self._longer = Counter[str](), Counter[str]()
         self._short: dict[str, Counter[int]] = defaultdict(Counter)
         self._channels: dict[str, set[object]] = defaultdict(set)
+        # By name of the message the words of its signals, and how often each came in place of a number.
+        self._words = {m.name: {s.name: find_words(s) for s in m.signals} for m in database.values()}
+        self._came_as_words = Counter[str]()
         # Frames by identifier, and frames left out by kind.
         self._identifiers, self._left_out = Counter[str](), Counter[str]()
 
@@ -106,13 +136,19 @@ class FrameReader:
         self._note_left_out()
 
     def _note_left_out(self) -> None:
-        """Append a line on frames that were left out, by kind, and one on those longer than the database has them."""
+        """Append lines on frames left out, by kind, on those longer than the database has them, and on words that came.
+
+        `self._came_as_words`: by signal and word how often this came in place of a number.
+        """
         if self._left_out:
             counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
             self._notes.append(f"{self._path}: frames left out: {counts}")
         if self._longer:
             counts = ", ".join(f"{name} ({count})" for name, count in self._longer.items())
             self._notes.append(f"{self._path}: frames longer than {self._sources.dbc} has them: {counts}")
+        if self._came_as_words:
+            counts = _join_names([f"{signal} ({count})" for signal, count in self._came_as_words.items()])
+            self._notes.append(f"{self._path}: words of {self._sources.dbc} in place of numbers, not used: {counts}")
 
     def _decode_frame(self, frame: "Message", moment: float, where: str) -> FileMessage | InputError | None:
         """Return the message of a frame, or why it cannot be read; None of one that is not wanted.
@@ -154,6 +190,10 @@ class FrameReader:
             self._longer[description.name] += 1
         # Signals that a multiplexed message does not have this time did not arrive.
         signals: dict[str, Any] = dict.fromkeys(signal.name for signal in description.signals) | decoded
+        for name, words in self._words[description.name].items():
+            if words and (word := words.get(signals[name])) is not None:
+                self._came_as_words[f"{description.name}.{name} {word!r}"] += 1
+                signals[name] = None
         return signals
 
     def _check_channel(self, name: str, channel: object) -> None:

@@ -284,10 +284,15 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
 
 def make_errors_table(record: Record) -> list[Table]:
     """Return the table of each filter's errors; none where the recording has no true state."""
+
+    def show(value: float, error: float) -> str:
+        """Return a number to the digits of its standard error, or a dash where no truth is known."""
+        return "–" if np.isnan(value) else round_to(value, error)
+
     rows = [
         [visible(f"{errors.node}/{errors.filter}"), errors.claim,
-         *(round_to(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
-         "–" if np.isnan(errors.nees) else round_to(errors.nees, errors.nees_error)]
+         *(show(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
+         show(errors.nees, errors.nees_error)]
         for errors in compute_filter_errors(record)
     ]  # fmt: skip
     caption = (

@@ -11,6 +11,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 
+HALF_TURN = np.pi  # of an angle
 FAR = 10.0  # times the best filter's error: from there an axis is logarithmic
 
 if TYPE_CHECKING:  # an extra
@@ -68,28 +69,39 @@ def check_run(run: int, runs: int | None) -> None:
 
 
 def draw_state(
-    panel: "Axes", time: np.ndarray, estimates: Mapping[str, Estimate], run_and_state: tuple[Any, int], sigmas: float
+    panel: "Axes",
+    time: np.ndarray,
+    estimates: Mapping[str, Estimate],
+    run_and_state: tuple[Any, int],
+    sigmas: float,
+    truth: np.ndarray | None = None,
 ) -> None:
-    """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations.
+    """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations, and the true state.
 
-    `run_and_state`: index of the run (... without an axis of runs), and number of the state.
+    Args:
+        panel: to draw on.
+        time: times of the rows.
+        estimates: by name.
+        run_and_state: index of the run (... without an axis of runs), and number of the state.
+        sigmas: half-width of the bands.
+        truth: the true state (time,), of which estimated angles are within half a turn; None where it is unknown.
     """
     run, i = run_and_state
+    # Estimates of an angle between -pi and pi are then between -2 pi and 2 pi.
+    turns = truth is not None and find_wraps(truth[~np.isnan(truth)], HALF_TURN).size
+    most = 2 * HALF_TURN if turns else HALF_TURN
     for number, (name, estimate) in enumerate(estimates.items()):
         mean = np.asarray(estimate.mean)[run][..., i]
         variance = np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
-        drawn_time, mean, band = insert_gaps_at_wraps(time, mean, sigmas * deviation)
+        drawn_time, mean, band = insert_gaps(time, find_wraps(mean, most), mean, sigmas * deviation)
         panel.plot(drawn_time, mean, color=choose_colour(number), label=quote_for_figure(name))
         if estimate.claim != "none":
-            panel.fill_between(
-                drawn_time, mean - band, mean + band, color=choose_colour(number), alpha=0.2, linewidth=0
-            )
-
-
-def draw_truth(panel: "Axes", time: ArrayLike, truth: ArrayLike) -> None:
-    """Draw one true state over time."""
-    panel.plot(*insert_gaps_at_wraps(time, truth), color="0.25", linestyle=":", label="truth")
+            low, high = mean - band, mean + band
+            panel.fill_between(drawn_time, low, high, color=choose_colour(number), alpha=0.2, linewidth=0)
+    if truth is not None:
+        wraps = find_wraps(truth, HALF_TURN)
+        panel.plot(*insert_gaps(time, wraps, truth), color="0.25", linestyle=":", label="truth")
 
 
 def draw_modes(
@@ -143,20 +155,17 @@ def choose_colour(number: int) -> str:
     return COLOURS[number % len(COLOURS)]
 
 
-def insert_gaps_at_wraps(time: ArrayLike, mean: ArrayLike, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return what is drawn over time with a gap where an angle goes around: from near pi to near -pi, or back.
+def find_wraps(values: ArrayLike, most: float) -> np.ndarray:
+    """Return before which rows an angle goes around: from near pi to near -pi, or back.
 
-    Values that never leave +-pi, and of which two in a row are further apart than pi, are such an angle's.
-
-    Args:
-        time: times (time,).
-        mean: values (time,).
-        others: what has a gap in the same places, each (time,).
+    Values (time,) that never leave +-`most`, and of which two in a row are further apart than pi, are such an angle's.
     """
-    time, mean = np.asarray(time), np.asarray(mean)
-    # Before these rows a NaN is inserted, at the row's time, which breaks the curve.
-    jumps = np.flatnonzero(np.abs(np.diff(mean)) > np.pi) + 1
-    if not jumps.size or np.nanmax(np.abs(mean)) > np.pi + 1e-9:
-        return time, mean, *others
-    time_with_gaps = np.insert(time, jumps, time[jumps])
-    return time_with_gaps, *(np.insert(values, jumps, np.nan) for values in (mean, *others))
+    values = np.asarray(values)
+    jumps = np.flatnonzero(np.abs(np.diff(values)) > HALF_TURN) + 1
+    return jumps if jumps.size and np.nanmax(np.abs(values)) <= most + 1e-9 else jumps[:0]
+
+
+def insert_gaps(time: ArrayLike, rows: np.ndarray, *parts: ArrayLike) -> tuple[np.ndarray, ...]:
+    """Return times and what is drawn over them, each (time,), with a NaN before these rows, which breaks the curve."""
+    time = np.asarray(time)
+    return np.insert(time, rows, time[rows]), *(np.insert(np.asarray(part), rows, np.nan) for part in parts)

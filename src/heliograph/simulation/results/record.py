@@ -38,7 +38,6 @@ from heliograph.simulation.results.plots import (
     choose_filters,
     draw_modes,
     draw_state,
-    draw_truth,
     find_state_places,
     legend_outside,
     make_panels,
@@ -337,9 +336,9 @@ class Record(SavableResults):
         of_run: Any = ... if self.runs is None else run  # index of the run; `...` takes all of a record without runs
         drawn = make_panels(axes, len(places), self.time, self.units)
         for panel, i in zip(drawn, places, strict=True):
-            draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (of_run, i), sigmas)
-            if self.truth is not None:
-                draw_truth(panel, self.time, self.truth[of_run][..., i])
+            truth = None if self.truth is None else self.truth[of_run][..., i]
+            estimates = {name: self.estimates[node][name] for name in filters}
+            draw_state(panel, self.time, estimates, (of_run, i), sigmas, truth)
             panel.set_ylabel(label_with_unit(self.states[i], self.units))
         legend_outside(drawn[0])
         return drawn

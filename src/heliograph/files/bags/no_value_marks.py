@@ -1,0 +1,112 @@
+"""Values of which a message of ROS says itself that they are none, as the definition of its type has it."""
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Mark(NamedTuple):
+    """How messages of a type say that some of their fields have no value.
+
+    Attributes:
+        fields: dotted paths of these fields, each with what is in it.
+        flags: dotted paths of the numbers that say so.
+        is_none: from a value and these numbers, or arrays of them, whether it is none.
+    """
+
+    fields: tuple[str, ...]
+    flags: tuple[str, ...]
+    is_none: Callable[..., Any]
+
+    def covers(self, path: str) -> bool:
+        """Return whether a field is one of these, or in one."""
+        return any(path == field or path.startswith(f"{field}.") for field in self.fields)
+
+
+def _is_negative(_value: Any, status: Any) -> Any:
+    """Return whether there is no fix: STATUS_NO_FIX is -1."""
+    return status < 0
+
+
+def _is_minus_one(_value: Any, first: Any) -> Any:
+    """Return whether there is no estimate: the first entry of its covariance is -1."""
+    return first == -1
+
+
+def _is_out_of_range(value: Any, least: Any, most: Any) -> Any:
+    """Return whether a range is to be discarded: below the least that the sensor knows, or beyond the most.
+
+    Both are 0 where a driver does not tell them.
+    """
+    return (most > least) & ((value < least) | (value > most))
+
+
+# Of the comments in the definitions of the types.
+MARKS = {
+    "sensor_msgs/msg/NavSatFix": [Mark(("latitude", "longitude", "altitude"), ("status.status",), _is_negative)],
+    "sensor_msgs/msg/Imu": [
+        Mark((field,), (f"{field}_covariance.0",), _is_minus_one)
+        for field in ("orientation", "angular_velocity", "linear_acceleration")
+    ],
+    "sensor_msgs/msg/Range": [Mark(("range",), ("min_range", "max_range"), _is_out_of_range)],
+    "sensor_msgs/msg/LaserScan": [Mark(("ranges",), ("range_min", "range_max"), _is_out_of_range)],
+}
+
+
+def list_flags(kind: str, paths: Collection[str]) -> set[str]:
+    """Return the paths of the numbers by which a message of this type says that the fields at `paths` have no value."""
+    return {flag for mark in MARKS.get(kind, ()) if any(map(mark.covers, paths)) for flag in mark.flags}
+
+
+def blank_columns(kind: str, columns: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return fields of many messages of a type, (messages,) each, with NaN where one says that it has no value.
+
+    `columns`: by path, those of `list_flags` too. Returned second is which messages have such a field, (messages,).
+    """
+    blank, marked = dict(columns), np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
+    for mark in MARKS.get(kind, ()):
+        for path in filter(mark.covers, columns):
+            is_none = mark.is_none(columns[path], *(columns[flag] for flag in mark.flags))
+            blank[path] = np.where(is_none, np.nan, columns[path].astype(np.float64))
+            marked |= is_none
+    return blank, marked
+
+
+def blank_message(kind: str, message: Any, paths: Collection[str]) -> bool:
+    """Set fields of a message of a type to NaN where it says that they have no value; return whether some were.
+
+    Args:
+        kind: the type.
+        message: the message, as rosbags has it.
+        paths: dotted paths of the fields that are read.
+    """
+    marked = False
+    for mark in MARKS.get(kind, ()):
+        for path in filter(mark.covers, paths):
+            if mark.is_none(*(float(_get(message, part)) for part in (path, *mark.flags))):
+                _set(message, path, np.nan)
+                marked = True
+    return marked
+
+
+def _get(message: Any, path: str) -> Any:
+    """Return the field of a message at a dotted path; NaN where there is none."""
+    for part in path.split("."):
+        if part.isdigit():
+            message = message[int(part)] if int(part) < len(message) else np.nan
+        else:
+            message = getattr(message, part, np.nan)
+    return message
+
+
+def _set(message: Any, path: str, value: float) -> None:
+    """Set the field of a message at a dotted path; a list is copied, since it may be that of the file."""
+    *parents, last = path.split(".")
+    if last.isdigit():
+        numbers = np.array(_get(message, ".".join(parents)), dtype=np.float64)
+        numbers[int(last)] = value
+        *parents, last = parents
+        setattr(_get(message, ".".join(parents)) if parents else message, last, numbers)
+    else:
+        setattr(_get(message, ".".join(parents)) if parents else message, last, value)
