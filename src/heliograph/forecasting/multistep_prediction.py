@@ -137,7 +137,7 @@ class MultistepPredictor(Module):
 
         # The sensor's noise, as it was learned where the filter learns it.
         deviations = None
-        learned_noise: WeightedColumns | None = None
+        learned_noise = None
         if isinstance(self.filter, AdaptiveFilter):
             deviations = jnp.asarray(self.filter.noise_deviations(prior, k))
             learned_noise = sensor.noise.columns.through(jnp.diag(deviations))
