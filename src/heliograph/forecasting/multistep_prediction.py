@@ -125,10 +125,9 @@ class MultistepPredictor(Module):
         if self.sensor is None or self.plant is None:
             return None
         # Modes that change what is measured: the filter expects a signal in each.
-        if isinstance(self.filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
-            signal, weights = self.filter.prior_signals(prior, k)
-            covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
-            return Moments(weights=weights, means=signal.mean, covariances=covariances)
+        filter, within = _condition_on_limits(self.filter, prior)
+        if isinstance(filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
+            return _measure_in_each_mode(filter, within, k)
         plant, initial_moments = at(self.plant, k), second_moments_at_start(self.plant)
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
@@ -215,6 +214,18 @@ class MultistepPredictor(Module):
         return prior, (states, outputs, received)
 
 
+def _condition_on_limits(filter: AbstractFilter, state: PyTree) -> tuple[AbstractFilter, PyTree]:
+    """Return the filter within limits of states, and its state given that these hold; any other filter as it is."""
+    return (filter.base, filter.condition_on_limits(state)) if isinstance(filter, LimitedFilter) else (filter, state)
+
+
+def _measure_in_each_mode(filter: MultipleModelFilter, prior: PyTree, k: jax.Array) -> Moments:
+    """Return the moments of the outputs at step k, a part for each mode."""
+    signal, weights = filter.prior_signals(prior, k)
+    covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
+    return Moments(weights=weights, means=signal.mean, covariances=covariances)
+
+
 def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
     """Return the moments of the outputs of a state of which not all is known: some variances are infinite."""
     covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
@@ -225,8 +236,7 @@ def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
 
 def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
     """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
-    if isinstance(filter, LimitedFilter):
-        return _expect(filter.base, filter.hold(prior), k)
+    filter, prior = _condition_on_limits(filter, prior)
     if isinstance(filter, FilterOfInputs):
         return _expect(filter.make_filter_under(prior.u, k), prior.base, k)
     if isinstance(filter, ToldFilter):  # part of z says which law of noise holds: zeros would say one

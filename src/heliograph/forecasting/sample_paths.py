@@ -8,6 +8,7 @@ import numpy as np
 
 from heliograph.filters.gaussian.adaptive import AdaptiveFilter
 from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
+from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.forecasting.forecast import ForecastTarget, check_steps_covered, find_target
 from heliograph.forecasting.horizons import Horizons, Inputs, check_inputs_ahead, find_rows_ahead
 from heliograph.forecasting.paths_within_limits import StateLimits, draw_limited_components
@@ -164,6 +165,8 @@ def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
     filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
     if not memories((plant, sensor)):
         return None
+    if isinstance(filter, LimitedFilter):
+        filter = filter.base
     if not isinstance(filter, MultipleModelFilter):
         expected = "a filter that has the modes' probabilities (imm_filter, gpb1_filter, gpb2_filter)"
         raise fail("paths of a plant or sensor with modes", expected, type(filter).__name__)
