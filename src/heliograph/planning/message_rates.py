@@ -268,34 +268,43 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
 
     x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta. So
     (x, last sent) is a Markov chain. Its law is held as f[i, j] = P(x in cell i, last sent in cell j), on cells no
-    longer than `share` of the lesser noise's deviation.
+    longer than `share` of the lesser noise's deviation. It is the same of (-x, -last sent), so that the rows of x >= 0
+    are all.
     """
     a, q, r = system.a, system.q, system.r
     cells = _choose_cells(system, delta, share)
     # Probabilities of a cell given the middle of another: move[new, old] of x after a step, noise[x, z] of z given x.
     x = np.arange(-cells.each_side, cells.each_side + 1) * cells.length
-    move, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
+    size, upper = len(x), x[cells.each_side :]  # of x >= 0
+    move = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T[cells.each_side :]
+    noise = _compute_cell_probabilities(x, upper, np.sqrt(r))
     # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
-    quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
-    size = len(x)
+    quiet = ndtr((x + delta - upper[:, None]) / np.sqrt(r)) - ndtr((x - delta - upper[:, None]) / np.sqrt(r))
+
+    def move_law(half: np.ndarray) -> np.ndarray:
+        """Return the rows of x >= 0 after x moves, from those before."""
+        below = half[:0:-1, ::-1]  # of x < 0: the same with both signs turned
+        return np.asarray(move @ np.concatenate([below, half]))
 
     def move_and_send(vector: np.ndarray) -> np.ndarray:
-        """Return the law after a step, from that before it, each (size^2,): x moves, then is sent or not."""
-        f = move @ vector.reshape(size, size)
+        """Return the rows of x >= 0 after a step, from those before it, in one vector: x moves, then is sent or not."""
+        f = move_law(vector.reshape(-1, size))
         return np.asarray(f * quiet + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
     deviation = np.sqrt(q / (1 - a * a))
-    start = _compute_cell_probabilities(x, np.zeros(1), deviation).T * noise
-    operator = LinearOperator((size**2, size**2), matvec=move_and_send, dtype=np.float64)
+    start = _compute_cell_probabilities(x, np.zeros(1), deviation).T[cells.each_side :] * noise
+    operator = LinearOperator((start.size, start.size), matvec=move_and_send, dtype=np.float64)
     most_iterations = int(PRODUCTS / size**3 / PRODUCTS_OF_ITERATION) + 2
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=most_iterations, tol=1e-9)
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
-    f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(_compute_law_after_message(move @ f, noise, cells.of_delta).sum()), cells.length
+    f = np.real(vectors[:, 0] / vectors.sum()).reshape(-1, size)
+    sent = _compute_law_after_message(move_law(f), noise, cells.of_delta)
+    times = np.where(upper > 0, 2.0, 1.0)  # of each row, which is one of two but for that of x = 0
+    return float(times @ sent.sum(axis=1) / (times @ f.sum(axis=1))), cells.length
 
 
 def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
@@ -307,7 +316,7 @@ def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta:
         cells_of_delta: number of cells on either side of a measured one that are no further than delta from it.
     """
     # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
-    size = len(f)
+    size = f.shape[1]
     beyond = max(size - cells_of_delta - 1, 0)  # measured cells that have any such value above them, or below
     sums = np.cumsum(f, axis=1)
     far = np.zeros_like(f)
