@@ -273,38 +273,47 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
 
     x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta. So
     (x, last sent) is a Markov chain. Its law is held as f[i, j] = P(x in cell i, last sent in cell j), on cells no
-    longer than `share` of the lesser noise's deviation.
+    longer than `share` of the lesser noise's deviation. It is the same of (-x, -last sent), so that the rows of x >= 0
+    are all.
     """
     a, q, r = system.a, system.q, system.r
     cells = _choose_cells(system, delta, share)
     # Probabilities of a cell given the middle of another: T[new, old] of x after a step, noise[x, z] of z given x.
     x = np.arange(-cells.each_side, cells.each_side + 1) * cells.length
-    T, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
+    size, upper = len(x), x[cells.each_side :]  # of x >= 0
+    T = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T[cells.each_side :]
+    noise = _compute_cell_probabilities(x, upper, np.sqrt(r))
     # silence[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
-    silence = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
-    size = len(x)
+    silence = ndtr((x + delta - upper[:, None]) / np.sqrt(r)) - ndtr((x - delta - upper[:, None]) / np.sqrt(r))
+
+    def move_law(half: np.ndarray) -> np.ndarray:
+        """Return the rows of x >= 0 after x moves, from those before."""
+        below = half[:0:-1, ::-1]  # of x < 0: the same with both signs turned
+        return np.asarray(T @ np.concatenate([below, half]))
 
     def step_law(vector: np.ndarray) -> np.ndarray:
-        """Return the law (size^2,) of (x, value sent last) after a step: x moves by T, then is sent or not.
+        """Return the rows of x >= 0 after a step, from those before it, in one vector: x moves by T, then is sent or not.
 
         Without a message (probability `silence`) the value sent last stays; with one it is what was measured, x + v,
         whose probabilities given x are `noise`.
         """
-        f = T @ vector.reshape(size, size)
+        f = move_law(vector.reshape(-1, size))
         return np.asarray(f * silence + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
     deviation = np.sqrt(q / (1 - a * a))
-    start = _compute_cell_probabilities(x, np.zeros(1), deviation).T * noise
-    operator = LinearOperator((size**2, size**2), matvec=step_law, dtype=np.float64)
+    start = _compute_cell_probabilities(x, np.zeros(1), deviation).T[cells.each_side :] * noise
+    operator = LinearOperator((start.size, start.size), matvec=step_law, dtype=np.float64)
     most_iterations = int(PRODUCTS / size**3 / PRODUCTS_OF_ITERATION) + 2
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=most_iterations, tol=1e-9)
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
-    f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(_compute_law_after_message(T @ f, noise, cells.of_delta).sum()), cells.length
+    f = np.real(vectors[:, 0] / vectors.sum()).reshape(-1, size)
+    sent = _compute_law_after_message(move_law(f), noise, cells.of_delta)
+    times = np.where(upper > 0, 2.0, 1.0)  # of each row, which is one of two but for that of x = 0
+    return float(times @ sent.sum(axis=1) / (times @ f.sum(axis=1))), cells.length
 
 
 def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
@@ -316,7 +325,7 @@ def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta:
         cells_of_delta: number of cells on either side of a measured one that are no further than delta from it.
     """
     # So many cells have values more than delta above them; as many, at the other end, have such values below.
-    size = len(f)
+    size = f.shape[1]
     count = max(size - cells_of_delta - 1, 0)
     mass_up_to = np.cumsum(f, axis=1)  # [i, j] = P(x in cell i, last sent in cell j or below)
     # [i, z] = P(x in cell i, last sent more than delta from cell z): above it, then below.
