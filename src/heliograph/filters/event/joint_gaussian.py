@@ -43,17 +43,21 @@ class LinkMoments(NamedTuple):
 
 
 def augment_by_signal(
-    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, mixture: GaussianSum, start: jax.Array
+    plant: AbstractPlant,
+    sensor: AbstractSensor,
+    transform: AbstractTransform,
+    mixture: GaussianSum,
+    initial_power: jax.Array,
 ) -> GaussianSum:
-    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data.
+    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v, for the sensor h with the noise v.
 
-    x: the plant's state, r: the value that a sender compares with y. E[x_i^2] sets the size of numbers that rounding
-    acts on.
+    x: the plant's state, r: the value that a sender compares with y. `initial_power` (n,): E[x_i^2] before any data,
+    the size of numbers that rounding acts on.
     """
 
     def augment_one(joint: Gaussian) -> Gaussian:
         """Return one Gaussian of (x, r, y) from that of (x, r)."""
-        signal = find_signal_moments(plant, sensor, transform, take_leading(joint, len(start)), start)
+        signal = find_signal_moments(plant, sensor, transform, take_leading(joint, len(initial_power)), initial_power)
         return _append_signal(joint, signal)
 
     return mixture._replace(gaussian=jax.vmap(augment_one)(mixture.gaussian))
@@ -68,16 +72,16 @@ def _append_signal(joint: Gaussian, signal: Signal) -> Gaussian:
 
 
 def predict_with_reference(
-    plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data.
+    """Return the Gaussian of (f(x, u) + w, r): r stays; `initial_power` (n,) is E[x_i^2] before any data.
 
     r: the value that a sender compares with its signal. E[x_i^2] sets the size of numbers that rounding acts on.
     """
-    n = len(start)
+    n = len(initial_power)
     length_of_r = len(joint.mean) - n
     image = find_transition_moments(plant, transform, take_leading(joint, n), u)
-    noise = sum_unexplained(image, factor_process_noise(plant, u, start))
+    noise = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
     # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), joint.root[n:]])
     noise_of_joint = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)

@@ -166,7 +166,7 @@ def mix_and_predict(
     parts: Gaussian,
     weight: jax.Array,
     u: jax.Array,
-    start: jax.Array,
+    initial_power: jax.Array,
 ) -> Gaussian:
     """Return for each mixture the Gaussian (mixtures, n) of the mean and covariance of f(x, u) + w, x from the mixture.
 
@@ -176,16 +176,16 @@ def mix_and_predict(
         parts: Gaussians that are mixed, one a component.
         weight: [c, g], weight of component c in mixture g; columns need not sum to 1.
         u: input.
-        start: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
     share = normalise_columns(weight)
     # Through a nonlinear plant each mixture goes as one Gaussian.
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
-        return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
+        return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, initial_power))(mixtures)
     # A linear plant moves the parts before they are mixed, each once rather than once for each mixture: their means
     # A m + shift(u), the shift with the mean of w in it, and their covariances A P A'.
-    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, start).covariance
+    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
 
@@ -206,7 +206,7 @@ def mix_and_predict_by_mode(
     weight: jax.Array,
     moves: tuple[np.ndarray, np.ndarray],
     u: jax.Array,
-    start: jax.Array,
+    initial_power: jax.Array,
 ) -> Gaussian:
     """Return the Gaussians after a step: mixtures of `parts` by weights (components, mixtures), moved by modes' plants.
 
@@ -219,11 +219,11 @@ def mix_and_predict_by_mode(
         moves: two arrays, of each Gaussian after the step the number of the mixture that it was before, and the mode
             that moves it.
         u: input.
-        start: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
     mixture_of, mode_of = moves
     if len(plants) == 1:  # each mixture is moved once, however many modes it has afterwards
-        moved = mix_and_predict(plants[0], transform, parts, weight, u, start)
+        moved = mix_and_predict(plants[0], transform, parts, weight, u, initial_power)
         in_order = np.array_equal(mixture_of, np.arange(weight.shape[1]))
         return moved if in_order else jax.tree.map(lambda leaf: leaf[mixture_of], moved)
     # Plant after plant, the components that it moves; then all of them in order again.
@@ -232,7 +232,7 @@ def mix_and_predict_by_mode(
     for number, plant in enumerate(plants):
         sources = mixture_of[plant_of_component == number]
         before = jax.tree.map(lambda leaf, sources=sources: leaf[sources], mixtures)
-        results.append(_predict_each(plant, transform, before, u, start))
+        results.append(_predict_each(plant, transform, before, u, initial_power))
     moved_order = np.concatenate([np.flatnonzero(plant_of_component == number) for number in range(len(plants))])
     place_among_results = np.argsort(moved_order)  # of each component: the inverse permutation
     joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place_among_results], *results)
@@ -259,17 +259,17 @@ def mix_moments(parts: Gaussian, share: jax.Array) -> MixtureMoments:
 
 
 def _predict_each(
-    plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
     """Return the Gaussian of f(x, u) + w for each of some moments (..., n) of x.
 
-    `start`: E[x_i^2] at the start, for rounding. Moments of a linear plant are moved as they are, without factors
-    before.
+    Moments of a linear plant are moved as they are, without factors before. `initial_power`: E[x_i^2] at the start,
+    for rounding.
     """
     if not isinstance(plant, LinearPlant):
         before = jax.vmap(from_covariance_by_elimination)(*x)
-        return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, start))(before)
-    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, start).covariance
+        return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, initial_power))(before)
+    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
 
     def move(mean: jax.Array, covariance: jax.Array) -> Gaussian:
         """Move one pair of moments."""

@@ -139,8 +139,10 @@ class ModeObservedFilter(AbstractSizedFilter):
         """
         last_step = jnp.maximum(jnp.asarray(k) - 1, 0)
         channel = _find_moments_given_states(at(self.channel, last_step), memory_states)
-        start = second_moments_at_start(self.plant)
-        corrected, _ = correct_linear(state.before, at(self.sensor, last_step), channel, Polytope(), state.z, start)
+        initial_power = second_moments_at_start(self.plant)
+        corrected, _ = correct_linear(
+            state.before, at(self.sensor, last_step), channel, Polytope(), state.z, initial_power
+        )
         return predict_belief(corrected, state.move)
 
     def _describe_channel_after(self, begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
