@@ -89,15 +89,15 @@ def predict_with_reference(
     return from_columns(mean, join_columns(WeightedColumns(slopes, joint.variances), noise_of_joint))
 
 
-def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Return the Gaussian with the components at `places` replaced by known values, independent of all others.
+def set_known_components(x: Gaussian, indices: np.ndarray, values: jax.Array) -> Gaussian:
+    """Return the Gaussian with the components at `indices` replaced by known values, independent of all others.
 
     With the covariance root diag(variances) root' a known component has a column of its own, of variance 0, and as
     its row of the root that of the identity. The root is made lower triangular again.
     """
-    root = x.root.at[places].set(np.eye(len(x.mean))[places])
-    variances = x.variances.at[places].set(0.0)
-    return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
+    root = x.root.at[indices].set(np.eye(len(x.mean))[indices])
+    variances = x.variances.at[indices].set(0.0)
+    return Gaussian(x.mean.at[indices].set(values), below_diagonal(root), variances)
 
 
 def condition_parts_on_received(

@@ -39,9 +39,9 @@ class AbstractMerging(Module):
         """Return the weights (K, M) of the components before any data, of the modes' law (M,)."""
         return jnp.diag(law)
 
-    def merge_by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+    def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
         """Return one Gaussian for each mode, of components and weights (K, M) as `keep_components` returns them."""
-        return parts
+        return gaussians
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return how components are mixed before a move: weights (K, G) of K components in G mixtures.
@@ -60,9 +60,9 @@ class AbstractMerging(Module):
         places = np.arange(modes)
         return places, places
 
-    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return the components after the update of all pairs, and their weights (K, M)."""
-        return parts, jnp.diag(weight)
+        return gaussians, jnp.diag(weight)
 
 
 class MergeAll(AbstractMerging):
@@ -102,15 +102,15 @@ class MergeByMode(AbstractMerging):
         """Return the pairs (component, mode) of the update: every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
-    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return one component for each present mode, merged over the modes before, and the weights (M, M).
 
-        `parts`, `weight`: a Gaussian and its weight for each pair (mode before, present mode). A component holds the
-        weight of its own mode alone: the weights returned are diagonal.
+        `gaussians`, `weight`: a Gaussian and its weight for each pair (mode before, present mode). A component holds
+        the weight of its own mode alone: the weights returned are diagonal.
         """
         _, present_mode = self.list_update_pairs(modes)
         weight_by_mode = weight[:, None] * (present_mode[:, None] == np.arange(modes))  # (pair, present mode)
-        merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight_by_mode))
+        merged = jax.vmap(partial(merge_mixture, gaussians), in_axes=1)(normalise_columns(weight_by_mode))
         return merged, jnp.diag(jnp.sum(weight_by_mode, axis=0))
 
 
@@ -122,9 +122,9 @@ class MergePairs(AbstractMerging):
         """Always True."""
         return True
 
-    def merge_by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+    def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
         """Return one Gaussian for each present mode, merged from its pairs."""
-        return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight))
+        return jax.vmap(partial(merge_mixture, gaussians), in_axes=1)(normalise_columns(weight))
 
     def initial_weights(self, law: jax.Array) -> jax.Array:
         """Return the weights (M^2, M) of pairs before any data: the law (M,) on pairs of equal modes."""
@@ -144,9 +144,9 @@ class MergePairs(AbstractMerging):
         """Return the pairs (component, mode) of the update: each component, a pair of modes, with its present mode."""
         return np.arange(modes**2), np.tile(np.arange(modes), modes)
 
-    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return all components, pairs of modes, as they are until the next move, and their weights (M^2, M)."""
-        return parts, self._by_mode(weight, modes)
+        return gaussians, self._by_mode(weight, modes)
 
     def _by_mode(self, weight: jax.Array, modes: int) -> jax.Array:
         """Return the weights (M^2,) of pairs as (M^2, M), each in the column of its present mode."""
@@ -246,13 +246,13 @@ class MixtureMoments(NamedTuple):
     covariance: jax.Array
 
 
-def mix_moments(parts: Gaussian, share: jax.Array) -> MixtureMoments:
+def mix_moments(gaussians: Gaussian, share: jax.Array) -> MixtureMoments:
     """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
-    covariances = jax.vmap(lambda x: x.covariance)(parts)
+    covariances = jax.vmap(lambda x: x.covariance)(gaussians)
 
     def mix(shares: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean and covariance of the mixture with these shares of the components."""
-        return moments_of_mixture(parts.mean, covariances, shares)
+        return moments_of_mixture(gaussians.mean, covariances, shares)
 
     mean, covariance = jax.vmap(mix, in_axes=1)(share)
     return MixtureMoments(mean, covariance)
