@@ -134,7 +134,8 @@ def _condition_on_received(
 ) -> tuple[Gaussian, jax.Array]:
     """Return one Gaussian x of (state, r, y) given z = G y + n, and log of the density of z.
 
-    Arguments as of `condition_parts_on_received`.
+    z: what a sender's message brought, of which `arrived` came; `link`: moments of G and n; `sender`: its components
+    of y (m,); `delivers`: what arrives is y itself.
     """
     expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
     after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
