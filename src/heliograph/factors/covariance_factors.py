@@ -99,12 +99,12 @@ def below_diagonal(lower: jax.Array) -> jax.Array:
     return _take_entries(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
 
 
-def _take_entries(entries: jax.Array, places: np.ndarray) -> jax.Array:
-    """Return `entries[..., places]` as one operation: the places are known, and need no check of their bounds."""
+def _take_entries(entries: jax.Array, indices: np.ndarray) -> jax.Array:
+    """Return `entries[..., indices]` as one operation: the indices are known, and need no check of their bounds."""
     axis = entries.ndim - 1
     numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
     sizes = (*entries.shape[:-1], 1)
-    return lax.gather(entries, places[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
+    return lax.gather(entries, indices[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
 
 
 def is_positive(x: jax.Array) -> jax.Array:

@@ -215,46 +215,46 @@ def _check_weighable(covariance: Array, independent: bool) -> None:
         raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 
 
-def _pair_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
+def _pair_branches(sensed: GaussianBranches, last_hop: GaussianBranches) -> tuple[Array, ...]:
     """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
 
     Log probabilities, means and variances of the sensor's, means and variances of the last hop's.
 
     A branch is one Gaussian of a mixture; its probability is the product of both.
     """
-    xp = library(sensed, late)
-    shape = (len(sensed.mean), sensed.mean.shape[1], late.mean.shape[1])
+    xp = library(sensed, last_hop)
+    shape = (len(sensed.mean), sensed.mean.shape[1], last_hop.mean.shape[1])
 
     def repeat(values: Array, axis: int) -> Array:
         """Return values (m, branches) for all pairs, the same along this axis of (m, sensor's, last hop's)."""
         pairs: Array = xp.broadcast_to(xp.expand_dims(values, axis), shape).reshape(shape[0], -1)
         return pairs
 
-    log_share = repeat(sensed.log_share, axis=2) + repeat(late.log_share, axis=1)
+    log_share = repeat(sensed.log_share, axis=2) + repeat(last_hop.log_share, axis=1)
     sensed_moments = repeat(sensed.mean, axis=2), repeat(sensed.variance, axis=2)
-    return log_share, *sensed_moments, repeat(late.mean, axis=1), repeat(late.variance, axis=1)
+    return log_share, *sensed_moments, repeat(last_hop.mean, axis=1), repeat(last_hop.variance, axis=1)
 
 
-def _find_least_degrees(sensed: AbstractNoise, late: AbstractNoise | None, source: np.ndarray) -> Vector:
+def _find_least_degrees(sensed: AbstractNoise, last_hop: AbstractNoise | None, source: np.ndarray) -> Vector:
     """Return the least degrees of freedom of Student's noises in each received number (m,), infinite where none is.
 
-    `late`: noise of the last hop, None if there is none; `source`: output whose noise each number brings.
+    `last_hop`: noise of the last hop, None if there is none; `source`: output whose noise each number brings.
     """
-    laws = [_student_degrees(sensed, None)[source], *([] if late is None else [_student_degrees(late, None)])]
+    laws = [_student_degrees(sensed, None)[source], *([] if last_hop is None else [_student_degrees(last_hop, None)])]
     xp = library(laws)
     finite = [xp.where(xp.isnan(degrees), xp.inf, degrees) for degrees in laws]
     least: Vector = xp.min(xp.stack(finite), axis=0)
     return least
 
 
-def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
+def _student_degrees(sensed: AbstractNoise, last_hop: AbstractNoise | None) -> Vector:
     """Return the degrees of freedom of each output's Student noise; NaN where the noise has another law.
 
-    `late`: noise of the last hop, None if there is none; a sum of two is no Student noise.
+    `last_hop`: noise of the last hop, None if there is none; a sum of two is no Student noise.
     """
     independent_noises = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
-        noise.degrees * np.ones(noise.dimension) if isinstance(noise, StudentT) and late is None
+        noise.degrees * np.ones(noise.dimension) if isinstance(noise, StudentT) and last_hop is None
         else np.full(noise.dimension, np.nan)
         for noise in independent_noises
     ]  # fmt: skip

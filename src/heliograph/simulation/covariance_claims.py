@@ -85,16 +85,16 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
     return lowered
 
 
-def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFilter:
+def lower_claim_if_mistaken(own_models: Premise, filter: AbstractFilter) -> AbstractFilter:
     """Return the filter as it is if it was made for the models where it stands, else one that claims "nominal" at most.
 
     Args:
-        own: the models at the place where it stands: plant, sensor, channel and trigger.
+        own_models: the models at the place where it stands: plant, sensor, channel and trigger.
         filter: the filter, which keeps its claim outside of the network.
     """
     # A claim of "nominal" or less need not be lowered, whatever the filter was made for.
     is_weak = lower_claim(filter.claim) == filter.claim
-    return filter if is_weak or not list_mistaken_parts(own, filter) else lower_to_nominal(filter)
+    return filter if is_weak or not list_mistaken_parts(own_models, filter) else lower_to_nominal(filter)
 
 
 def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
@@ -219,14 +219,17 @@ def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
         yield from _yield_mistaken_beliefs(FUSED, find_common_premise(network), central)
 
 
-def _yield_mistaken_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[MistakenBelief]:
-    """Yield the filters of a node that claim something and were made for other models than its `own`, with which parts.
+def _yield_mistaken_beliefs(
+    node: str, own_models: Premise, filters: Mapping[str, AbstractFilter]
+) -> Iterator[MistakenBelief]:
+    """Yield the filters of a node that claim something and were made for other models than `own_models`, the node's.
 
-    Those that do not say for which models they were made (no premise) are passed over, unless lowered already.
+    Each with the parts of the models that differ. Filters that do not say for which models they were made (no
+    premise) are passed over, unless lowered already.
     """
     for label, filter in filters.items():
         is_known = filter.premise is not None or filter.kept.lowered
-        if filter.claim != "none" and is_known and (mistaken_parts := list_mistaken_parts(own, filter)):
+        if filter.claim != "none" and is_known and (mistaken_parts := list_mistaken_parts(own_models, filter)):
             yield MistakenBelief(node, label, mistaken_parts, filter.kept.lowered)
 
 

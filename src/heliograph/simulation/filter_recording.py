@@ -205,16 +205,16 @@ def _make_forecast_origin(network: Network, record: Record, state: PyTree, u: np
 
 
 def _find_times(
-    measured: Mapping[str, ArrayLike], others: Mapping[str, object], time: ArrayLike | None, steps: int
+    measured: Mapping[str, ArrayLike], other_tables: Mapping[str, object], time: ArrayLike | None, steps: int
 ) -> np.ndarray | None:
     """Return the times of the rows: `time`, else the dates by which the tables know them; None where there are none.
 
-    `measured`: tables of measurements by node. `others`: further tables by name. `steps`: number of rows.
+    `measured`: tables of measurements by node. `other_tables`: further tables by name. `steps`: number of rows.
     """
     if time is not None:
         return check_times("time", time, steps)
     tables = {f"measurements of node {name!r}": z for name, z in measured.items()}
-    return find_common_dates({**tables, **others})
+    return find_common_dates({**tables, **other_tables})
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:

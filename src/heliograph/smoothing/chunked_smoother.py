@@ -133,8 +133,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         else:
             pass_back_from, laws = first + own, later
         arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
-        all_but_recursion = [False, True, True, True, True, True, True]
-        choice = choose_code(smooth_chunk, arguments, differs_by_run=all_but_recursion)
+        choice = choose_code(smooth_chunk, arguments, differs_by_run=[False, True, True, True, True, True, True])
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:

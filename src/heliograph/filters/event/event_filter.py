@@ -108,12 +108,12 @@ class EventFilter(AbstractSizedFilter):
         has_sent = jnp.full(len(self.senders), not self.trigger.needs_reference)
         return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
 
-    def _pad_sum(self, one: GaussianSum) -> GaussianSum:
+    def _pad_sum(self, single: GaussianSum) -> GaussianSum:
         """Return a sum of one Gaussian, padded with copies of weight zero to the filter's number of Gaussians."""
         lost_references = self.lost if self.reference_may_be_lost else 0
         count = self._known_reference_count + lost_references
-        copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
-        return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
+        copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
+        return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))
 
     @property
     def region(self) -> SilentRegion:
@@ -221,7 +221,7 @@ class EventFilter(AbstractSizedFilter):
         # transmissions lost.
         unsent, due = self._split_label_by_sending(augmented.label[:, s], begun)
         loss = self._loss_probability(channel, s)[:, None, None]
-        dropped, forced = (status_after_sending(sent * loss, lost=True) for sent in (unsent, due))
+        dropped, forced = (status_after_sending(sent * loss, is_lost=True) for sent in (unsent, due))
         if self.trigger.losses == "known":  # told of a loss: it was sent; told of none: it was not
             unsent = jnp.where(lost > 0, 0.0, unsent)
             dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
@@ -311,7 +311,7 @@ class EventFilter(AbstractSizedFilter):
         sent_updated, sent_before = by_part[:count], by_part[count:]
         # One Gaussian again, with a new reference.
         merged = merge_groups(concatenate_sums(sent_updated).select_components(self._find_new_reference(sender)))
-        merged = merged.relabel_sender(s, status_after_sending(merged.label[:, s], lost=False))
+        merged = merged.relabel_sender(s, status_after_sending(merged.label[:, s], is_lost=False))
         signal = self._predict_sent_value(sent_before, links, sender)
         return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
 
@@ -326,12 +326,12 @@ class EventFilter(AbstractSizedFilter):
             received_by_mode.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
         return merge_groups(concatenate_sums(received_by_mode)).gaussian
 
-    def _restrict_to_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
+    def _restrict_to_sent(self, used: GaussianSum, s: int, has_sent: jax.Array) -> GaussianSum:
         """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
 
         Returns one sum of the pieces outside, of a floor where these have next to no probability, and of those due.
         """
-        waiting, due = self._split_label_by_sending(used.label[:, s], begun)
+        waiting, due = self._split_label_by_sending(used.label[:, s], has_sent)
         before_event = used.relabel_sender(s, waiting)
         outside = self.region.truncate_outside(before_event, self.senders[s], scale=1 - RIM)  # RIM: for rounding
         log_mass_outside = jnp.max(
@@ -341,12 +341,12 @@ class EventFilter(AbstractSizedFilter):
         floor = before_event._replace(log_weight=jnp.where(log_mass_outside < lowest, lowest, -jnp.inf))
         return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
 
-    def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _split_label_by_sending(self, label: jax.Array, has_sent: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
         heartbeat = self.trigger.heartbeat
         # A: steps since it sent. It must send at first (not begun), and at the heartbeat where there is one.
         is_heartbeat = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
-        due = jnp.where(~begun | is_heartbeat, label, 0.0)
+        due = jnp.where(~has_sent | is_heartbeat, label, 0.0)
         return label - due, due
 
     def _loss_probability(self, channel: ChannelByPattern, s: int) -> jax.Array:

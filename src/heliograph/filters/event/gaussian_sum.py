@@ -53,15 +53,15 @@ class GaussianSum(NamedTuple):
         few: GaussianSum = jax.tree.map(lambda leaf: leaf[first:stop], self)
         return few
 
-    def select_components(self, places: np.ndarray) -> "GaussianSum":
-        """Select components of the Gaussians' vector, in the order of `places`."""
+    def select_components(self, indices: np.ndarray) -> "GaussianSum":
+        """Select components of the Gaussians' vector, in the order of `indices`."""
         # The first components alone need no new factorisation.
-        if np.array_equal(places, np.arange(len(places))):
-            return self._replace(gaussian=take_leading(self.gaussian, len(places)))
+        if np.array_equal(indices, np.arange(len(indices))):
+            return self._replace(gaussian=take_leading(self.gaussian, len(indices)))
 
         def select(x: Gaussian) -> Gaussian:
             """Select components of one Gaussian."""
-            return from_columns(x.mean[places], WeightedColumns(x.root[places], x.variances))
+            return from_columns(x.mean[indices], WeightedColumns(x.root[indices], x.variances))
 
         return self._replace(gaussian=jax.vmap(select)(self.gaussian))
 

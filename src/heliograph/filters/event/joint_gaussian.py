@@ -43,17 +43,21 @@ class LinkMoments(NamedTuple):
 
 
 def augment_by_signal(
-    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, mixture: GaussianSum, start: jax.Array
+    plant: AbstractPlant,
+    sensor: AbstractSensor,
+    transform: AbstractTransform,
+    mixture: GaussianSum,
+    initial_power: jax.Array,
 ) -> GaussianSum:
-    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data.
+    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v, for the sensor h with the noise v.
 
-    x: the plant's state, r: the value that a sender compares with y. E[x_i^2] sets the size of numbers that rounding
-    acts on.
+    x: the plant's state, r: the value that a sender compares with y. `initial_power` (n,): E[x_i^2] before any data,
+    the size of numbers that rounding acts on.
     """
 
     def augment_one(joint: Gaussian) -> Gaussian:
         """Return one Gaussian of (x, r, y) from that of (x, r)."""
-        signal = find_signal_moments(plant, sensor, transform, take_leading(joint, len(start)), start)
+        signal = find_signal_moments(plant, sensor, transform, take_leading(joint, len(initial_power)), initial_power)
         return _append_signal(joint, signal)
 
     return mixture._replace(gaussian=jax.vmap(augment_one)(mixture.gaussian))
@@ -68,16 +72,16 @@ def _append_signal(joint: Gaussian, signal: Signal) -> Gaussian:
 
 
 def predict_with_reference(
-    plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data.
+    """Return the Gaussian of (f(x, u) + w, r): r stays; `initial_power` (n,) is E[x_i^2] before any data.
 
     r: the value that a sender compares with its signal. E[x_i^2] sets the size of numbers that rounding acts on.
     """
-    n = len(start)
+    n = len(initial_power)
     length_of_r = len(joint.mean) - n
     image = find_transition_moments(plant, transform, take_leading(joint, n), u)
-    noise = sum_unexplained(image, factor_process_noise(plant, u, start))
+    noise = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
     # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), joint.root[n:]])
     noise_of_joint = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
@@ -85,15 +89,15 @@ def predict_with_reference(
     return from_columns(mean, join_columns(WeightedColumns(slopes, joint.variances), noise_of_joint))
 
 
-def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Return the Gaussian with the components at `places` replaced by known values, independent of all others.
+def set_known_components(x: Gaussian, indices: np.ndarray, values: jax.Array) -> Gaussian:
+    """Return the Gaussian with the components at `indices` replaced by known values, independent of all others.
 
     With the covariance root diag(variances) root' a known component has a column of its own, of variance 0, and as
     its row of the root that of the identity. The root is made lower triangular again.
     """
-    root = x.root.at[places].set(np.eye(len(x.mean))[places])
-    variances = x.variances.at[places].set(0.0)
-    return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
+    root = x.root.at[indices].set(np.eye(len(x.mean))[indices])
+    variances = x.variances.at[indices].set(0.0)
+    return Gaussian(x.mean.at[indices].set(values), below_diagonal(root), variances)
 
 
 def condition_parts_on_received(
@@ -130,7 +134,8 @@ def _condition_on_received(
 ) -> tuple[Gaussian, jax.Array]:
     """Return one Gaussian x of (state, r, y) given z = G y + n, and log of the density of z.
 
-    Arguments as of `condition_parts_on_received`.
+    z: what a sender's message brought, of which `arrived` came; `link`: moments of G and n; `sender`: its components
+    of y (m,); `delivers`: what arrives is y itself.
     """
     expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
     after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)

@@ -22,17 +22,17 @@ class SilenceByCause(NamedTuple):
     forced: jax.Array
 
 
-def status_after_sending(label: jax.Array, lost: bool) -> jax.Array:
+def status_after_sending(label: jax.Array, is_lost: bool) -> jax.Array:
     """Return the probabilities of a sender's status after a transmission, which starts its count of steps anew.
 
     `label` (K, M, A, C): K Gaussians, M modes of the link, A steps since a transmission, C transmissions lost since
-    the last that arrived; `lost`: this one too. The last entry of C stands for all larger numbers too; with C = 1
+    the last that arrived; `is_lost`: this one too. The last entry of C stands for all larger numbers too; with C = 1
     losses are not counted.
     """
     label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
     if label.shape[-1] == 1:
         return label
-    if not lost:
+    if not is_lost:
         return jnp.zeros_like(label).at[..., 0].set(jnp.sum(label, axis=-1))
     # One loss more: each entry of C moves up by one, and the last one keeps its own too.
     one_more = jnp.concatenate([jnp.zeros_like(label[..., :1]), label[..., :-1]], axis=-1)

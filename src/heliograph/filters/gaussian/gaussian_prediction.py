@@ -113,13 +113,13 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
     return jnp.asarray(second_moments)
 
 
-def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
-    """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,).
+def factor_process_noise(plant: AbstractPlant, u: jax.Array, initial_power: jax.Array) -> WeightedColumns:
+    """Return factors of Cov w plus the rounding of a state that had the second moments `initial_power`, (n,).
 
     Numbers of second moments s have a rounding of some eps^2 s as variance: so no covariance is singular by rounding.
     """
     noise = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    rounding = rounding_of(start + diagonal(plant.noise_covariance(u)))
+    rounding = rounding_of(initial_power + diagonal(plant.noise_covariance(u)))
     joined = join_columns(noise, rounding)
     factors: WeightedColumns = keep_for_derivatives(triangularise(joined))
     return factors
@@ -136,13 +136,13 @@ def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, 
 
 
 def predict_gaussian(
-    plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of f(x, u) + w; `start` (n,) is E[x_i^2] before any data, which rounding acts on.
+    """Return the Gaussian of f(x, u) + w; `initial_power` (n,) is E[x_i^2] before any data, which rounding acts on.
 
     `settle` puts attitudes back on their group about `middle`, the state about which moments are taken.
     """
-    noise = factor_process_noise(plant, u, start)
+    noise = factor_process_noise(plant, u, initial_power)
     if isinstance(plant, LinearPlant):
         return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
     middle, image = transform_about_mean(plant, transform, x, u)

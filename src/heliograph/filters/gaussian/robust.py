@@ -215,20 +215,24 @@ class RobustFilter(AbstractGaussianStateFilter):
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
         """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        start = second_moments_at_start(self.plant, self)
-        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start)
+        initial_power = second_moments_at_start(self.plant, self)
+        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, initial_power)
         return predict_behind_channel(signal, channel), signal.mean
 
 
 def signal_without_noise(
-    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Gaussian, start: jax.Array
+    plant: AbstractPlant,
+    sensor: AbstractSensor,
+    transform: AbstractTransform,
+    state: Gaussian,
+    initial_power: jax.Array,
 ) -> Signal:
     """Return the moments of h(x) and the mean of its noise, without the noise's spread.
 
-    `start`: E[x_i^2] before any data (n,), the size of numbers that rounding acts on.
+    `initial_power`: E[x_i^2] before any data (n,), the size of numbers that rounding acts on.
     """
     no_noise = zero_covariance(len(sensor.outputs))
-    return find_signal_moments(plant, sensor, transform, state, start, no_noise)
+    return find_signal_moments(plant, sensor, transform, state, initial_power, no_noise)
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:

@@ -102,14 +102,14 @@ class SequentialFilter(AbstractSizedFilter):
         return replace(smoother_step_by_transform(self.filters[0], step, self.filters[0]), claim=self.claim)
 
 
-def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
+def _join_innovations(innovations: Sequence[Innovation]) -> Innovation:
     """Return one innovation of all nodes' measurements, from each node's given the nodes before it.
 
     The log likelihoods add up. Between nodes the covariance is 0, since each innovation is given the nodes before.
     """
-    covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
-    total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
-    return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)
+    covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in innovations))
+    total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in innovations]))
+    return Innovation(jnp.concatenate([innovation.value for innovation in innovations]), covariance, total)
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:

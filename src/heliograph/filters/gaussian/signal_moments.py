@@ -74,7 +74,7 @@ def find_signal_moments(
     sensor: AbstractSensor,
     transform: AbstractTransform,
     prior: Gaussian,
-    start: jax.Array,
+    initial_power: jax.Array,
     noise: WeightedColumns | None = None,
 ) -> Signal:
     """Return the moments of the sensor's signal y = h(x) + v under the prior of x.
@@ -84,7 +84,7 @@ def find_signal_moments(
         sensor: h and the law of v.
         transform: for an h that is not linear.
         prior: the law of x.
-        start: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
         noise: of v, in place of the sensor's.
     """
     law = sensor.noise
@@ -95,18 +95,20 @@ def find_signal_moments(
         image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
     second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
-    size = bound_signal_power_at_start(sensor, start) if isinstance(sensor, LinearSensor) else diagonal(second)
+    size = bound_signal_power_at_start(sensor, initial_power) if isinstance(sensor, LinearSensor) else diagonal(second)
     return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=noise, second=second, size=size)
 
 
-def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
+def bound_signal_power_at_start(sensor: LinearSensor, initial_power: jax.Array) -> jax.Array:
     """Return (|H| root E[x_i^2] + |E v|)^2 + Var v of the p outputs y = H x + v at the start: it bounds E[y_i^2].
 
-    `start`: E[x_i^2] before any data, (n,), since moments before data at later steps may grow without end. The noise
-    counts without its outliers: Student's law of at most two degrees has no variance.
+    `initial_power` (n,): E[x_i^2] before any data, since moments before data at later steps may grow without end. The
+    noise counts without its outliers: Student's law of at most two degrees has no variance.
     """
     law = sensor.noise
-    bound = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))  # of |E y_i|
+    bound = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(initial_power) + lax.abs(
+        jnp.asarray(law.mean)
+    )  # of |E y_i|
     power: jax.Array = bound**2 + diagonal(law.without_outliers().covariance)
     return power
 

@@ -158,15 +158,15 @@ def zero_mean_fixed_point_map(
 
 
 def _trace_weight(
-    omega: jax.Array, cross_square: jax.Array, others: Sequence[jax.Array]
+    omega: jax.Array, cross_square: jax.Array, matrices: Sequence[jax.Array]
 ) -> tuple[jax.Array, list[jax.Array]]:
     """Return W = Omega^-1 C' C Omega^-1, C' C = cross_square, and Omega^-1 X of each of the others, all (m, m).
 
     Omega: a covariance of what is received; the others X are solved with it in the same call.
     """
     solve = solver(omega)
-    solved = solve(jnp.concatenate([cross_square, *others], axis=1))
-    inverse_times_square, *inverse_times_others = jnp.split(solved, 1 + len(others), axis=1)
+    solved = solve(jnp.concatenate([cross_square, *matrices], axis=1))
+    inverse_times_square, *inverse_times_others = jnp.split(solved, 1 + len(matrices), axis=1)
     return solve(inverse_times_square.T), inverse_times_others
 
 

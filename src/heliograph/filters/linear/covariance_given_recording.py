@@ -56,8 +56,8 @@ class LinearFilterOfRecord(AbstractSizedFilter):
     @predicts
     def predict(self, state: RecordedBelief, u: ArrayLike = (), k: Step = 0) -> RecordedBelief:
         """Predict the filter's own state, and the covariance P given the recording: A P A' + Q."""
-        start = second_moments_at_start(self.plant)
-        move = motion_of_plant(at(self.plant, k), jnp.asarray(u), start)
+        initial_power = second_moments_at_start(self.plant)
+        move = motion_of_plant(at(self.plant, k), jnp.asarray(u), initial_power)
         covariance = move.matrix @ state.covariance @ move.matrix.T + move.covariance
         return RecordedBelief(self.filter.predict(state.own, u, k), symmetric(covariance))
 

@@ -151,11 +151,11 @@ class LinearFilter(AbstractSizedFilter):
         return LinearFilterOfRecord(filter=self, plant=self.plant, **make_sizes("nominal", self, self.received))
 
 
-def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:
+def signal_before_data(state: LinearBelief, sensor: LinearSensor, initial_power: jax.Array) -> Signal:
     """Return the moments of y = C x + v before any data, E y and E[y y'], with the slopes of the estimate's error.
 
     They depend on the error covariance and the state's moments before data alone, not on the estimate: derivatives by
-    the estimate do not involve them. `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
+    the estimate do not involve them. `initial_power`: E[x_i^2] at the start, the size of numbers that rounding acts on.
     """
     y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
@@ -164,20 +164,26 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
         slopes=jnp.asarray(sensor.matrix) @ state.gaussian.root,
         noise=y.noise,
         second=y.second,
-        size=bound_signal_power_at_start(sensor, start),
+        size=bound_signal_power_at_start(sensor, initial_power),
     )
 
 
 def correct_linear(
-    state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, start: jax.Array
+    state: LinearBelief,
+    sensor: LinearSensor,
+    channel: SecondOrder,
+    rule: Polytope,
+    z: jax.Array,
+    initial_power: jax.Array,
 ) -> tuple[LinearBelief, Innovation]:
     """Return the estimate corrected with the components of z (m,) that arrived, and the innovation.
 
     What is expected of z is by the estimate; gain and covariance are by the moments before any data.
 
-    `rule`: how uncertain probabilities of the channel are bounded; `start`: E[x_i^2] at the start, for rounding.
+    `rule`: how uncertain probabilities of the channel are bounded; `initial_power`: E[x_i^2] before data, for
+    rounding.
     """
-    before_data = signal_before_data(state, sensor, start)
+    before_data = signal_before_data(state, sensor, initial_power)
     expected_y = jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean)
     given_estimate = before_data._replace(mean=expected_y)
     after, innovation = correct_signal(given_estimate, channel, rule, z, unknown=before_data)

@@ -29,8 +29,8 @@ class PlantMotion(NamedTuple):
     noise: WeightedColumns
 
 
-def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> PlantMotion:
-    """Return the plant's motion under the input u; `start` is E[x_i^2] before the first step, (n,).
+def motion_of_plant(plant: LinearPlant, u: jax.Array, initial_power: jax.Array) -> PlantMotion:
+    """Return the plant's motion under the input u; `initial_power` is E[x_i^2] before the first step, (n,).
 
     x+ = matrix x + shift + w; `covariance`, `noise`: Cov w, and its factors with rounding.
     """
@@ -38,7 +38,7 @@ def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> Plant
         matrix=plant.transition_matrix(u),
         shift=plant.shift(u),
         covariance=plant.noise_covariance(u),
-        noise=factor_process_noise(plant, u, start),
+        noise=factor_process_noise(plant, u, initial_power),
     )
 
 

@@ -200,8 +200,8 @@ class ModalFilter(AbstractJointModalFilter):
         chain_noise = mode_transition_covariance(state.moments, transition)
         by_mode = chain_noise.matrix.reshape(*matrices.shape[:2], -1)
         moved_chain_noise = WeightedColumns((matrices @ by_mode).reshape(chain_noise.matrix.shape), chain_noise.weights)
-        start = second_moments_at_start(self.plant)
-        process_noise = noise_by_mode(plants, self.plant_modes, u, start, state.law @ transition)
+        initial_power = second_moments_at_start(self.plant)
+        process_noise = noise_by_mode(plants, self.plant_modes, u, initial_power, state.law @ transition)
         return predict_by_mode(state.gaussian.root, matrices, transition), join_columns(
             moved_chain_noise, process_noise
         )

@@ -42,12 +42,12 @@ def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Ar
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
 
 
-def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> WeightedColumns:
+def noise_in_mode(plant: LinearPlant, u: ArrayLike, initial_power: jax.Array) -> WeightedColumns:
     """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator.
 
-    `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
+    `initial_power`: E[x_i^2] at the start, the size of numbers that rounding acts on.
     """
-    process_noise = factor_process_noise(plant, jnp.asarray(u), start)
+    process_noise = factor_process_noise(plant, jnp.asarray(u), initial_power)
     of_indicator = rounding_of(np.ones(1))
     matrix = jax.scipy.linalg.block_diag(process_noise.matrix, of_indicator.matrix)
     return WeightedColumns(matrix, jnp.append(process_noise.weights, of_indicator.weights))
@@ -97,15 +97,15 @@ def centred_motion(
 
 
 def noise_by_mode(
-    plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, start: jax.Array, law: jax.Array
+    plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, initial_power: jax.Array, law: jax.Array
 ) -> WeightedColumns:
     """Return columns of the process noise and rounding of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x, 1).
 
     The block of mode j is P(j) Cov w_j, with P(j) = law[j] and the plant number modes[j].
 
-    `start`: E[x_i^2] at the start, for rounding.
+    `initial_power`: E[x_i^2] at the start, for rounding.
     """
-    noises = [noise_in_mode(plant, u, start) for plant in plants]
+    noises = [noise_in_mode(plant, u, initial_power) for plant in plants]
     matrix = jax.scipy.linalg.block_diag(*(noises[mode].matrix for mode in modes))
     weights = jnp.concatenate([p * noises[mode].weights for p, mode in zip(law, modes, strict=True)])
     return WeightedColumns(matrix, weights)

@@ -39,9 +39,9 @@ class AbstractMerging(Module):
         """Return the weights (K, M) of the components before any data, of the modes' law (M,)."""
         return jnp.diag(law)
 
-    def merge_by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+    def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
         """Return one Gaussian for each mode, of components and weights (K, M) as `keep_components` returns them."""
-        return parts
+        return gaussians
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return how components are mixed before a move: weights (K, G) of K components in G mixtures.
@@ -60,9 +60,9 @@ class AbstractMerging(Module):
         places = np.arange(modes)
         return places, places
 
-    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return the components after the update of all pairs, and their weights (K, M)."""
-        return parts, jnp.diag(weight)
+        return gaussians, jnp.diag(weight)
 
 
 class MergeAll(AbstractMerging):
@@ -102,15 +102,15 @@ class MergeByMode(AbstractMerging):
         """Return the pairs (component, mode) of the update: every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
-    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return one component for each present mode, merged over the modes before, and the weights (M, M).
 
-        `parts`, `weight`: a Gaussian and its weight for each pair (mode before, present mode). A component holds the
-        weight of its own mode alone: the weights returned are diagonal.
+        `gaussians`, `weight`: a Gaussian and its weight for each pair (mode before, present mode). A component holds
+        the weight of its own mode alone: the weights returned are diagonal.
         """
         _, present_mode = self.list_update_pairs(modes)
         weight_by_mode = weight[:, None] * (present_mode[:, None] == np.arange(modes))  # (pair, present mode)
-        merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight_by_mode))
+        merged = jax.vmap(partial(merge_mixture, gaussians), in_axes=1)(normalise_columns(weight_by_mode))
         return merged, jnp.diag(jnp.sum(weight_by_mode, axis=0))
 
 
@@ -122,9 +122,9 @@ class MergePairs(AbstractMerging):
         """Always True."""
         return True
 
-    def merge_by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+    def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
         """Return one Gaussian for each present mode, merged from its pairs."""
-        return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight))
+        return jax.vmap(partial(merge_mixture, gaussians), in_axes=1)(normalise_columns(weight))
 
     def initial_weights(self, law: jax.Array) -> jax.Array:
         """Return the weights (M^2, M) of pairs before any data: the law (M,) on pairs of equal modes."""
@@ -144,9 +144,9 @@ class MergePairs(AbstractMerging):
         """Return the pairs (component, mode) of the update: each component, a pair of modes, with its present mode."""
         return np.arange(modes**2), np.tile(np.arange(modes), modes)
 
-    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return all components, pairs of modes, as they are until the next move, and their weights (M^2, M)."""
-        return parts, self._by_mode(weight, modes)
+        return gaussians, self._by_mode(weight, modes)
 
     def _by_mode(self, weight: jax.Array, modes: int) -> jax.Array:
         """Return the weights (M^2,) of pairs as (M^2, M), each in the column of its present mode."""
@@ -166,7 +166,7 @@ def mix_and_predict(
     parts: Gaussian,
     weight: jax.Array,
     u: jax.Array,
-    start: jax.Array,
+    initial_power: jax.Array,
 ) -> Gaussian:
     """Return for each mixture the Gaussian (mixtures, n) of the mean and covariance of f(x, u) + w, x from the mixture.
 
@@ -176,16 +176,16 @@ def mix_and_predict(
         parts: Gaussians that are mixed, one a component.
         weight: [c, g], weight of component c in mixture g; columns need not sum to 1.
         u: input.
-        start: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
     share = normalise_columns(weight)
     # Through a nonlinear plant each mixture goes as one Gaussian.
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
-        return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
+        return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, initial_power))(mixtures)
     # A linear plant moves the parts before they are mixed, each once rather than once for each mixture: their means
     # A m + shift(u), the shift with the mean of w in it, and their covariances A P A'.
-    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, start).covariance
+    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
 
@@ -206,7 +206,7 @@ def mix_and_predict_by_mode(
     weight: jax.Array,
     moves: tuple[np.ndarray, np.ndarray],
     u: jax.Array,
-    start: jax.Array,
+    initial_power: jax.Array,
 ) -> Gaussian:
     """Return the Gaussians after a step: mixtures of `parts` by weights (components, mixtures), moved by modes' plants.
 
@@ -219,11 +219,11 @@ def mix_and_predict_by_mode(
         moves: two arrays, of each Gaussian after the step the number of the mixture that it was before, and the mode
             that moves it.
         u: input.
-        start: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
     mixture_of, mode_of = moves
     if len(plants) == 1:  # each mixture is moved once, however many modes it has afterwards
-        moved = mix_and_predict(plants[0], transform, parts, weight, u, start)
+        moved = mix_and_predict(plants[0], transform, parts, weight, u, initial_power)
         in_order = np.array_equal(mixture_of, np.arange(weight.shape[1]))
         return moved if in_order else jax.tree.map(lambda leaf: leaf[mixture_of], moved)
     # Plant after plant, the components that it moves; then all of them in order again.
@@ -232,7 +232,7 @@ def mix_and_predict_by_mode(
     for number, plant in enumerate(plants):
         sources = mixture_of[plant_of_component == number]
         before = jax.tree.map(lambda leaf, sources=sources: leaf[sources], mixtures)
-        results.append(_predict_each(plant, transform, before, u, start))
+        results.append(_predict_each(plant, transform, before, u, initial_power))
     moved_order = np.concatenate([np.flatnonzero(plant_of_component == number) for number in range(len(plants))])
     place_among_results = np.argsort(moved_order)  # of each component: the inverse permutation
     joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place_among_results], *results)
@@ -246,30 +246,30 @@ class MixtureMoments(NamedTuple):
     covariance: jax.Array
 
 
-def mix_moments(parts: Gaussian, share: jax.Array) -> MixtureMoments:
+def mix_moments(gaussians: Gaussian, share: jax.Array) -> MixtureMoments:
     """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
-    covariances = jax.vmap(lambda x: x.covariance)(parts)
+    covariances = jax.vmap(lambda x: x.covariance)(gaussians)
 
     def mix(shares: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean and covariance of the mixture with these shares of the components."""
-        return moments_of_mixture(parts.mean, covariances, shares)
+        return moments_of_mixture(gaussians.mean, covariances, shares)
 
     mean, covariance = jax.vmap(mix, in_axes=1)(share)
     return MixtureMoments(mean, covariance)
 
 
 def _predict_each(
-    plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
     """Return the Gaussian of f(x, u) + w for each of some moments (..., n) of x.
 
-    `start`: E[x_i^2] at the start, for rounding. Moments of a linear plant are moved as they are, without factors
-    before.
+    Moments of a linear plant are moved as they are, without factors before. `initial_power`: E[x_i^2] at the start,
+    for rounding.
     """
     if not isinstance(plant, LinearPlant):
         before = jax.vmap(from_covariance_by_elimination)(*x)
-        return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, start))(before)
-    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, start).covariance
+        return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, initial_power))(before)
+    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
 
     def move(mean: jax.Array, covariance: jax.Array) -> Gaussian:
         """Move one pair of moments."""

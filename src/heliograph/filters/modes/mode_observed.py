@@ -139,19 +139,21 @@ class ModeObservedFilter(AbstractSizedFilter):
         """
         last_step = jnp.maximum(jnp.asarray(k) - 1, 0)
         channel = _find_moments_given_states(at(self.channel, last_step), memory_states)
-        start = second_moments_at_start(self.plant)
-        corrected, _ = correct_linear(state.before, at(self.sensor, last_step), channel, Polytope(), state.z, start)
+        initial_power = second_moments_at_start(self.plant)
+        corrected, _ = correct_linear(
+            state.before, at(self.sensor, last_step), channel, Polytope(), state.z, initial_power
+        )
         return predict_belief(corrected, state.move)
 
-    def _describe_channel_after(self, begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
+    def _describe_channel_after(self, has_begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
         """Return the channel's moments at step k given the memories' states one step before; at the first step none.
 
-        `begun`: whether a step was before. A memory is what a link remembers, such as its mode.
+        `has_begun`: whether a step was before. A memory is what a link remembers, such as its mode.
         """
         channel, last_step = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
         at_later_step = _find_moments_given_earlier_states(at(self.channel, last_step), channel, memory_states)
         at_first_step = _find_moments_given_earlier_states(None, channel, memory_states)
-        moments: SecondOrder = jax.tree.map(lambda a, b: jnp.where(begun, a, b), at_later_step, at_first_step)
+        moments: SecondOrder = jax.tree.map(lambda a, b: jnp.where(has_begun, a, b), at_later_step, at_first_step)
         return moments
 
     @estimates

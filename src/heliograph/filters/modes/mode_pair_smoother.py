@@ -64,7 +64,7 @@ def move_pairs(
     transform: AbstractTransform,
     parts: Gaussian,
     u: jax.Array,
-    start: jax.Array,
+    initial_power: jax.Array,
 ) -> MovedPairs:
     """Return the Gaussian of each mode i moved by the plant of each mode j, [i, j], and the smoother gain back.
 
@@ -74,17 +74,17 @@ def move_pairs(
         transform: of moments, for a nonlinear plant.
         parts: the Gaussian of each mode (M, n).
         u: input.
-        start: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
         """Move one Gaussian x by one plant: return the law of f(x, u) + w, and x given the next state.
 
         f(x, u) is known by its slopes in x and what these do not explain. `transform`: moments of a nonlinear f; u:
-        input; `start`: E[x_i^2] at the start, for rounding.
+        input; `initial_power`: E[x_i^2] at the start, for rounding.
         """
         image = find_transition_moments(plant, transform, x, u)
-        unexplained = sum_unexplained(image, factor_process_noise(plant, u, start))
+        unexplained = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
         mean = image.mean + plant.noise_mean()
         predicted = from_columns(mean, join_columns(image.explained, unexplained))
         return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, unexplained))

@@ -198,7 +198,7 @@ class MultipleModelFilter(AbstractSizedFilter):
             weight=mixing,
             moves=self.merging.list_moves(modes),
             u=u,
-            start=second_moments_at_start(self.plant),
+            initial_power=second_moments_at_start(self.plant),
         )
         parts = parts._replace(mean=align_angles(plants[0], parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(parts, weight, jnp.asarray(True))

@@ -122,8 +122,8 @@ class ParticleFilter(AbstractSizedFilter):
         transition = jnp.asarray(at(self.channel, k).transition)[state.mode]
         uniform = jax.random.uniform(key, state.weight.shape, state.weight.dtype)
         drawn_mode = jax.vmap(invert_distribution)(transition, uniform)
-        start = second_moments_at_start(self.plant)
-        gaussians = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
+        initial_power = second_moments_at_start(self.plant)
+        gaussians = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, initial_power))(state.gaussian)
         mode = jnp.where(state.moved, drawn_mode, state.mode)
         gaussians = gaussians._replace(mean=align_angles(plant, gaussians.mean, state.weight))
         return Particles(gaussian=gaussians, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
@@ -132,8 +132,10 @@ class ParticleFilter(AbstractSizedFilter):
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
-        start = second_moments_at_start(self.plant)
-        signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, start))(state.gaussian)
+        initial_power = second_moments_at_start(self.plant)
+        signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, initial_power))(
+            state.gaussian
+        )
         after, weight, mixed = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )

@@ -113,8 +113,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         def draw(number: jax.Array) -> jax.Array:
             """Draw x_0 of the particle of this number."""
-            state: jax.Array = plant.sample_initial(jax.random.fold_in(key, number))
-            return state
+            x_0: jax.Array = plant.sample_initial(jax.random.fold_in(key, number))
+            return x_0
 
         drawn: jax.Array = jax.vmap(draw)(numbers)
         return drawn

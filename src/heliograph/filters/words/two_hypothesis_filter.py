@@ -73,9 +73,9 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: Hypotheses, u: ArrayLike = (), k: Step = 0) -> Hypotheses:
         """Predict the Gaussians of both hypotheses: that the last words were right in their leading bits, or not."""
-        plant, start = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
+        plant, initial_power = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
         u = jnp.asarray(u)
-        predicted = jax.vmap(lambda x: predict_gaussian(plant, self.base.transform, x, u, start))(state.parts)
+        predicted = jax.vmap(lambda x: predict_gaussian(plant, self.base.transform, x, u, initial_power))(state.parts)
         return state._replace(parts=predicted)
 
     @corrects

@@ -118,10 +118,9 @@ def sum_words_near_prior(
 ) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
 
-    Arguments are those of `find_effect_of_bits`.
-
-    t = (y - mean) / deviation. WINDOW blocks of 2^BLOCK words; REACH: 8.5 deviations, beyond which there is no
-    probability.
+    L is the likelihood of the word that y is rounded to, t = (y - mean) / deviation. WINDOW blocks of 2^BLOCK words;
+    REACH: 8.5 deviations, beyond which there is no probability. `pairs`: likelihoods of each bit's 0 and 1, for each
+    combination of error rates, of the probability `weights`; `grid`: all words.
     """
     count = WINDOW * 2**BLOCK
     lowest = prior.mean - REACH * prior.deviation
@@ -227,9 +226,10 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
 def _sum_wide_words(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return the effect of a word on y by a sum over the words within the prior's reach: 8.5 deviations of its mean.
+    """Return the effect of a received word on y by a sum over the words within the prior's reach, 8.5 deviations.
 
-    Arguments are those of `find_effect_of_bits`.
+    `pairs`: likelihoods of each bit's 0 and 1, for each combination of error rates, of the probability `weights`;
+    `grid`: all words; `prior`: of y; `dither`: of the encoder.
     """
     return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
 
@@ -237,9 +237,10 @@ def _sum_wide_words(
 def _sum_fine_words(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return the effect of a word on y by a sum over cells of several words, and over what lies beyond the end words.
+    """Return the effect of a received word on y by a sum over cells of several words, and over all beyond the range.
 
-    The dither's variance widens the prior, and is removed after. Arguments are those of `find_effect_of_bits`.
+    The dither's variance widens the prior, and is removed after. `pairs`: likelihoods of each bit's 0 and 1, for each
+    combination of error rates, of the probability `weights`; `grid`: all words.
     """
     wider, variance_ratio = widen_by_dither(prior, grid, dither)
     sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]

@@ -136,8 +136,8 @@ class FedBackFilter(AbstractWrapper):
         """Correct with the measurement of y - r, r the reference that the sender subtracts from its signal y."""
         base = self.base
         plant, sensor = at(base.plant, k), at(base.sensor, k)
-        start = second_moments_at_start(base.plant, base)
-        y = find_signal_moments(plant, sensor, base.transform, state.gaussian, start)
+        initial_power = second_moments_at_start(base.plant, base)
+        y = find_signal_moments(plant, sensor, base.transform, state.gaussian, initial_power)
         # What is sent is y - r: of another mean and second moment, and the same covariance.
         mean = y.mean - state.reference
         sent = y._replace(mean=mean, second=y.covariance + jnp.outer(mean, mean))

@@ -91,13 +91,6 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     start = filter.init()
     modes = len(told.initial)
 
-    def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
-        """Return f(P, a): the covariance P of `prior` after a message with the numbers a; its values do not matter."""
-        z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
-        after, _ = filter.correct(prior, z, k)
-        covariance: jax.Array = after.gaussian.covariance
-        return covariance
-
     def bound_step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
         """Step over one row: the mean covariance in each mode, and as output that in the mean over the modes."""
         state, before, law = carry
@@ -113,7 +106,7 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
             """
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
-            covariances_after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
+            covariances_after = jax.vmap(lambda a: _correct_covariance(filter, prior, a, k))(numbers)
             return prior, jnp.tensordot(weights, covariances_after, 1)
 
         priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(told.numbers), jnp.asarray(told.weights))
@@ -128,6 +121,14 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(told.initial)
     covariances_over_time: jax.Array = jax.lax.scan(bound_step, carry, (jnp.arange(len(u)), jnp.asarray(u)))[1]
     return covariances_over_time
+
+
+def _correct_covariance(filter: ToldFilter, prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
+    """Return f(P, a): the covariance P of `prior` after a message with the numbers a; its values do not matter."""
+    z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
+    after, _ = filter.correct(prior, z, k)
+    covariance: jax.Array = after.gaussian.covariance
+    return covariance
 
 
 def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:

@@ -168,12 +168,12 @@ def _make_step_into_row(dt: int) -> StepInto:
     For continuous time, with one step for each row; `dt`: place of the time between rows among the inputs.
     """
 
-    def step_into_row(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+    def step_into_row(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
         """Return the smoother step into a row, of all filters, from their states after the row before.
 
         `dt`: place of the time between rows among the inputs.
         """
-        row, _ = place
+        row, _ = step_of_row
         state = sweep.states_after(history, row - 1)
         received, _, _ = history.read_row(row)
         u = history.inputs_into_row(row, dt)
@@ -189,12 +189,12 @@ def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
     return row - 1, history.step[row - 1]
 
 
-def _compute_step_into_k(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+def _compute_step_into_k(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
     """Return the smoother step into step k, what the backward pass needs of it, of all filters.
 
-    They step on from the row before, without measurements up to k. `place`: the row that k is or leads to, and k.
+    They step on from the row before, without measurements up to k. `step_of_row`: the row that k is or leads to, and k.
     """
-    row, k = place
+    row, k = step_of_row
 
     def step_on(j: jax.Array, state: PyTree) -> PyTree:
         """Step the filters' states by step j."""
