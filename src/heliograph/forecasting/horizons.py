@@ -1,6 +1,6 @@
 """How far ahead, and with which inputs: horizons in steps, time or dates as rows of inputs to predict with."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta
 from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 
@@ -112,10 +112,11 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
 
 def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
     """Return how many steps, each of `origin.months` whole months, a date lies ahead."""
-    apart = np.datetime64(date).astype("datetime64[M]") - _find_end_of_data(origin, date).astype("datetime64[M]")
-    steps, left = divmod(int(apart.astype(int)), origin.months)
-    if left or not steps:
-        raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(date)}, {apart} ahead")
+    end = _find_end_of_data(origin, date)
+    ahead = np.datetime64(date).astype("datetime64[M]") - end.astype("datetime64[M]")
+    steps, rest = divmod(int(ahead.astype(int)), origin.months)
+    if rest or not steps:
+        raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(date)}, {ahead} ahead")
     return float(steps)
 
 
@@ -148,11 +149,12 @@ def _require_step_count(value: object) -> int:
 
 def _list_horizons(horizons: object) -> list[object]:
     """Return horizons as a list; a single time or date as a list of one."""
-    single = isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64)
-    listed: list[object] = [horizons] if single else list(horizons) if rank("horizons", horizons) == 1 else []  # type: ignore[call-overload]
-    if not listed:
+    if isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64):
+        return [horizons]
+    values = list(cast(Iterable[object], horizons)) if rank("horizons", horizons) == 1 else []
+    if not values:
         raise fail("horizons", "a number of steps, or a list of how far ahead", show_value(horizons))
-    return listed
+    return values
 
 
 def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
