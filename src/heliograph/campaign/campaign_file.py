@@ -105,9 +105,8 @@ def _read_network(table: Mapping[str, object], name: str) -> str:
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
-        raise fail(
-            f"{name}, network", 'a file and a function in it, as "my_network.py:build"', _format_value_for_error(value)
-        )
+        expected = 'a file and a function in it, as "my_network.py:build"'
+        raise fail(f"{name}, network", expected, _format_value_for_error(value))
     return str(value)
 
 
@@ -148,10 +147,10 @@ def _read_inputs(table: object, horizon: int, name: str) -> dict[str, float | li
     if not isinstance(table, dict):
         raise fail(f"{name}, inputs", "a table of numbers by the input's name", repr(table))
     for key, value in table.items():
-        values = value if isinstance(value, list) else [value]
-        if not all(_is_number(v) for v in values) or (isinstance(value, list) and len(value) != horizon):
-            found = f"{len(value)} values" if isinstance(value, list) else repr(value)
-            raise fail(f"{name}, inputs.{key}", f"a number or one for each of {horizon} steps", found)
+        values = value if isinstance(value, list) else [value] * horizon
+        if len(values) != horizon or not all(_is_number(single) for single in values):
+            got = f"{len(value)} values" if isinstance(value, list) else repr(value)
+            raise fail(f"{name}, inputs.{key}", f"a number or one for each of {horizon} steps", got)
     return dict(table)
 
 

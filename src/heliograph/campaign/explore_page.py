@@ -63,9 +63,11 @@ def list_state_scores(
     results: list[StateScore] = []
     for setting in settings:
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
-        parts = [_sum_errors(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
-        if parts:  # of all chunks together, field by field
-            sums = ErrorSums(*(np.sum(totals, axis=0) for totals in zip(*parts, strict=True)))
+        sums_of_chunks = [
+            _sum_errors(group, setting, slice(chunk.start, chunk.stop), claims[setting], steps) for chunk in chunks
+        ]
+        if sums_of_chunks:  # of all chunks together, field by field
+            sums = ErrorSums(*(np.sum(of_field, axis=0) for of_field in zip(*sums_of_chunks, strict=True)))
             results += _compute_state_scores(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
@@ -99,13 +101,14 @@ def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray
     squared = error**2
     # Which runs count, (run, node, filter): those that are finite at all steps and in all states.
     has_variance = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
-    counted = np.isfinite(squared).all(axis=(1, -1)) & has_variance
+    counts = np.isfinite(squared).all(axis=(1, -1)) & has_variance
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.stack([squared, variance, squared / variance])
-    # (value, run, step, node, filter, state): the mean over steps, then the given ones.
-    kept = np.concatenate([values.mean(axis=2, keepdims=True), values[:, :, [step - 1 for step in steps]]], axis=2)
-    kept = np.where(counted[None, :, None, :, :, None], kept, 0.0)
-    return ErrorSums(runs=counted.sum(axis=0), values=kept.sum(axis=1), squares=(kept**2).sum(axis=1))
+        numbers = np.stack([squared, variance, squared / variance])
+    # (number, run, step, node, filter, state): the mean over steps, then the given ones.
+    mean_over_steps, at_steps = numbers.mean(axis=2, keepdims=True), numbers[:, :, [step - 1 for step in steps]]
+    selected = np.concatenate([mean_over_steps, at_steps], axis=2)
+    selected = np.where(counts[None, :, None, :, :, None], selected, 0.0)
+    return ErrorSums(runs=counts.sum(axis=0), values=selected.sum(axis=1), squares=(selected**2).sum(axis=1))
 
 
 def _compute_state_scores(
@@ -341,9 +344,9 @@ def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequen
 
 def _choose_axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
     """Return the column for the axis: the first numeric parameter with several values, any with several, "setting"."""
-    several = [name for name in parameters if len(set(columns[name])) > 1]
-    numbers = [name for name in several if {type(value) for value in columns[name]} <= {int, float}]
-    return next(iter([*numbers, *several]), "setting")
+    varying = [name for name in parameters if len(set(columns[name])) > 1]
+    numeric = [name for name in varying if {type(value) for value in columns[name]} <= {int, float}]
+    return [*numeric, *varying, "setting"][0]
 
 
 def _round_value(value: object) -> Value:

@@ -66,8 +66,8 @@ def write_failures(out: Path, failures: list[FailedJob], tried: list[Job]) -> No
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
     jobs = {*tried, *(Job(job.setting) for job in tried)}
-    left = [failure for failure in read_failures(out) if Job(failure.setting, failure.chunk) not in jobs]
-    entries = [asdict(failure) for failure in (*left, *failures)]
+    earlier = [failure for failure in read_failures(out) if Job(failure.setting, failure.chunk) not in jobs]
+    entries = [asdict(failure) for failure in (*earlier, *failures)]
     if not entries:
         path.unlink(missing_ok=True)
         partial.unlink(missing_ok=True)  # of a process that was killed

@@ -43,7 +43,9 @@ def start_engine(
     """
     if scheduler is not None:
         return run_on_cluster(campaign, store, scheduler, timeout)
-    return run_in_processes(campaign, store, workers, timeout) if workers else run_in_this_process(campaign, store)
+    if workers == 0:
+        return run_in_this_process(campaign, store)
+    return run_in_processes(campaign, store, workers, timeout)
 
 
 @contextmanager
@@ -55,12 +57,12 @@ def run_in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
 @contextmanager
 def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
     """Do one job at a time in each worker process; a process that dies, or that takes too long, is replaced."""
-    crew = [_WorkerProcess(campaign, store, timeout) for _ in range(workers)]
+    processes = [_WorkerProcess(campaign, store, timeout) for _ in range(workers)]
     try:
-        yield lambda jobs: _distribute_jobs_to_workers(crew, deque(jobs))
+        yield lambda jobs: _distribute_jobs_to_workers(processes, deque(jobs))
     finally:
-        for worker in crew:
-            worker.stop()
+        for process in processes:
+            process.stop()
 
 
 def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:

@@ -2,7 +2,7 @@
 
 import traceback
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from operator import itemgetter
 from pathlib import Path
 
@@ -109,7 +109,7 @@ def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | No
         raise fail("inputs", f"values of {list(network.inputs)}", list(campaign.inputs))
     if not network.inputs:
         return None
-    columns = [np.broadcast_to(np.asarray(campaign.inputs[n], float), campaign.horizon) for n in network.inputs]
+    columns = [np.broadcast_to(np.asarray(campaign.inputs[name], float), campaign.horizon) for name in network.inputs]
     return np.stack(columns, axis=1)
 
 
@@ -194,17 +194,16 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
 
         `step`: true state, measurements, and estimates of nodes and of fusions (centres), each alike a tree.
         """
-        recorded = {
-            kind: jax.tree.map(
-                lambda estimate: _measure_errors(step["truth"], estimate),
-                step[kind],
-                is_leaf=lambda leaf: isinstance(leaf, Estimate),
-            )
-            for kind in ("estimates", "fused")
-        }
+
+        def is_estimate(leaf: object) -> bool:
+            """Return whether the tree goes no deeper here: an estimate is measured as a whole."""
+            return isinstance(leaf, Estimate)
+
+        measure = partial(_measure_errors, step["truth"])
+        collected = {kind: jax.tree.map(measure, step[kind], is_leaf=is_estimate) for kind in ("estimates", "fused")}
         if self.world:
-            recorded |= {name: step[name] for name in ("truth", "measurements")}
-        return OfStep(collected=recorded)
+            collected |= {name: step[name] for name in ("truth", "measurements")}
+        return OfStep(collected=collected)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """Return the collected errors by node and filter, and with `self.world` truth and measurements.

@@ -169,15 +169,16 @@ def _describe_settings_and_compute_chunks(
 
 def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
     """Return the chunks to compute, all or those of `only`, which must be the campaign's."""
-    every = [Job(chunk.setting, chunk.number) for chunk in campaign.all_chunks()]
+    all_jobs = [Job(chunk.setting, chunk.number) for chunk in campaign.all_chunks()]
     if only is None:
-        return every
-    chosen, known = [Job(*pair) for pair in only], set(every)
-    unknown = [job for job in chosen if job not in known]
+        return all_jobs
+    jobs, known = [Job(setting, chunk) for setting, chunk in only], set(all_jobs)
+    unknown = [job for job in jobs if job not in known]
     if unknown:
-        expected = f"a setting from 0 to {every[-1].setting} and a chunk from 0 to {every[-1].chunk}"
+        last = all_jobs[-1]
+        expected = f"a setting from 0 to {last.setting} and a chunk from 0 to {last.chunk}"
         raise fail("setting and chunk", expected, f"{unknown[0].setting} and {unknown[0].chunk}")
-    return chosen
+    return jobs
 
 
 def _count_workers(workers: int | None, jobs: int) -> int:
@@ -210,10 +211,10 @@ def _prepare_store(
     jobs = [Job(setting) for setting in without_claims]
     described: dict[int, NetworkDescription] = {}
 
-    def accept(job: Job, value: NetworkDescription | None, done: int) -> None:
+    def accept(job: Job, description: NetworkDescription | None, done: int) -> None:
         """Keep the description of a job's setting in `described`, and show progress: `done` of all `jobs` are built."""
-        assert value is not None  # these jobs only describe
-        described[job.setting] = value
+        assert description is not None  # these jobs only describe
+        described[job.setting] = description
         progress("building", done, len(jobs))
 
     failed = _try_jobs(engine, jobs, accept)

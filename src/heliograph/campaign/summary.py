@@ -82,7 +82,8 @@ def read_summary(path: str | Path) -> list[Score]:
         raise fail(f"summary {path}", "a file", "none of that name")
     with path.open(newline="", encoding="utf-8") as file:
         table = csv.DictReader(file)
-        if missing := [name for name in kinds if name not in (table.fieldnames or ())]:
+        missing = [name for name in kinds if name not in (table.fieldnames or ())]
+        if missing:
             raise fail(f"summary {path}", f"columns {', '.join(kinds)}", f"none {', '.join(missing)}")
         rows = [{name: unquote_cell(cell) for name, cell in row.items()} for row in table]
     return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in rows]
@@ -119,7 +120,8 @@ def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.
     names = ("error", "variance", "nees_per_dimension")
     error, variance, nees = (_read_runs(group, name, setting, runs) for name in names)
     squared = np.sum(error**2, axis=-1).mean(axis=1)
-    squared[~np.isfinite(variance).all(axis=(1, -1)) & (claims != "none")] = np.nan
+    has_variance = np.isfinite(variance).all(axis=(1, -1))
+    squared[~has_variance & (claims != "none")] = np.nan
     return np.stack([squared, nees.mean(axis=1)])
 
 
@@ -155,9 +157,11 @@ def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndar
 
 def _compute_mean_and_error(values: np.ndarray) -> tuple[float, float]:
     """Return the mean of independent values and its standard error; NaN where there are none, or no two of them."""
-    if not len(values):
+    count = len(values)
+    if count == 0:
         return np.nan, np.nan
-    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
+    error = float(values.std(ddof=1) / np.sqrt(count)) if count > 1 else np.nan
+    return float(values.mean()), error
 
 
 def make_score_headers(campaign: Campaign) -> list[str]:

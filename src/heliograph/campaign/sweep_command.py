@@ -91,10 +91,12 @@ def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -
         return None
     if not 0 <= setting < len(campaign.settings):
         raise fail("--setting", f"a number from 0 to {len(campaign.settings) - 1}", setting)
-    chunks = [planned.number for planned in campaign.chunks(setting)]
-    if chunk is not None and chunk not in chunks:
-        raise fail("--chunk", f"a number from 0 to {chunks[-1]}", chunk)
-    return [(setting, number) for number in (chunks if chunk is None else [chunk])]
+    numbers = [planned_chunk.number for planned_chunk in campaign.chunks(setting)]
+    if chunk is None:
+        return [(setting, number) for number in numbers]
+    if chunk not in numbers:
+        raise fail("--chunk", f"a number from 0 to {numbers[-1]}", chunk)
+    return [(setting, chunk)]
 
 
 def _count_chunks(run: CampaignRun) -> str:

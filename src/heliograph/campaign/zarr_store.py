@@ -70,20 +70,20 @@ def restore_labels(table: LabelsAsJson) -> AxisLabels:
     return AxisLabels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
 
 
-def unite_labels(parts: Mapping[int, AxisLabels]) -> AxisLabels:
+def unite_labels(by_setting: Mapping[int, AxisLabels]) -> AxisLabels:
     """Return the union of the labels (names of nodes and filters) of all settings, in order of first appearance.
 
-    `parts`: labels by setting. States have to be the same in all; `received`: components of the longest measurement.
+    States have to be the same in all; `received`: components of the longest measurement.
     """
-    first, labels = next(iter(parts.items()))
-    for setting, other in parts.items():
-        if other.states != labels.states:
-            raise fail(f"setting {setting}", f"the states of setting {first}, {labels.states}", other.states)
+    first_setting, first = next(iter(by_setting.items()))
+    for setting, labels in by_setting.items():
+        if labels.states != first.states:
+            raise fail(f"setting {setting}", f"the states of setting {first_setting}, {first.states}", labels.states)
     return AxisLabels(
-        states=labels.states,
-        nodes=_unite_names([part.nodes for part in parts.values()]),
-        filters=_unite_names([part.filters for part in parts.values()]),
-        received=max(part.received for part in parts.values()),
+        states=first.states,
+        nodes=_unite_names([labels.nodes for labels in by_setting.values()]),
+        filters=_unite_names([labels.filters for labels in by_setting.values()]),
+        received=max(labels.received for labels in by_setting.values()),
     )
 
 
@@ -173,10 +173,10 @@ def list_parameter_values(campaign: Campaign, name: str) -> np.ndarray:
     values = [setting.get(name) for setting in campaign.settings]
     if all(isinstance(value, bool) for value in values):
         return np.array(values)
-    if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values):
-        whole = all(isinstance(value, int) for value in values)
-        return np.array(values, dtype=np.int64 if whole else np.float64)
-    return np.array([_write_as_text(value) for value in values])
+    if any(isinstance(value, bool) or not isinstance(value, int | float | None) for value in values):
+        return np.array([_write_as_text(value) for value in values])
+    are_whole = all(isinstance(value, int) for value in values)
+    return np.array(values, dtype=np.int64 if are_whole else np.float64)
 
 
 def _write_as_text(value: object) -> str:
@@ -275,8 +275,11 @@ def find_described_settings(path: Path) -> set[tuple[int, ...]]:
 
 def remove_damaged_chunks(path: Path, campaign: Campaign) -> list[Path]:
     """Remove the files of chunks that do not agree with their checksums; return these files."""
-    files = [file for name in list_stored_variables(campaign) for file in _find_chunk_files(path / name, 2).values()]
-    damaged = [file for file in (*files, *_find_chunk_files(path / CLAIM, 1).values()) if not _has_right_checksum(file)]
+    files: list[Path] = []
+    for name in list_stored_variables(campaign):
+        files += _find_chunk_files(path / name, indices=2).values()
+    files += _find_chunk_files(path / CLAIM, indices=1).values()
+    damaged = [file for file in files if not _has_right_checksum(file)]
     for file in damaged:
         file.unlink()
     return damaged
@@ -361,6 +364,8 @@ def _list_differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:
     if campaign.source != stored.source:
         yield f"another source of {campaign.network.rpartition(':')[0]}"
     if campaign.settings != stored.settings:
-        pairs = zip(campaign.settings, stored.settings, strict=False)
-        changed = [f"setting {i} {new} (was {old})" for i, (new, old) in enumerate(pairs) if new != old]
-        yield changed[0] if changed else f"{len(campaign.settings)} settings (was {len(stored.settings)})"
+        for i, (new_setting, old_setting) in enumerate(zip(campaign.settings, stored.settings, strict=False)):
+            if new_setting != old_setting:
+                yield f"setting {i} {new_setting} (was {old_setting})"
+                return
+        yield f"{len(campaign.settings)} settings (was {len(stored.settings)})"

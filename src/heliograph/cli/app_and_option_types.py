@@ -68,23 +68,26 @@ def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
 
 def _convert_to_int(_: type, tokens: Sequence[Token]) -> int:
     """Return the integer that an option's digits say; fractions, and underscores between digits, are refused."""
-    if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
-        raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
-    return int(tokens[0].value)
+    text = tokens[0].value
+    if not re.fullmatch(r"[+-]?[0-9]+", text, re.ASCII):
+        raise ValueError(f"expected a whole number, got {text!r}")
+    return int(text)
 
 
 def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
     """Return the path that an option's text is; an empty one, or one with a NUL, is refused."""
-    if not tokens[0].value or "\0" in tokens[0].value:
-        raise ValueError(f"expected a path, got {tokens[0].value!r}")
-    return Path(tokens[0].value)
+    text = tokens[0].value
+    if not text or "\0" in text:
+        raise ValueError(f"expected a path, got {text!r}")
+    return Path(text)
 
 
 def _convert_to_path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
     """Return the address of a store of which an option's text is the URL, of any other text the path."""
     from heliograph.files.stores.store_address import is_store, parse_store
 
-    return parse_store(tokens[0].value) if is_store(tokens[0].value) else _convert_to_path(kind, tokens)
+    text = tokens[0].value
+    return parse_store(text) if is_store(text) else _convert_to_path(kind, tokens)
 
 
 def completion(

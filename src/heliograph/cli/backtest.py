@@ -96,10 +96,10 @@ def _parse_rows_ahead(horizons: str) -> list[int]:
     from heliograph.numerics.check import check_count, fail
     from heliograph.numerics.times.dates import horizons_in
 
-    asked = horizons_in(horizons)  # one number, or a list
-    listed = [asked] if isinstance(asked, int) else asked
-    rows_ahead = [horizon for horizon in listed if isinstance(horizon, int)]
-    if len(rows_ahead) < len(listed):
+    one_or_list = horizons_in(horizons)
+    values = [one_or_list] if isinstance(one_or_list, int) else one_or_list
+    rows_ahead = [value for value in values if isinstance(value, int)]
+    if len(rows_ahead) < len(values):
         raise fail("--horizons", "numbers of rows, as 1,3,12", horizons)
     for horizon in rows_ahead:
         check_count("--horizons", horizon)
@@ -128,6 +128,7 @@ def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "
         `advance` shows the progress, in rows of the recording.
         """
         advance("fitting to the rows before", rows, len(recording.time))
-        return heliograph.fit(build, {name: values[:rows] for name, values in z.items()}, u[:rows]).network
+        measurements = {name: values[:rows] for name, values in z.items()}
+        return heliograph.fit(build, measurements, u[:rows]).network
 
     return fit_to_first

@@ -71,12 +71,16 @@ def describe_costs(written: "Exported", measured: "StepCost") -> list[str]:
     """
     from heliograph.export.c_files import COMPILER
 
-    counts = {kind: sum(written.operations.get(op, 0) for op in ops) for kind, ops in KINDS.items()}
-    counts["others"] = sum(written.operations.values()) - sum(counts.values())
-    parts = ", ".join(f"{count:,} {kind}" for kind, count in counts.items() if count)
+    total = sum(written.operations.values())
+    counts = {
+        kind: sum(written.operations.get(operation, 0) for operation in operations)
+        for kind, operations in KINDS.items()
+    }
+    counts["others"] = total - sum(counts.values())
+    by_kind = ", ".join(f"{count:,} {kind}" for kind, count in counts.items() if count)
     state = f"state {written.state_bytes:,} bytes"
     code = "code unmeasured" if measured.code_bytes is None else f"code {measured.code_bytes:,} bytes"
     time = f"time unmeasured: no C compiler {COMPILER!r} here"
     if measured.nanoseconds is not None:
         time = f"a step {measured.nanoseconds:,.0f} ns ({COMPILER} -O2 on this machine)"
-    return [f"{sum(written.operations.values()):,} operations: {parts}", f"{state}, {code}, {time}"]
+    return [f"{total:,} operations: {by_kind}", f"{state}, {code}, {time}"]

@@ -101,9 +101,9 @@ def write_plant_estimates(
 
 def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
     """Return where a plant's estimates go: of several plants each has a file with its name; a store holds them all."""
-    if isinstance(out, StoreAddress):
+    if isinstance(out, StoreAddress) or not several:
         return out
-    return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
+    return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}")
 
 
 def filter_rows(

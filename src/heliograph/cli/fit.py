@@ -166,9 +166,12 @@ def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dic
     """
     from heliograph.learning.packet_losses.learn_losses import learn_losses
 
-    fates = _find_message_fates(network, recording)
-    lossy = {name for name, sequences in fates.items() if any(0 < sequence.mean() < 1 for sequence in sequences)}
-    return {name: learn_losses(fates[name]) for name in fates if name in lossy}
+    losses = {}
+    for name, fates in _find_message_fates(network, recording).items():
+        some_were_lost = any(0 < fates_in_sequence.mean() < 1 for fates_in_sequence in fates)
+        if some_were_lost:
+            losses[name] = learn_losses(fates)
+    return losses
 
 
 def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
@@ -247,9 +250,10 @@ def _fit_with_progress(
         """
         stop.raise_if_requested()
         stop.note_next_signal_only()  # from here on there is a best so far, which the next signal keeps
-        form, _, rest = line.partition(":")
-        step = re.match(r" step ([0-9]+)", rest)
-        advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)
+        form, _, state_of_search = line.partition(":")
+        match = re.match(r" step ([0-9]+)", state_of_search)
+        step = int(match[1]) if match else STEPS
+        advance(f"learning from {rows} rows ({form})", step, STEPS)
 
     fitted = learn_from(build, first_rows, starts=starts, seed=seed, progress=show_progress, truth=truth)
     assert isinstance(fitted, Fit)  # since no sender decides

@@ -137,7 +137,7 @@ def take_only_plant(path: object, measured: list[MeasuredPlant]) -> MeasuredPlan
     from heliograph.numerics.check import fail
 
     if len(measured) > 1:
-        names = ", ".join(repr(each.plant) for each in measured[:8])
+        names = ", ".join(repr(data.plant) for data in measured[:8])
         raise fail(f"{path}", f"one plant here, which --plant names (--plant {measured[0].plant})", names)
     return measured[0]
 
@@ -218,8 +218,6 @@ def describe_unreadable_messages(path: object, events: "EventTable") -> list[str
 
 def describe_refusals(path: object, what: str, count: int, reasons: Sequence[str], known: str = "") -> str:
     """Return a line: how many rows or messages were refused, how many for `known` reasons, and why, of the first."""
-    more = count - len(reasons)
-    others = f"; and {more} more" if more > 0 else ""
-    return (
-        f"{path}: {what} that could not be read: {count}{f' ({known})' if known else ''}; {'; '.join(reasons)}{others}"
-    )
+    in_brackets = f" ({known})" if known else ""
+    others = f"; and {count - len(reasons)} more" if count > len(reasons) else ""
+    return f"{path}: {what} that could not be read: {count}{in_brackets}; {'; '.join(reasons)}{others}"

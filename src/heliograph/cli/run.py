@@ -179,10 +179,10 @@ def _describe_estimation_errors(record: "Record") -> list[str]:
 
     lines = []
     for errors in compute_filter_errors(record):
-        known = {state: value for state, value in errors.rmse.items() if not isnan(value)}
-        parts = [f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in known.items()]
+        known = {state: rmse for state, rmse in errors.rmse.items() if not isnan(rmse)}
+        rmses = [f"of {state} {round_to(rmse, errors.rmse_error[state])}" for state, rmse in known.items()]
         nees = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
-        lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(parts)}{nees}")
+        lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(rmses)}{nees}")
     return lines
 
 
@@ -264,8 +264,10 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
         """Return the content of the results folder: of one plant its page, of several an overview and folders."""
         from heliograph.report.pages.run import make_results_of_plants, make_run_results
 
-        (first, *more) = health.values()
-        return make_results_of_plants(health, name) if more else make_run_results(first, name)
+        if len(health) > 1:
+            return make_results_of_plants(health, name)
+        (of_only_plant,) = health.values()
+        return make_run_results(of_only_plant, name)
 
     count = len(plants) * sum(map(len, network.claims().values()))
     write_results(report, count, examine_plants, results_of)

@@ -103,14 +103,16 @@ def _check_blocks_suffice(network: "Network", out: Path | StoreAddress | None, o
     from heliograph.disk.atomic_files import FORMATS
     from heliograph.fusion.network_fusion import Fusion
 
-    if given := list(others):
-        raise AllRowsNeededError(f"{' and '.join(given)} {'need' if len(given) > 1 else 'needs'} them")
+    options = list(others)
+    if options:
+        raise AllRowsNeededError(f"{' and '.join(options)} {'need' if len(options) > 1 else 'needs'} them")
     if not isinstance(out, Path) or out.suffix.lower() not in FORMATS:
         raise AllRowsNeededError(f"blocks go to {' or '.join(FORMATS)} alone, not to {out}")
     # Fusions whose messages take rows on their way, perhaps into the next block.
     of_centres = [name for name, fused in network.fused.items() if isinstance(fused, Fusion) and fused.by_report]
-    if late := [*network.meshes, *of_centres]:
-        raise AllRowsNeededError(f"messages of the fusion {late[0]} may come rows later")
+    with_delays = [*network.meshes, *of_centres]
+    if with_delays:
+        raise AllRowsNeededError(f"messages of the fusion {with_delays[0]} may come rows later")
 
 
 def filter_in_blocks(
@@ -225,14 +227,14 @@ class MergedBlockWarnings:
         Lines that differ in numbers alone (NUMBER) are kept once; `self._more` counts the later blocks that have one.
         """
         self._blocks += 1
-        here = set[str]()
+        kinds_in_block = set[str]()
         for line in lines:
             kind = NUMBER.sub("0", line)
             if kind not in self._first:
                 self._first[kind] = f"of the rows {first} to {last}, counted from 1: ", line
-            elif kind not in here:
+            elif kind not in kinds_in_block:
                 self._more[kind] += 1
-            here.add(kind)
+            kinds_in_block.add(kind)
 
     def list_lines(self) -> list[str]:
         """Return the lines, which name the rows of their block if there are several blocks.
@@ -241,7 +243,8 @@ class MergedBlockWarnings:
         """
         if self._blocks == 1:
             return [line for _, line in self._first.values()]
-        return [
-            f"{rows}{line}{f' (likewise in {self._more[kind]} later blocks)' if self._more[kind] else ''}"
-            for kind, (rows, line) in self._first.items()
-        ]
+        lines = []
+        for kind, (rows, line) in self._first.items():
+            count = self._more[kind]
+            lines.append(f"{rows}{line} (likewise in {count} later blocks)" if count else f"{rows}{line}")
+        return lines

@@ -142,7 +142,7 @@ def describe_worth(worth: "SensorWorth", steps: int, runs: int) -> Iterator[str]
     width = max(len(case.name) for case in cases)
     yield "  ".join([" " * width, *(f"{name:>20}" for name in worth.states)])
     for case in cases:
-        cells = [f"{e:.4g} ({times:.3g})" for e, times in zip(case.error, case.increase, strict=True)]
+        cells = [f"{error:.4g} ({times:.3g})" for error, times in zip(case.error, case.increase, strict=True)]
         yield "  ".join([f"{case.name:<{width}}", *(f"{cell:>20}" for cell in cells)])
     best = worth.best_addition
     if best is not None:
@@ -158,5 +158,6 @@ def write_worth_figure(worth: "SensorWorth", options: WorthOptions) -> None:
     from heliograph.report.pages.sensor_worth import draw_worth
 
     figure = draw_worth(worth, f"error after {options.steps} steps, {worth.describe_method(options.runs)}")
-    with whole_file(options.figure) as partial:
-        partial.write_bytes((png if options.figure.suffix.lower() == ".png" else svg)(figure))
+    with whole_file(options.figure) as partial_file:
+        is_png = options.figure.suffix.lower() == ".png"
+        partial_file.write_bytes(png(figure) if is_png else svg(figure))

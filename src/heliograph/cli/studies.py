@@ -196,14 +196,14 @@ def list_studies(kind: str) -> dict[str, EntryPoint]:
 
     Packages offer them as entry points of GROUP; the function's name (`attr`) says of which kind one is.
     """
-    offered: dict[str, EntryPoint] = {}
+    by_name: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
-        other = offered.setdefault(entry.name, entry).value
-        if entry.value != other:
+        first = by_name.setdefault(entry.name, entry)
+        if entry.value != first.value:
             from heliograph.numerics.check import fail
 
-            raise fail(f"study {entry.name}", "one package that offers it", f"{other}, {entry.value}")
-    return {name: entry for name, entry in offered.items() if entry.attr == kind}
+            raise fail(f"study {entry.name}", "one package that offers it", f"{first.value}, {entry.value}")
+    return {name: entry for name, entry in by_name.items() if entry.attr == kind}
 
 
 def load_study(entry: EntryPoint) -> Study:

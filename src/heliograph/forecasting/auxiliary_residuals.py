@@ -93,19 +93,23 @@ class Disturbances:
         size = np.nan_to_num(np.abs(residuals))
         # Both sides of each residual that is a number: the probabilities are shared by all these tests
         # (Bonferroni).
-        p = np.minimum(2 * np.isfinite(residuals).sum() * ndtr(-size), 1.0)
-        rows = _find_peaks(size.max(axis=1), p.min(axis=1) < level)
+        tests = 2 * np.isfinite(residuals).sum()
+        p = np.minimum(tests * ndtr(-size), 1.0)
+        rows = _find_peaks(size.max(axis=1), is_candidate=p.min(axis=1) < level)
         return [self._make_shock(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
 
-    def _make_shock(self, row: int, residuals: np.ndarray, p: np.ndarray, place: int) -> Shock:
-        """Return the shock of a row: the residual number `place` of its residuals, with its probability."""
-        kind: Literal["break", "outlier"] = "outlier" if place < len(self.outputs) else "break"
+    def _make_shock(self, row: int, residuals: np.ndarray, p: np.ndarray, index: int) -> Shock:
+        """Return the shock of a row, by one of its residuals (first those of outputs, then of states) and its p-value.
+
+        `residuals` and `p`: all of the row, of which that with this index is the shock's.
+        """
+        kind: Literal["break", "outlier"] = "outlier" if index < len(self.outputs) else "break"
         return Shock(
             row=row,
             kind=kind,
-            name=(*self.outputs, *self.states)[place],
-            residual=float(residuals[place]),
-            p=float(p[place]),
+            name=(*self.outputs, *self.states)[index],
+            residual=float(residuals[index]),
+            p=float(p[index]),
         )
 
 
@@ -179,14 +183,11 @@ def _is_received_unchanged(predicted: Forecast) -> bool:
 
     EQUAL: the largest relative difference, that of rounding.
     """
-    sent, came = predicted.outputs, predicted.received
-    return (
-        sent is not None
-        and came is not None
-        and sent.mean.shape == came.mean.shape
-        and np.allclose(sent.covariance, came.covariance, rtol=EQUAL, atol=0)
-        and np.allclose(sent.mean, came.mean, rtol=EQUAL, atol=1e-300)
-    )
+    measured, received = predicted.outputs, predicted.received
+    if measured is None or received is None or measured.mean.shape != received.mean.shape:
+        return False
+    has_same_covariance = np.allclose(measured.covariance, received.covariance, rtol=EQUAL, atol=0)
+    return has_same_covariance and np.allclose(measured.mean, received.mean, rtol=EQUAL, atol=1e-300)
 
 
 def _smooth_noises(
@@ -249,12 +250,15 @@ def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.nd
     ROUNDING: share of the largest variance over the steps, up to which it is none.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    known = variance > ROUNDING * np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
-    return np.where(known, mean, np.nan), np.sqrt(np.where(known, variance, np.nan))
+    largest = np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
+    is_above_rounding = variance > ROUNDING * largest
+    return np.where(is_above_rounding, mean, np.nan), np.sqrt(np.where(is_above_rounding, variance, np.nan))
 
 
-def _find_peaks(size: np.ndarray, marked: np.ndarray) -> list[int]:
-    """Return the rows at which the size is largest, one of each stretch of `marked` rows side by side."""
-    rows = np.flatnonzero(marked)
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+def _find_peaks(size: np.ndarray, is_candidate: np.ndarray) -> list[int]:
+    """Return of each run of candidate rows, which lie side by side, the row at which the size is largest."""
+    rows = np.flatnonzero(is_candidate)
+    if not len(rows):
+        return []
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     return [int(run[np.argmax(size[run])]) for run in runs]

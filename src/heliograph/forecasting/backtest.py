@@ -81,12 +81,13 @@ class Score(NamedTuple):
 
     def row(self) -> dict[str, object]:
         """Return the score as a row of a table, with standard errors in columns of their own."""
-        shares = zip(LEVELS, self.coverage, strict=True)
-        means = {"bias": self.bias, "mse": self.mse, **{f"coverage {level:.0%}": share for level, share in shares},
-                 "log score": self.log_score, "crps": self.crps}  # fmt: skip
-        numbers = {column: value for name, mean in means.items() for column, value in
-                   ((name, mean.value), (f"{name} error", mean.error))}  # fmt: skip
-        return {**dict(zip(self._fields[:6], self[:6], strict=True)), "rmse": self.rmse, **numbers}
+        means = {"bias": self.bias, "mse": self.mse}
+        means |= {f"coverage {level:.0%}": share for level, share in zip(LEVELS, self.coverage, strict=True)}
+        means |= {"log score": self.log_score, "crps": self.crps}
+        row: dict[str, object] = {**dict(zip(self._fields[:6], self[:6], strict=True)), "rmse": self.rmse}
+        for name, mean in means.items():
+            row[name], row[f"{name} error"] = mean.value, mean.error
+        return row
 
 
 @readable
@@ -116,12 +117,12 @@ class Backtest:
         Raises:
             ValueError: there is no such score.
         """
-        asked = node, filter, name, horizon
-        found = [s for s in self.scores if (s.node, s.filter, s.name, s.horizon) == asked]
-        if not found:
-            known = ", ".join(dict.fromkeys(f"{s.node}/{s.filter} {s.name}" for s in self.scores))
+        key = node, filter, name, horizon
+        scores = [score for score in self.scores if (score.node, score.filter, score.name, score.horizon) == key]
+        if not scores:
+            known = ", ".join(dict.fromkeys(f"{score.node}/{score.filter} {score.name}" for score in self.scores))
             raise fail("score", f"one of {known} at {list(self.horizons)}", f"{node}/{filter} {name} at {horizon}")
-        return found[-1]  # of a state and a received number of one name the latter, which comes later
+        return scores[-1]  # of a state and a received number of one name the latter, which comes later
 
     def to_pandas(self) -> "pd.DataFrame":
         """Return a table with a row for each score, and columns of means and their standard errors.
@@ -287,11 +288,12 @@ def _roll_segments(
     """
     rolled = [roll_forecasts(target.outlook, z, u, ahead) for _, target in segments]
     ends = [*(row for row, _ in segments[1:]), len(z)]
-    bounds = list(zip([0, *ends[:-1]], ends, strict=True))
+    begins = [0, *ends[:-1]]
 
-    def join(*parts: np.ndarray) -> np.ndarray:
-        """Return the rows of each segment from its own part."""
-        return np.concatenate([np.asarray(part)[a:b] for part, (a, b) in zip(parts, bounds, strict=True)])
+    def join(*arrays: np.ndarray) -> np.ndarray:
+        """Return the rows of each segment from the array of its own filter, one segment after the other."""
+        rows_of_segments = zip(arrays, begins, ends, strict=True)
+        return np.concatenate([np.asarray(array)[begin:end] for array, begin, end in rows_of_segments])
 
     joined: tuple[Moments, Moments | None] = jax.tree.map(join, *rolled)
     return joined
@@ -300,9 +302,12 @@ def _roll_segments(
 def _select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
     """Return the law of one number at one horizon (its index), from each row."""
     if moments.laws is not None:
-        return MixtureLaws(*(np.asarray(one)[:, horizon, :, number] for one in moments.laws))
-    means, variances = (np.asarray(one)[:, horizon, :, number] for one in (moments.means, moments.covariances))
-    return MixtureLaws(np.asarray(moments.weights)[:, horizon], means, variances)
+        weights, means, variances = map(np.asarray, moments.laws)
+        of_number = (slice(None), horizon, slice(None), number)
+        return MixtureLaws(weights[of_number], means[of_number], variances[of_number])
+    weights, means = np.asarray(moments.weights), np.asarray(moments.means)
+    variances = np.asarray(moments.covariances)  # of numbers by themselves, in the place of covariances
+    return MixtureLaws(weights[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
 def _score_number(

@@ -97,13 +97,13 @@ def find_target(origin: Origin, node: str | None, filter: str | None) -> Forecas
     Raises:
         ValueError: none, or several of them.
     """
-    every = list_targets(origin)
-    found = [t for t in every if node in (None, t.node) and filter in (None, t.filter)]
-    if len(found) != 1:
-        known = ", ".join(f"{t.node}/{t.filter}" for t in every)
-        asked = "none" if node is None and filter is None else f"{node}/{filter}"
-        raise fail("node and filter", f"one of {known}", asked)
-    return found[0]
+    targets = list_targets(origin)
+    matching = [target for target in targets if node in (None, target.node) and filter in (None, target.filter)]
+    if len(matching) != 1:
+        known = ", ".join(f"{target.node}/{target.filter}" for target in targets)
+        got = "none" if node is None and filter is None else f"{node}/{filter}"
+        raise fail("node and filter", f"one of {known}", got)
+    return matching[0]
 
 
 def list_targets(origin: Origin) -> list[ForecastTarget]:
@@ -164,15 +164,17 @@ def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[Abstra
     A claim says how far the covariance holds; it is lowered to nominal where a prediction is approximate.
     """
     plant = first(network.plant)
-    linear = isinstance(plant, LinearPlant) and not plant.circular
-    claim = estimate.claim if linear or estimate.claim == "none" else weakest([estimate.claim, "nominal"])
+    is_exact = isinstance(plant, LinearPlant) and not plant.circular
+    claim = estimate.claim if is_exact or estimate.claim == "none" else weakest([estimate.claim, "nominal"])
     filter = open_loop_filter(network.plant)
-    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
-    lowered = replace(filter, claim=claim)
+    with_claim = replace(filter, claim=claim)
     # `replace` does not take `kept` along, and the filter is frozen.
-    object.__setattr__(lowered, "kept", filter.kept)
-    factors = from_covariance if mean.ndim == 1 else _factor_each
-    return lowered, factors(mean, covariance if claim != "none" else np.zeros_like(covariance))
+    object.__setattr__(with_claim, "kept", filter.kept)
+    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    if claim == "none":
+        covariance = np.zeros_like(covariance)
+    make_state = from_covariance if mean.ndim == 1 else _factor_each
+    return with_claim, make_state(mean, covariance)
 
 
 _factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covariance(mean, covariance)))
@@ -186,24 +188,27 @@ def _find_sensor(network: Network, node: str) -> AnySensor | None:
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None
-    whole = {name: single.sensor for name, single in network.nodes.items() if isinstance(single, Node)}
-    sensors = {name: sensor for name, sensor in whole.items() if isinstance(sensor, AbstractSensor)}
-    return None if len(sensors) < len(network.nodes) else joint_sensor(sensors)
+    sensors = {}
+    for name, receiver in network.nodes.items():
+        if not isinstance(receiver, Node) or not isinstance(receiver.sensor, AbstractSensor):
+            return None
+        sensors[name] = receiver.sensor
+    return joint_sensor(sensors)
 
 
 def _name_received(network: Network, node: str) -> tuple[str, ...]:
     """Return the names of the numbers that a node receives, or if it is "fused" those of all nodes."""
     if node != FUSED:
         return network.nodes[node].received_names
-    return tuple(f"{name}_{part}" for name in network.names for part in network.nodes[name].received_names)
+    return tuple(f"{name}_{number}" for name in network.names for number in network.nodes[name].received_names)
 
 
 def check_steps_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
     """Raise ValueError where what varies over time ends before `count` steps ahead of `step`."""
-    last = int(np.max(step))
-    if filter.horizon is not None and last + count > filter.horizon:
-        left = max(filter.horizon - last, 0)
-        raise fail("horizons", f"at most {left} steps, which the model covers beyond the data", count)
+    last_step = int(np.max(step))
+    if filter.horizon is not None and last_step + count > filter.horizon:
+        covered = max(filter.horizon - last_step, 0)
+        raise fail("horizons", f"at most {covered} steps, which the model covers beyond the data", count)
 
 
 def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -> Forecast:

@@ -88,8 +88,8 @@ class Prediction:
         Raises:
             ValueError: a coverage that is no probability between 0 and 1.
         """
-        inside = float(scalar("coverage", coverage, 0, 1))
-        return self.quantile((1 - inside) / 2), self.quantile((1 + inside) / 2)
+        p = float(scalar("coverage", coverage, 0, 1))
+        return self.quantile((1 - p) / 2), self.quantile((1 + p) / 2)
 
     def below(self, values: ArrayLike) -> Float[np.ndarray, "horizons m"]:
         """Return the probability that each number lies below a value: one for all, (m,), or (horizons, m).
@@ -134,13 +134,14 @@ class Prediction:
 
         A part without variance is its mean, which counts half at the value itself.
         """
-        away = values[..., None, :] - self.part_means
-        spread = np.sqrt(self.part_variances)
-        certain = np.where(away > 0, np.inf, np.where(away < 0, -np.inf, 0.0))
+        distance = values[..., None, :] - self.part_means
+        deviation = np.sqrt(self.part_variances)
+        without_variance = np.where(distance > 0, np.inf, np.where(distance < 0, -np.inf, 0.0))
         with np.errstate(invalid="ignore"):
-            units = np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), certain)
+            in_deviations = distance / np.where(deviation > 0, deviation, 1.0)
+            in_deviations = np.where(deviation > 0, in_deviations, without_variance)
         beyond_all = np.isinf(values)[..., None, :]  # also beyond parts whose variance is infinite
-        probabilities: np.ndarray = ndtr(np.where(beyond_all, values[..., None, :], units))
+        probabilities: np.ndarray = ndtr(np.where(beyond_all, values[..., None, :], in_deviations))
         return probabilities
 
 
@@ -176,11 +177,11 @@ class Forecast:
         Raises:
             ValueError: another number of them.
         """
-        kept = np.asarray(rows)
-        if kept.shape != self.steps.shape or kept.dtype.kind != "b":
-            raise fail("rows", f"{len(self.steps)} of true and false", f"shape {kept.shape} of {kept.dtype}")
-        chosen = self._map_arrays(lambda array, behind: np.compress(kept, array, axis=array.ndim - 1 - behind))
-        return replace(chosen, steps=self.steps[kept])
+        mask = np.asarray(rows)
+        if mask.shape != self.steps.shape or mask.dtype.kind != "b":
+            raise fail("rows", f"{len(self.steps)} of true and false", f"shape {mask.shape} of {mask.dtype}")
+        selected = self._map_arrays(lambda array, behind: np.compress(mask, array, axis=array.ndim - 1 - behind))
+        return replace(selected, steps=self.steps[mask])
 
     def of_source(self, number: int) -> "Forecast":
         """Return the forecast of one of several sources.
@@ -203,7 +204,7 @@ class Forecast:
         `change`: function of an array and of its number of axes behind that of horizons.
         """
         states, outputs, received = (
-            part and part.map_arrays(change) for part in (self.states, self.outputs, self.received)
+            prediction and prediction.map_arrays(change) for prediction in (self.states, self.outputs, self.received)
         )
         assert states is not None
         return replace(self, time=change(self.time, 0), states=states, outputs=outputs, received=received)
@@ -214,9 +215,9 @@ class Forecast:
         Raises:
             ValueError: no state, output or received number of this name.
         """
-        predictions = [part for part in (self.states, self.outputs, self.received) if part is not None]
+        predictions = list(filter(None, (self.states, self.outputs, self.received)))
         for prediction in predictions:
             if name in prediction.names:
                 return prediction, prediction.names.index(name)
-        known = dict.fromkeys(known for prediction in predictions for known in prediction.names)
+        known = dict.fromkeys(known_name for prediction in predictions for known_name in prediction.names)
         raise fail("name", f"one of {', '.join(known)}", repr(name))

@@ -1,6 +1,6 @@
 """How far ahead, and with which inputs: horizons in steps, time or dates as rows of inputs to predict with."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta
 from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 
@@ -159,11 +159,12 @@ def _require_step_count(value: object) -> int:
 
 def _list_horizons(horizons: object) -> list[object]:
     """Return horizons as a list; a single time or date as a list of one."""
-    single = isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64)
-    listed: list[object] = [horizons] if single else list(horizons) if rank("horizons", horizons) == 1 else []  # type: ignore[call-overload]
-    if not listed:
+    if isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64):
+        return [horizons]
+    values = list(cast(Iterable[object], horizons)) if rank("horizons", horizons) == 1 else []
+    if not values:
         raise fail("horizons", "a number of steps, or a list of how far ahead", show_value(horizons))
-    return listed
+    return values
 
 
 def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:

@@ -190,9 +190,9 @@ class MultistepPredictor(Module):
         """
         if not self.receives:
             return None
-        innovation = _expect(self.filter, prior, k)
+        innovation = _expect(self.filter, prior, k)  # of z = 0
         mean, covariance = -jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-        moments = Moments(jnp.ones(1), mean[None], covariance[None])
+        moments = Moments(weights=jnp.ones(1), means=mean[None], covariances=covariance[None])
         noise = self.received_noise
         if noise is None or outputs is None:
             return moments
@@ -344,7 +344,8 @@ def _predict_moments(outlook: MultistepPredictor, state: PyTree, u: jax.Array, s
         return outlook.predict_step(state, *row)
 
     rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-    return jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)[1]
+    _, moments = jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)
+    return moments
 
 
 def _predict_moments_of_each(outlook: MultistepPredictor, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
@@ -361,8 +362,8 @@ def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Cl
     A claim says how far the covariance holds: by a sensor that is not linear, or by angles, it is approximate.
     """
     sensor = first(outlook.sensor)
-    plain = isinstance(sensor, LinearSensor) and not sensor.circular
-    return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])
+    is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
+    return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])
 
 
 def find_received_claim(filter: AbstractFilter) -> Claim:

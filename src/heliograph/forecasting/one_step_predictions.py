@@ -79,12 +79,12 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
     network = find_origin(instance("record", record, Record, "a Record")).model
     assert isinstance(network, Network)  # nothing else makes a record with an origin
     u, filtered = read_plant_inputs(network, inputs, len(record.time)), list_single_filters(network)
-    found: Forecasts = {}
+    forecasts: Forecasts = {}
     for target in list_targets(find_origin(record)):
         if (target.node, target.filter) in filtered:
             predicted = _make_forecast(target.outlook, select_measurements(target, record), u, target.received)
-            found.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
-    return found
+            forecasts.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
+    return forecasts
 
 
 def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
@@ -116,10 +116,13 @@ def _predict_each_row(outlook: MultistepPredictor, z: jax.Array, u: jax.Array) -
         """Return the state after a row, and the moments that were predicted for it."""
         k, z_k, u_k = row
         prior, moments = outlook.predict_step(state, u_k, k)
-        return outlook.filter.correct(prior, z_k, k)[0], moments
+        state_after, _ = outlook.filter.correct(prior, z_k, k)
+        return state_after, moments
 
     start = jax.tree.map(jnp.asarray, outlook.filter.init())
-    return jax.lax.scan(predict_and_correct, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)
+    _, moments_of_rows = jax.lax.scan(predict_and_correct, start, rows)
+    return moments_of_rows
 
 
 _by_xla = quickly_compiled(_predict_each_row)

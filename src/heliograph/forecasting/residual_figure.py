@@ -38,11 +38,11 @@ def compare_with_normal_quantiles(e: np.ndarray) -> ResidualQuantiles:
 
     The band leaves OUTSIDE beyond each side; `ndtri` is the quantile function of the normal law.
     """
-    came = np.sort(e[~np.isnan(e)])
-    n = len(came)
-    place = np.arange(1, n + 1)
-    low, high = (np.asarray(ndtri(beta.ppf(p, place, n + 1 - place))) for p in (OUTSIDE, 1 - OUTSIDE))
-    return ResidualQuantiles(normal=ndtri(place / (n + 1)), residuals=came, low=low, high=high)
+    sorted_residuals = np.sort(e[~np.isnan(e)])
+    n = len(sorted_residuals)
+    i = np.arange(1, n + 1)
+    low, high = (np.asarray(ndtri(beta.ppf(p, i, n + 1 - i))) for p in (OUTSIDE, 1 - OUTSIDE))
+    return ResidualQuantiles(normal=ndtri(i / (n + 1)), residuals=sorted_residuals, low=low, high=high)
 
 
 def draw_residuals(

@@ -64,12 +64,12 @@ class Residuals:
         """
         tests = {"correlated over time": self.ljung_box, "not normal": self.normality,
                  "of a variance that changes": self.variance}  # fmt: skip
-        made = sum(int(np.sum(np.isfinite(p))) for p in tests.values())
+        count = sum(int(np.sum(np.isfinite(p))) for p in tests.values())
         return [
-            f"residuals of {name} are {said} (p = {p[i]:.1g} of {made} tests)"
+            f"residuals of {name} are {finding} (p = {p[i]:.1g} of {count} tests)"
             for i, name in enumerate(self.names)
-            for said, p in tests.items()
-            if p[i] < FALSE / made
+            for finding, p in tests.items()
+            if p[i] < FALSE / count
         ]
 
     def quantiles(self, name: str) -> ResidualQuantiles:
@@ -192,8 +192,10 @@ def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
 def _compute_autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
     """Return r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came, for each lag from 1 on (lags,)."""
     e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
-    total = np.nansum(e**2)
-    return np.array([_multiply_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])
+    sum_of_squares = np.nansum(e**2)
+    if not sum_of_squares > 0:
+        return np.full(lags, np.nan)
+    return np.array([_multiply_pairs(e, lag).sum() / sum_of_squares for lag in range(1, lags + 1)])
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
@@ -205,7 +207,8 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
     if n < LEAST:
         return float("nan")
     counts = np.array([max(len(_multiply_pairs(e, lag)), 1) for lag in range(1, lags + 1)])
-    return float(chi2.sf(n * (n + 2) * np.sum(_compute_autocorrelation(e, lags) ** 2 / counts), lags))
+    statistic = n * (n + 2) * np.sum(_compute_autocorrelation(e, lags) ** 2 / counts)
+    return float(chi2.sf(statistic, df=lags))
 
 
 def _test_normality(e: np.ndarray) -> float:
@@ -213,11 +216,13 @@ def _test_normality(e: np.ndarray) -> float:
 
     The number is chi-squared with 2 degrees of freedom if they are normal. NaN where fewer than LEAST came.
     """
-    came = e[~np.isnan(e)]
-    if len(came) < LEAST:
+    e = e[~np.isnan(e)]
+    n = len(e)
+    if n < LEAST:
         return float("nan")
-    t = (came - came.mean()) / came.std()
-    return float(chi2.sf(len(came) * (np.mean(t**3) ** 2 + (np.mean(t**4) - 3) ** 2 / 4) / 6, 2))
+    standardised = (e - e.mean()) / e.std()
+    S, K = np.mean(standardised**3), np.mean(standardised**4)
+    return float(chi2.sf(n * (S**2 + (K - 3) ** 2 / 4) / 6, df=2))
 
 
 def _test_same_variance(e: np.ndarray) -> float:
@@ -226,9 +231,9 @@ def _test_same_variance(e: np.ndarray) -> float:
     Of the residuals that came, h in a third: the ratio has the F law of h and h degrees of freedom if the variance
     is one. NaN where h is less than half of LEAST.
     """
-    came = e[~np.isnan(e)]
-    h = len(came) // 3
+    e = e[~np.isnan(e)]
+    h = len(e) // 3
     if h < LEAST // 2:
         return float("nan")
-    ratio = float(np.sum(came[-h:] ** 2) / np.sum(came[:h] ** 2))
+    ratio = float(np.sum(e[-h:] ** 2) / np.sum(e[:h] ** 2))
     return float(2 * min(f.sf(ratio, h, h), f.cdf(ratio, h, h)))

@@ -153,11 +153,15 @@ class ModeSwitching(NamedTuple):
 
     def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
         """Return plant and sensor of one step as they are in a joint mode."""
-        plant_mode, sensor_mode = (jnp.asarray(x)[mode] for x in (self.filter.plant_modes, self.filter.sensor_modes))
-        return (
-            plant.given(plant_mode) if isinstance(plant, ModalPlant) else plant,
-            sensor.given(sensor_mode) if isinstance(sensor, ModalSensor) else sensor,
+        plant_mode, sensor_mode = (
+            jnp.asarray(self.filter.plant_modes)[mode],
+            jnp.asarray(self.filter.sensor_modes)[mode],
         )
+        if isinstance(plant, ModalPlant):
+            plant = plant.given(plant_mode)
+        if isinstance(sensor, ModalSensor):
+            sensor = sensor.given(sensor_mode)
+        return plant, sensor
 
 
 def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
@@ -265,7 +269,8 @@ def _draw_paths_from_states(
         `u`: inputs of the rows; `step`: number of the first row.
         """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-        path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: draw_row(before, row, key), start, rows)[1]
+        path: tuple[jax.Array, jax.Array]
+        _, path = jax.lax.scan(lambda before, row: draw_row(before, row, key), start, rows)
         return path
 
     paths: tuple[jax.Array, jax.Array] = jax.vmap(draw_path)(jax.tree.map(jnp.asarray, starts), keys)

@@ -34,11 +34,12 @@ def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     LOG_TURN: log(2 pi). The largest term is taken out of the sum, lest every exponential is 0.
     """
+    squares = (values[:, None] - law.means) ** 2 / law.variances
     with np.errstate(divide="ignore"):  # a part of no weight has no density
         log_weights = np.log(law.weights)
-    terms = log_weights - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2
-    top = terms.max(axis=1)
-    return np.asarray(top + np.log(np.sum(np.exp(terms - top[:, None]), axis=1)))
+    log_terms = log_weights - (squares + np.log(law.variances) + LOG_TURN) / 2
+    largest = log_terms.max(axis=1)
+    return np.asarray(largest + np.log(np.sum(np.exp(log_terms - largest[:, None]), axis=1)))
 
 
 def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
@@ -49,12 +50,13 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
     """
-    away = np.sum(law.weights * _compute_mean_size(values[:, None] - law.means, law.variances), axis=1)
-    between = np.zeros(len(values))
+    distance_from_z = np.sum(law.weights * _compute_mean_size(values[:, None] - law.means, law.variances), axis=1)
+    distance_of_two = np.zeros(len(values))  # E|X - X'|
     for i in range(law.weights.shape[1]):
-        pair = _compute_mean_size(law.means[:, i : i + 1] - law.means, law.variances[:, i : i + 1] + law.variances)
-        between += law.weights[:, i] * np.sum(law.weights * pair, axis=1)
-    return np.asarray(away - between / 2)
+        differences, variances = law.means[:, [i]] - law.means, law.variances[:, [i]] + law.variances
+        mean_sizes = _compute_mean_size(differences, variances)
+        distance_of_two += law.weights[:, i] * np.sum(law.weights * mean_sizes, axis=1)
+    return np.asarray(distance_from_z - distance_of_two / 2)
 
 
 def _compute_mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -86,9 +88,10 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     if not count:
         return ScoreMean(float("nan"), float("nan"))
     mean = float(values[came].mean())
-    apart = np.where(came, values - mean, 0.0)
+    d = np.where(came, values - mean, 0.0)
     lags = min(max(horizon - 1, int(BANDWIDTH * count**0.5)), len(values) - 1)
-    total = apart @ apart
+    total = d @ d
     for lag in range(1, lags + 1):
-        total += 2 * (1 - lag / (lags + 1)) * (apart[lag:] @ apart[:-lag])
+        bartlett_weight = 1 - lag / (lags + 1)
+        total += 2 * bartlett_weight * (d[lag:] @ d[:-lag])
     return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / count))

@@ -23,13 +23,10 @@ def find_origin(source: object) -> Origin:
     """
     origin = getattr(source, "origin", None)
     if not isinstance(origin, Origin):
-        expected = "a result of filter.run or hg.run, a Stream or a Timeline"
         got = type(source).__name__
-        raise fail(
-            "forecast",
-            expected,
-            f"a {got} without states, as files and simulations have" if hasattr(source, "origin") else got,
-        )
+        if hasattr(source, "origin"):
+            got = f"a {got} without states, as files and simulations have"
+        raise fail("forecast", "a result of filter.run or hg.run, a Stream or a Timeline", got)
     return origin
 
 
@@ -90,10 +87,10 @@ def _stack_estimates(estimates: list[Estimate]) -> Estimate:
 
     Of plants with another claim the covariances are NaN.
     """
-    claimed = next((one for one in estimates if one.claim != "none"), estimates[0])
+    model = next((estimate for estimate in estimates if estimate.claim != "none"), estimates[0])
+    unknown = np.full(np.shape(model.covariance), np.nan)
     covariances = [
-        np.asarray(one.covariance) if one.claim == claimed.claim else np.full(np.shape(claimed.covariance), np.nan)
-        for one in estimates
+        np.asarray(estimate.covariance) if estimate.claim == model.claim else unknown for estimate in estimates
     ]
-    means = np.stack([np.asarray(one.mean) for one in estimates])
-    return Estimate(means, np.stack(covariances), claimed.claim, attitude=claimed.attitude)
+    means = np.stack([np.asarray(estimate.mean) for estimate in estimates])
+    return Estimate(means, np.stack(covariances), model.claim, attitude=model.attitude)

@@ -58,8 +58,8 @@ class Crossing:
         """
         p = float(scalar("level of a quantile", level, 0, 1))
         # `by`: probability to have been beyond by each of the `steps`.
-        reached = np.flatnonzero(self.by >= p)
-        return float(self.steps[reached[0]]) if len(reached) else float("inf")
+        reaching_steps = self.steps[self.by >= p]
+        return float(reaching_steps[0]) if len(reaching_steps) else float("inf")
 
 
 def crossing(

@@ -112,7 +112,8 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
     start = columns_of(errors.state_covariance)
-    root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (padding, (0, 0)))
+    root_of_x_and_errors = jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1))
+    root = jnp.pad(root_of_x_and_errors, (padding, (0, 0)))
     mean = jnp.pad(errors.mean.reshape(-1), padding)
     shapes = (received, n), (received,), (received, received), (n,)
     past = PastReports(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
@@ -135,12 +136,13 @@ class ReportMap(NamedTuple):
         zeta = (x, errors of the nodes); a report is x - e_i, and the past ones follow, the latest first.
         """
         nodes, n, _ = self.transition.errors.shape
-        zeta, past = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
-        moved = self.transition @ zeta
-        if not len(past):
-            return moved
-        sent = jnp.concatenate([zeta[:n]] * nodes) - zeta[n:]
-        return jnp.concatenate([moved, sent, past[: -nodes * n]])
+        zeta, past_reports = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
+        zeta_after = self.transition @ zeta
+        if not len(past_reports):
+            return zeta_after
+        x, node_errors = zeta[:n], zeta[n:]
+        newest_reports = jnp.concatenate([x] * nodes) - node_errors
+        return jnp.concatenate([zeta_after, newest_reports, past_reports[: -nodes * n]])
 
 
 def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportModel) -> ReportsBelief:
@@ -212,14 +214,14 @@ def _compute_gain(
     x: state of the centre; `output`: reports by x; `past`: gain, offset, noise and quantizers' error of reports by age
     and node.
     """
-    one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
-    terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
+    identity, shape = np.eye(past.noise.shape[-1]), past.offset.shape
+    sizes_of_terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
     # Rounding to segments, uniform within -+ error, has the variance error^2 / 3.
-    quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
-    noise = past.noise + quantized + one * noise_beside_repeated(terms)[..., None]
+    quantizer_noise = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
+    noise = past.noise + quantizer_noise + identity * noise_beside_repeated(sizes_of_terms)[..., None]
     # What did not arrive has slopes of zero and a noise of its own.
     arrived = present.reshape(shape)
-    noise = jnp.where(arrived[..., :, None] & arrived[..., None, :], noise, one)
+    noise = jnp.where(arrived[..., :, None] & arrived[..., None, :], noise, identity)
     slopes = jnp.where(present[:, None], output @ x.root, 0.0)
     return jnp.where(present, gain_of(x, slopes, _factor_each(noise)), 0.0)
 
@@ -231,7 +233,9 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """
     x = take_leading(state.gaussian, n)
     mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
-    return mean, covariance if state.spill is None else _bound_by_young(covariance, state.spill[:n, :n])
+    if state.spill is None:
+        return mean, covariance
+    return mean, _bound_by_young(covariance, state.spill[:n, :n])
 
 
 def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
@@ -301,10 +305,11 @@ def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Ar
     There is one block for each age and node, (a, b).
     """
     ages, nodes, rows, columns = blocks.shape
-    items = jnp.arange(ages * nodes)
-    empty = jnp.zeros((len(items), rows, len(items), columns))
-    full = empty.at[items, :, items, :].set(blocks.reshape(-1, rows, columns))
-    return full.reshape(len(items) * rows, len(items) * columns)
+    count = ages * nodes
+    numbers = jnp.arange(count)
+    zeros = jnp.zeros((count, rows, count, columns))
+    block_diagonal = zeros.at[numbers, :, numbers, :].set(blocks.reshape(-1, rows, columns))
+    return block_diagonal.reshape(count * rows, count * columns)
 
 
 def _bound_by_cauchy(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:

@@ -97,10 +97,10 @@ def _trace_derivatives(
     J: information matrices of the estimates; w: their weights.
     """
     p = invert_positive_definite(_sum_weighted(w, information))
-    half = information @ p  # J_k P
-    full = p @ half
-    hessian = 2 * symmetric(jnp.einsum("kab,jba->kj", half, full))
-    return jnp.trace(p), -jnp.trace(full, axis1=1, axis2=2), hessian
+    j_p = information @ p  # J_k P of each k
+    p_j_p = p @ j_p
+    hessian = 2 * symmetric(jnp.einsum("kab,jba->kj", j_p, p_j_p))
+    return jnp.trace(p), -jnp.trace(p_j_p, axis1=1, axis2=2), hessian
 
 
 def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "count n n"]) -> Float[jax.Array, "n n"]:
@@ -244,12 +244,12 @@ def restore_exact_components(
     In `invert_covariances` a small number stands for no variance, of which the mean would keep 1e-8 of what the
     others say.
     """
-    exact = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
+    is_exact_in_input = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
     # From the last input to the first, so that of several exact ones the first is taken.
-    for own, is_exact in zip(reversed(list(means)), reversed(list(exact)), strict=True):
-        mean = jnp.where(is_exact, own, mean)
-    is_exact = jnp.any(exact, axis=0)
-    return mean, jnp.where(is_exact[:, None] | is_exact, 0.0, covariance)
+    for mean_of_input, is_exact in zip(reversed(list(means)), reversed(list(is_exact_in_input)), strict=True):
+        mean = jnp.where(is_exact, mean_of_input, mean)
+    is_exact_in_any = jnp.any(is_exact_in_input, axis=0)
+    return mean, jnp.where(is_exact_in_any[:, None] | is_exact_in_any, 0.0, covariance)
 
 
 Shared = tuple[Float[jax.Array, " degree"], Float[jax.Array, "n n"]]  # shares pi, and (sum_j pi_j P_j^-1)^-1

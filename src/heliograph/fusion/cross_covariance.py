@@ -61,8 +61,9 @@ class ErrorMap(NamedTuple):
         """
         nodes, n, _ = self.errors.shape
         x, e = columns[:n].reshape(n, -1), columns[n:].reshape(nodes, n, -1)
-        after = self.errors @ e + self.of_state @ x
-        return jnp.concatenate([self.plant @ x, after.reshape(nodes * n, -1)]).reshape(columns.shape)
+        e_after = self.errors @ e + self.of_state @ x
+        x_after = self.plant @ x
+        return jnp.concatenate([x_after, e_after.reshape(nodes * n, -1)]).reshape(columns.shape)
 
 
 class ErrorStep(NamedTuple):
@@ -86,12 +87,12 @@ class ErrorStep(NamedTuple):
         """
         nodes, n, _ = self.gain.shape
         if self.received.ndim == 4:
-            measured = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
+            by_received = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
         else:
-            items, blocks = jnp.arange(nodes), symmetrize(propagate_by_mode(self.gain, self.received, 0.0))
-            measured = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(blocks)
-        added = jnp.pad(measured.reshape(nodes * n, nodes * n), ((n, 0), (n, 0)))
-        return jnp.asarray(propagate_by_mode(self.of_noise, self.process, added))
+            numbers, blocks = jnp.arange(nodes), symmetrize(propagate_by_mode(self.gain, self.received, 0.0))
+            by_received = jnp.zeros((nodes, n, nodes, n)).at[numbers, :, numbers, :].set(blocks)
+        padded = jnp.pad(by_received.reshape(nodes * n, nodes * n), ((n, 0), (n, 0)))  # it does not reach x
+        return jnp.asarray(propagate_by_mode(self.of_noise, self.process, padded))
 
 
 class ErrorMoments(NamedTuple):
@@ -202,9 +203,10 @@ class ErrorSources(NamedTuple):
         e_i is `shared`_i times common sources of variance 1, plus an own part of covariance `independent`_i.
         """
         count, n, _ = self.shared.shape
-        flat = self.shared.reshape(count * n, -1)
-        blocks = np.eye(count)[:, None, :, None] * self.independent[:, :, None]
-        return (flat @ flat.T).reshape(count, n, count, n) + blocks
+        roots = self.shared.reshape(count * n, -1)
+        of_independent = np.eye(count)[:, None, :, None] * self.independent[:, :, None]
+        of_shared = (roots @ roots.T).reshape(count, n, count, n)
+        return of_shared + of_independent
 
     def weigh(self, weights: Float[Array, "n node n"]) -> tuple[Float[Array, "n sources"], Float[Array, "n n"]]:
         """Return the sources of the sum W e, and the covariance of its independent part.

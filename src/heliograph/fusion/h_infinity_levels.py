@@ -23,8 +23,8 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
     Source: H-infinity quantized fusion over amplify-and-forward relays, Theorem 4, in closed form.
     """
     gamma = _check_levels(levels)
-    inverse = (gamma.min() / gamma) ** 2  # relative to the smallest level: at most 1, so that nothing overflows
-    return np.asarray(inverse / inverse.sum())
+    inverse_squares = (gamma.min() / gamma) ** 2  # relative to the smallest level: at most 1, so that none overflows
+    return np.asarray(inverse_squares / inverse_squares.sum())
 
 
 def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
@@ -89,10 +89,10 @@ def fused_error_norm(
 
 def _check_levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
     """Return levels gamma_i (N,) as an array; raise ValueError unless all are positive."""
-    checked = np.asarray(array("levels", levels, (None,)))
-    if not len(checked) or np.any(checked <= 0):
-        raise fail("levels", "positive numbers", checked.tolist())
-    return checked
+    gamma = np.asarray(array("levels", levels, (None,)))
+    if not len(gamma) or np.any(gamma <= 0):
+        raise fail("levels", "positive numbers", gamma.tolist())
+    return gamma
 
 
 def _check_levels_and_weights(

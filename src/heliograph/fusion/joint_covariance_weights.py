@@ -63,12 +63,12 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     # D, and P in units of its roots.
     variances = jnp.einsum("iaia->a", joint) / nodes
     unit = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
-    scaled = joint / (unit[:, None, None] * unit)
+    P = joint / (unit[:, None, None] * unit)
     # U = P + E E' in these units.
-    total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
-    ones = jnp.tile(jnp.eye(n), (nodes, 1))
-    projected = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
-    weights = regular_solve(projected @ ones, projected).reshape(n, nodes, n)
+    U = symmetrize((P + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
+    E = jnp.tile(jnp.eye(n), (nodes, 1))
+    E_U_inverse = pseudo_solve(U, E, rounding(0.0, U, RANK)).T  # E' U^+
+    weights = regular_solve(E_U_inverse @ E, E_U_inverse).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
@@ -144,8 +144,9 @@ def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) ->
     `joint` is Cov(e_i, e_j) of all estimates; its traces replace it, as of a state of one component.
     """
     nodes, n = joint.shape[:2]
-    traces = jnp.einsum("iaja->ij", joint)
-    return jnp.einsum("i,ab->aib", weigh(traces.reshape(nodes, 1, nodes, 1))[0, :, 0], jnp.eye(n))
+    traces = jnp.einsum("iaja->ij", joint).reshape(nodes, 1, nodes, 1)
+    weights = weigh(traces)[0, :, 0]
+    return jnp.einsum("i,ab->aib", weights, jnp.eye(n))
 
 
 def weigh_covariance(
@@ -218,8 +219,9 @@ def _weigh_component(
     mean = jnp.sum(arrived * jnp.diagonal(joint)) / jnp.sum(arrived)
     # What U adds to P; the rows of absent estimates are those of I.
     ridge = jnp.where(arrived > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
-    solved = psd_solve(arrived[:, None] * arrived * joint + jnp.diag(ridge), arrived[:, None])[:, 0]
-    return solved / jnp.sum(solved)
+    U = arrived[:, None] * arrived * joint + jnp.diag(ridge)
+    U_inverse_of_ones = psd_solve(U, arrived[:, None])[:, 0]  # U^-1 1
+    return U_inverse_of_ones / jnp.sum(U_inverse_of_ones)
 
 
 def weigh_covariance_by_component(

@@ -135,9 +135,9 @@ class Fusion(Module):
         if self.quantizer is None:
             return self.rule.claim(claims)
         # All are of one kind, and that alone decides the claim.
-        quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
-        kind = stack_over_time(quantizer)
-        return self.rule.claim([kind.claim(claim) for claim in claims])
+        any_quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
+        quantizer = stack_over_time(any_quantizer)
+        return self.rule.claim([quantizer.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
         """List the quantizers of all nodes, one for each."""

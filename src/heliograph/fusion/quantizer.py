@@ -101,8 +101,8 @@ def widen_by_quantization(covariance: Float[Array, "n n"], error: Float[Array, "
     q: the quantized estimate, xhat: the estimate, D: bounds of the quantizer's error (n,).
     """
     s, r = jnp.sum(error), jnp.sqrt(jnp.trace(covariance))
-    share = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
-    return (1 + share) * covariance + (r + s) * jnp.diag(error)
+    t = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
+    return (1 + t) * covariance + (r + s) * jnp.diag(error)
 
 
 Parameter = Float[Array, "..."]  # of all components, or of each
@@ -129,8 +129,8 @@ def check_levels(value: int) -> Float[np.ndarray, ""]:
 
 def check_parameter(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter as a number, or as one number per component."""
-    several = isinstance(value, Sequence) or rank(name, value) > 0
-    numbers: Parameter = array(name, value, (None,) if several else ())
+    is_list = isinstance(value, Sequence) or rank(name, value) > 0
+    numbers: Parameter = array(name, value, (None,) if is_list else ())
     return numbers
 
 
@@ -195,8 +195,8 @@ class UniformQuantizer(AbstractQuantizer):
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Return half of a segment's length for each component: the largest error within the range."""
-        half = self.scale * self.amplitude / self.levels
-        bound: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
+        half_segment = self.scale * self.amplitude / self.levels
+        bound: Float[Array, " n"] = library(half_segment).broadcast_to(half_segment, (n,))
         return bound
 
 
@@ -208,11 +208,11 @@ def _quantize_uniformly(
     d is the amplitude; what is returned is in the unit of x.
     """
     scaled = x / scale
-    inside = midpoint(find_segment(scaled, amplitude, levels), amplitude, levels)
-    value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
-    saturated = jnp.abs(scaled) > amplitude
-    error = jnp.where(saturated | ~jnp.isfinite(x), jnp.nan, scale * amplitude / levels)
-    return Quantized(scale * value, error, saturated, jnp.ones(x.shape, dtype=int))
+    middle_of_segment = midpoint(find_segment(scaled, amplitude, levels), amplitude, levels)
+    value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, middle_of_segment))
+    is_saturated = jnp.abs(scaled) > amplitude
+    error = jnp.where(is_saturated | ~jnp.isfinite(x), jnp.nan, scale * amplitude / levels)
+    return Quantized(scale * value, error, is_saturated, symbols=jnp.ones(x.shape, dtype=int))
 
 
 class UplinkSymbols(NamedTuple):

@@ -136,12 +136,11 @@ class ReportLink(Module):
         """Raise ValueError unless it takes reports of n components and has no memory."""
         if self.channel is None:
             return
-        if first(self.channel).inputs != n:
-            raise fail(
-                "channel of a report link", f"one that takes {n} numbers", f"{first(self.channel).inputs} inputs"
-            )
-        if first(self.channel).remembers:
-            raise fail("channel of a report link", "one that forgets", f"{type(first(self.channel)).__name__}")
+        channel = first(self.channel)
+        if channel.inputs != n:
+            raise fail("channel of a report link", f"one that takes {n} numbers", f"{channel.inputs} inputs")
+        if channel.remembers:
+            raise fail("channel of a report link", "one that forgets", f"{type(channel).__name__}")
 
     def delivers(self, n: int) -> bool:
         """Return whether every report of n numbers that is sent arrives as it is, after a fixed delay."""

@@ -70,10 +70,10 @@ class AbstractFusion(Module):
 
         So it is where its class has weights or gains of neighbours of its own.
         """
-        this = type(self)
-        return (this.neighbour_weights, this.neighbour_gains) != (
-            AbstractFusion.neighbour_weights, AbstractFusion.neighbour_gains
-        )  # fmt: skip
+        own, base = type(self), AbstractFusion
+        has_own_weights = own.neighbour_weights != base.neighbour_weights
+        has_own_gains = own.neighbour_gains != base.neighbour_gains
+        return has_own_weights or has_own_gains
 
     @property
     def needs_joint(self) -> bool:

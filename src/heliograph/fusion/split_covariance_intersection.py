@@ -89,9 +89,10 @@ class SplitIntersection(AbstractIntersection):
             LEAST: 1e-12.
             """
             weights = matrix_weights(bound_joint(shares))
-            root = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
-            total = root.sum()  # 0 where nothing is unknown: then the shares do not matter
-            return jnp.maximum(jnp.where(total > 0, root / jnp.where(total > 0, total, 1.0), shares), LEAST)
+            deviations = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
+            total = deviations.sum()  # 0 where nothing is unknown: then the shares do not matter
+            new_shares = jnp.where(total > 0, deviations / jnp.where(total > 0, total, 1.0), shares)
+            return jnp.maximum(new_shares, LEAST)
 
         # Alternating minimisation from equal shares.
         shares = jax.lax.fori_loop(0, ROUNDS, improve_shares, jnp.full(count, 1 / count))
@@ -112,5 +113,5 @@ def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
     """
     n = unknown.shape[-1]
     rounding = rounding_of_variances(jnp.einsum("aii->ai", covariances), n)
-    is_some = jnp.any(unknown != 0, axis=(-1, -2), keepdims=True)
-    return unknown + jnp.where(is_some, rounding[..., None] * jnp.eye(n, dtype=unknown.dtype), 0.0)
+    is_not_zero = jnp.any(unknown != 0, axis=(-1, -2), keepdims=True)
+    return unknown + jnp.where(is_not_zero, rounding[..., None] * jnp.eye(n, dtype=unknown.dtype), 0.0)

@@ -62,9 +62,10 @@ class ZoomQuantizer(AbstractQuantizer):
         The next amplitude is decay times the present one plus growth times x^2; it stays where x is missing.
         """
         x, amplitude = jnp.asarray(value, dtype=float), jnp.asarray(state, dtype=float)
-        following = jnp.where(jnp.isfinite(x), self.decay * amplitude + self.growth * x**2, amplitude)
-        _, sent = eqx.tree_at(lambda q: q.amplitude, self.uniform, amplitude).step((), x)
-        return following, sent
+        next_amplitude = jnp.where(jnp.isfinite(x), self.decay * amplitude + self.growth * x**2, amplitude)
+        quantizer_now = eqx.tree_at(lambda quantizer: quantizer.amplitude, self.uniform, amplitude)
+        _, quantized = quantizer_now.step((), x)
+        return next_amplitude, quantized
 
     def claim(self, claim: Claim) -> Claim:
         """Lower a claim to "nominal": the amplitude depends on the data, and may be small where errors are large."""

@@ -83,9 +83,8 @@ class JumpSystem(NamedTuple):
 
         It acts on the e entries of the upper triangles of all modes' moments X.
         """
-        return np.asarray(
-            make_matrix_on_triangle_entries(self._replace(added=0.0 * self.added)._propagate_one_period, self.shape)
-        )
+        without_noise = self._replace(added=0.0 * self.added)
+        return np.asarray(make_matrix_on_triangle_entries(without_noise._propagate_one_period, self.shape))
 
     def radius(self) -> float:
         """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
@@ -97,12 +96,11 @@ class JumpSystem(NamedTuple):
         The spectral radius of their operator has to be below 1; else there are none.
         """
         # X after a period is a linear map of X before it, and what comes from no X: both are equal where it is steady.
-        start = solve_fixed_point(
-            self._replace(added=0.0 * self.added)._propagate_one_period,
-            self._propagate_one_period(np.zeros(self.shape)),
-        )
-        after = library(start).stack(self.after(start))
-        return (after + after.swapaxes(-1, -2)) / 2
+        without_noise = self._replace(added=0.0 * self.added)
+        from_zero = self._propagate_one_period(np.zeros(self.shape))
+        start = solve_fixed_point(without_noise._propagate_one_period, from_zero)
+        moments = library(start).stack(self.after(start))
+        return (moments + moments.swapaxes(-1, -2)) / 2
 
     def adjoint(self, weights: Float[np.ndarray, "time n n"], forever: bool) -> Float[np.ndarray, "time M n n"]:
         """Return the derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
@@ -120,8 +118,9 @@ class JumpSystem(NamedTuple):
             """
             derivatives = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
-                derivatives.append(weight + later)
-                later = mix_moments_of_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivatives[-1], 0.0))
+                derivative = weight + later  # by X after this step
+                derivatives.append(derivative)
+                later = mix_moments_of_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivative, 0.0))
             return later[..., :modes_before, :, :], derivatives[::-1]
 
         later = np.zeros((modes_before, n, n))
@@ -155,12 +154,10 @@ def solve_fixed_point(linear: Maps, constant: Array) -> Any:
 
     As linear equations for the entries of the upper triangles, which are all that a symmetric matrix has.
     """
-    matrix, where = (
-        make_matrix_on_triangle_entries(linear, constant.shape),
-        _place_in_upper_triangles(constant.shape)[1],
-    )
-    solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
-    return unpack_triangle_entries(solution, constant.shape)
+    matrix = make_matrix_on_triangle_entries(linear, constant.shape)
+    _, triangle_indices, _ = _place_in_upper_triangles(constant.shape)
+    entries = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[triangle_indices])
+    return unpack_triangle_entries(entries, constant.shape)
 
 
 def unpack_triangle_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
@@ -177,8 +174,9 @@ def _place_in_upper_triangles(
     Three results: for each entry of the matrix its place in the list of these entries; their indices in the matrix; and
     for each a unit matrix, with this entry and its mirror image at 1 and all else at 0.
     """
-    where = np.nonzero(np.triu(np.ones(shape)))
-    mirrored = *where[:-2], where[-1], where[-2]
+    *leading, rows, columns = triangle_indices = np.nonzero(np.triu(np.ones(shape)))
+    mirrored_indices = *leading, columns, rows
+    count = len(rows)
     places = np.empty(shape, dtype=int)
-    places[where] = places[mirrored] = np.arange(len(where[0]))
-    return places, where, np.eye(len(where[0]))[:, places]
+    places[triangle_indices] = places[mirrored_indices] = np.arange(count)
+    return places, triangle_indices, np.eye(count)[:, places]

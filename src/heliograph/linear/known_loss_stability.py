@@ -79,10 +79,12 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
     radius = jumps.radius()
     if radius >= BELOW_ONE:
         return radius
-    unit = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
-    (witness,) = jumps._replace(added=unit).steady()
-    left: Parts = witness - propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, witness), 0.0)
-    return radius if min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness).min()) > 0 else float("inf")
+    unit_noises = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
+    (witness,) = jumps._replace(added=unit_noises).steady()
+    witness_after = propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, witness), 0.0)
+    decrease: Parts = witness - witness_after
+    is_proved = min(np.linalg.eigvalsh(decrease).min(), np.linalg.eigvalsh(witness).min()) > 0
+    return radius if is_proved else float("inf")
 
 
 def find_gains(system: KnownLossSystem) -> KindGains:
@@ -162,14 +164,14 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
     K_s = A U C_s' (C_s U C_s' + R)^-1: U (V mixed by the chain) and R (noises, weighted by the modes' law) are summed
     over the modes that the receiver cannot distinguish from each other, those with `known` = s.
     """
-    results: list[np.ndarray] = []
-    before: Parts = mix_moments_of_modes(system.chain, parts)
-    for s, c in enumerate(system.outputs):
+    gains: list[np.ndarray] = []
+    mixed: Parts = mix_moments_of_modes(system.chain, parts)
+    for s, C in enumerate(system.outputs):
         modes = np.flatnonzero(system.known == s)
-        v = before[modes].sum(axis=0)
-        r = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(c), len(c))))
-        results.append(system.transition @ observe_root(roots_of(v), c, roots_of(r)).gain)
-    return tuple(results)
+        U = mixed[modes].sum(axis=0)
+        R = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(C), len(C))))
+        gains.append(system.transition @ observe_root(roots_of(U), C, roots_of(R)).gain)
+    return tuple(gains)
 
 
 def _relative_change(before: KindGains, after: KindGains) -> float:
@@ -177,9 +179,10 @@ def _relative_change(before: KindGains, after: KindGains) -> float:
 
     0 if these are all zero.
     """
-    size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
-    gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
-    return float(gap / size) if size > 0 else 0.0
+    largest_entry = max((np.max(np.abs(gain), initial=0.0) for gain in after), default=0.0)
+    changes = [new - old for old, new in zip(before, after, strict=True)]
+    largest_change = max((np.max(np.abs(change), initial=0.0) for change in changes), default=0.0)
+    return float(largest_change / largest_entry) if largest_entry > 0 else 0.0
 
 
 UNSEEN = 1e-9  # of its size: what of an eigenvector an output or a noise may show that is taken for nothing
@@ -205,12 +208,13 @@ def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np
     SAME, relative to the matrix's norm, is the distance up to which eigenvalues are one, and singular values zero.
     """
     results: list[tuple[complex, np.ndarray]] = []
-    size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
+    tolerance = SAME * max(float(np.linalg.norm(matrix, 2)), 1e-300)
     for value in np.linalg.eigvals(matrix):
-        if value.imag >= 0 and all(abs(value - other) > SAME * size for other, _ in results):
-            _, singular, right = np.linalg.svd(matrix - value * np.eye(len(matrix)))
-            count = max(int(np.sum(singular <= SAME * size)), 1)
-            results.append((complex(value), right.conj().T[:, -count:]))
+        is_new = all(abs(value - other) > tolerance for other, _ in results)
+        if value.imag >= 0 and is_new:
+            _, singular_values, right = np.linalg.svd(matrix - value * np.eye(len(matrix)))
+            dimension = max(int(np.sum(singular_values <= tolerance)), 1)
+            results.append((complex(value), right.conj().T[:, -dimension:]))
     return results
 
 
@@ -243,8 +247,8 @@ def _find_unobserving_modes(
     # Subspaces by the largest set of modes that misses them: the whole space, and its cuts with what outputs miss.
     subspaces = {frozenset(_list_modes_not_observing(space, outputs)): space}
     for output in outputs:
-        for known in list(subspaces.values()):
-            smaller = _find_unobservable_part(output, known)
+        for subspace in list(subspaces.values()):
+            smaller = _find_unobservable_part(output, subspace)
             if smaller.shape[1] and len(subspaces) < SETS_LIMIT:
                 subspaces.setdefault(frozenset(_list_modes_not_observing(smaller, outputs)), smaller)
     return [(tuple(sorted(modes)), basis) for modes, basis in subspaces.items() if modes]
@@ -260,12 +264,13 @@ def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray
 
     Rows are divided by their lengths, since units must not matter: a part below UNSEEN of a row is not observed.
     """
-    sizes = np.linalg.norm(output, axis=1)
-    rows = output[sizes > 0] / sizes[sizes > 0][:, None]
+    lengths = np.linalg.norm(output, axis=1)
+    is_used = lengths > 0
+    rows = output[is_used] / lengths[is_used][:, None]
     if not len(rows):
         return space
-    _, singular, right = np.linalg.svd(rows @ space)
-    rank = int(np.sum(singular > UNSEEN))
+    _, singular_values, right = np.linalg.svd(rows @ space)
+    rank = int(np.sum(singular_values > UNSEEN))
     return np.asarray(space @ right.conj().T[:, rank:])
 
 
@@ -280,8 +285,8 @@ def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], n
         size = np.linalg.norm(columns, 2) if columns.size else 0.0
         if size == 0:
             break
-        left, singular, _ = np.linalg.svd(np.concatenate([basis, columns / size], axis=1), full_matrices=False)
-        basis = left[:, singular > UNSEEN * max(singular[0], 1e-300)]
+        left, singular_values, _ = np.linalg.svd(np.concatenate([basis, columns / size], axis=1), full_matrices=False)
+        basis = left[:, singular_values > UNSEEN * max(singular_values[0], 1e-300)]
         columns = matrix @ basis
-    rest = vectors - basis @ (basis.T @ vectors)
-    return bool(np.max(np.abs(rest), initial=0.0) <= UNSEEN)
+    outside_subspace = vectors - basis @ (basis.T @ vectors)
+    return bool(np.max(np.abs(outside_subspace), initial=0.0) <= UNSEEN)

@@ -54,15 +54,15 @@ class CarriedRounding(NamedTuple):
         much to the error's covariance; that it changes the gain, too, adds nothing, since the gain minimises. The
         largest share of a claimed variance so far is noted with its step k.
         """
-        keep = np.eye(len(gains.gain)) - gains.gain @ matrices.output
+        I_GC = np.eye(len(gains.gain)) - gains.gain @ matrices.output
         rounding = gains.transition @ self.covariance @ gains.transition.T
-        rounding += (keep * system.rounding[k]) @ keep.T
+        rounding += (I_GC * system.rounding[k]) @ I_GC.T
         rounding += (gains.gain * system.received_rounding[k]) @ gains.gain.T
         # Its share of each claimed variance.
-        error = np.diag(system.projection @ rounding @ system.projection.T)
-        claimed = np.maximum(np.diag(gains.covariance), error)
-        share = np.divide(error, claimed, out=np.zeros_like(error), where=error > 0)
-        worst, when = max((self.worst, self.when), (float(np.max(share, initial=0.0)), k))
+        variance = np.diag(system.projection @ rounding @ system.projection.T)
+        claimed_variance = np.maximum(np.diag(gains.covariance), variance)
+        shares = np.divide(variance, claimed_variance, out=np.zeros_like(variance), where=variance > 0)
+        worst, when = max((self.worst, self.when), (float(np.max(shares, initial=0.0)), k))
         return CarriedRounding(rounding, worst, when)
 
 
@@ -159,17 +159,18 @@ def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) ->
     A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
     and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
     """
-    changes = [np.abs(a - b) for a, b in zip(after, before, strict=True)]
+    changes = [np.abs(new - old) for new, old in zip(after, before, strict=True)]
     if not any(np.any(change) for change in changes):
         return True
-    ratio = spectral_radius(loop) ** (2 * SPAN)
-    if ratio >= 1:
+    r = spectral_radius(loop) ** (2 * SPAN)
+    if r >= 1:
         return False
-    left = max(1.0, ratio / (1 - ratio))
-    units = [np.sqrt(np.abs(np.diag(a))) for a in after]
-    return all(
-        np.all(left * change <= STILL * np.outer(unit, unit)) for change, unit in zip(changes, units, strict=True)
-    )
+    factor_of_changes_to_come = max(1.0, r / (1 - r))
+    for covariance, change in zip(after, changes, strict=True):
+        deviations = np.sqrt(np.abs(np.diag(covariance)))
+        if not np.all(factor_of_changes_to_come * change <= STILL * np.outer(deviations, deviations)):
+            return False
+    return True
 
 
 def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:

@@ -67,7 +67,8 @@ class SteadyMomentTest:
         if before is None or self._tolerance < 0:
             return False
         # Of each moment the size that its variables' squares give it: prod_i (E x_i^2)^(power_i / 2).
-        scale = np.prod(np.sqrt(np.abs(moments[self._squares])) ** self._powers, axis=1)
+        deviations = np.sqrt(np.abs(moments[self._squares]))
+        scale = np.prod(deviations**self._powers, axis=1)
         return bool(np.all(np.abs(moments - before) <= self._tolerance * scale))
 
 
@@ -366,7 +367,8 @@ def make_linear_rows(variables: int, degree: int, expected: int | None = None) -
     column_of_monomial = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(column_of_monomial) - 1))
     for i, row in enumerate(rows):
-        row[column_of_monomial[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
+        powers_of_variable = (*(int(i == j) for j in range(variables)), degree - 1)
+        row[column_of_monomial[powers_of_variable]] = 1.0
     return rows
 
 

@@ -65,14 +65,16 @@ def _make_measurement_maps(
     It is the sensor's map followed by the channel's; but where the outputs of a sum of links have independent noises,
     the sensor is moved into each link (`move_sensor_into_links`), which makes one map of the state itself.
     """
-    apart = list[AbstractRandomAffine]()
+    maps_by_link = list[AbstractRandomAffine]()
     for sensor, channel in zip(sensors, channels, strict=True):
         assert isinstance(sensor, LinearSensor)  # checked before
-        by_link = move_sensor_into_links(sensor.matrix, sensor.noise, channel)
-        apart += [] if by_link is None else [by_link]
-    if len(apart) == len(sensors):
-        return apart
-    return [Series(pair) for pair in zip(_tabulate_affine_maps(sensors, order), channels, strict=True)]
+        map_by_link = move_sensor_into_links(sensor.matrix, sensor.noise, channel)
+        if map_by_link is not None:
+            maps_by_link.append(map_by_link)
+    if len(maps_by_link) == len(sensors):
+        return maps_by_link
+    sensor_maps = _tabulate_affine_maps(sensors, order)
+    return [Series(sensor_and_channel) for sensor_and_channel in zip(sensor_maps, channels, strict=True)]
 
 
 def _tabulate_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:

@@ -102,9 +102,11 @@ def _make_filter_map(g: Gains) -> np.ndarray:
     q (n,) is its estimate, z+ (m,) the measurement; `g` has F (transition), K (gain) and c (offset).
     """
     n, m = g.gain.shape
-    after = np.eye(2 * n + m)
-    after[n : 2 * n, n : 2 * n], after[n : 2 * n, 2 * n :] = g.transition, g.gain
-    return _affine_matrix(after, np.concatenate([np.zeros(n), g.offset, np.zeros(m)]))
+    of_q, of_z = slice(n, 2 * n), slice(2 * n, None)
+    matrix = np.eye(2 * n + m)
+    matrix[of_q, of_q], matrix[of_q, of_z] = g.transition, g.gain
+    offset = np.concatenate([np.zeros(n), g.offset, np.zeros(m)])
+    return _affine_matrix(matrix, offset)
 
 
 class _MomentCache:
@@ -277,11 +279,11 @@ def _largest_third_moment(
     `pair` are the places of the product a b, of a and of b among the N numbers, `linear` those of each c.
     """
     product, a, b = pair
-    deviation = np.sqrt(np.diag(joint))
-    third = joint[product, linear] - mean[a] * joint[b, linear] - mean[b] * joint[a, linear]
-    size = deviation[a] * deviation[b] * deviation[linear]
-    ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)
-    return float(np.max(ratio))
+    deviations = np.sqrt(np.diag(joint))
+    k3 = joint[product, linear] - mean[a] * joint[b, linear] - mean[b] * joint[a, linear]
+    product_of_deviations = deviations[a] * deviations[b] * deviations[linear]
+    ratios = np.divide(np.abs(k3), product_of_deviations, out=np.zeros_like(k3), where=product_of_deviations > 0)
+    return float(np.max(ratios))
 
 
 def _place_products(variables: int) -> dict[tuple[int, ...], int]:

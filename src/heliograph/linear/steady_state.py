@@ -103,14 +103,17 @@ def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lowe
     `gain_at` gives one for a probability, None where none is certified; with probability 1 there is one. `lower` is a
     bound below which there is none: where one is certified just above it, it is the answer.
     """
-    near, gain = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
-    if near is not None:
-        return lower, near
+    gain_just_above_bound, gain = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
+    if gain_just_above_bound is not None:
+        return lower, gain_just_above_bound
     low, high = lower, 1.0
     while high - low > RESOLUTION / 10:
         middle = (low + high) / 2
         candidate = gain_at(middle)
-        low, high, gain = (middle, high, gain) if candidate is None else (low, middle, candidate)
+        if candidate is None:
+            low = middle
+        else:
+            high, gain = middle, candidate
     assert gain is not None
     return high, gain
 
@@ -148,7 +151,9 @@ def _describe_type(model: AnyPlant | AnySensor) -> str:
     """Return the type of a model in words for an error message: by what it varies, else its class."""
     if isinstance(model, OverTime):
         return "one that varies"
-    return f"one that varies with {list(model.inputs)}" if isinstance(model, LinearPlant) else type(model).__name__
+    if isinstance(model, LinearPlant):
+        return f"one that varies with {list(model.inputs)}"
+    return type(model).__name__
 
 
 CLOSE = 1e-8  # relative: what one more step of the Riccati recursion may change

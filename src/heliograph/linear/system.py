@@ -106,9 +106,10 @@ class LinearSystem(Module):
         """The first step from which on all steps are as the last, in matrices and roundings; 0 if none differs."""
         changes = [0]  # of each field, the last step that differs from the one before
         for field in (*self.steps, self.rounding, self.received_rounding):
-            moved = field[1:] != field[:-1]
-            changed = np.flatnonzero(np.any(moved, axis=tuple(range(1, moved.ndim))))
-            changes += (changed[-1:] + 1).tolist()
+            differs = field[1:] != field[:-1]
+            step_differs = np.any(differs, axis=tuple(range(1, differs.ndim)))
+            differing_steps = 1 + np.flatnonzero(step_differs)
+            changes += differing_steps[-1:].tolist()
         return max(changes)
 
 
@@ -140,15 +141,15 @@ def state_moments(system: LinearSystem) -> StateMoments:
         system: a linear system.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    mean, spread = system.mean, system.covariance
-    means, spreads = [mean], [spread]
+    mean, covariance = system.mean, system.covariance
+    means, covariances = [mean], [covariance]
     for k in range(system.horizon):
-        s = system.step(k)
-        mean = s.transition @ mean + s.drift
-        spread = propagate_by_mode(s.transition, spread, s.process)
+        step = system.step(k)
+        mean = step.transition @ mean + step.drift
+        covariance = propagate_by_mode(step.transition, covariance, step.process)
         means.append(mean)
-        spreads.append(spread)
-    return StateMoments(np.array(means), np.array(spreads))
+        covariances.append(covariance)
+    return StateMoments(np.array(means), np.array(covariances))
 
 
 Matrices = TypeAliasType("Matrices", Float[np.ndarray, "*time _ _"])  # one for each step; one step: no axis

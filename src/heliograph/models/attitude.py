@@ -78,12 +78,13 @@ def _read_coordinates(name: str, value: ArrayLike, last: int) -> Any:
     NaN stands for a missing coordinate and is let through. `name`: what the array is called in errors.
     """
     if isinstance(value, jax.Array):
-        read = value
+        coordinates = value
     else:
         try:
-            read = array(name, value, (None,) * np.ndim(value), missing=True)  # None: an axis of any length
+            coordinates = array(name, value, (None,) * np.ndim(value), missing=True)  # None: an axis of any length
         except (TypeError, ValueError):
-            read = array(name, value, (last,), missing=True)  # no array of numbers, which this names
-    if jnp.shape(read)[-1:] != (last,):
-        raise fail(name, f"shape (..., {last})", f"shape {jnp.shape(read)}")
-    return read
+            coordinates = array(name, value, (last,), missing=True)  # no array of numbers, which this names
+    shape = jnp.shape(coordinates)
+    if shape[-1:] != (last,):
+        raise fail(name, f"shape (..., {last})", f"shape {shape}")
+    return coordinates

@@ -110,10 +110,10 @@ class ContinuousSystem(Module):
 
             The terms are h^k A^(k-1) / k! of the integral of exp(A s), and the like of exp(A s) S exp(A s)'.
             """
-            power, spread, integral, noise = parts
-            power, moved = a @ power * (h / k), a @ spread * (h / k)
-            spread = moved + moved.T
-            return power, spread, integral + power, noise + spread
+            integral_term, noise_term, integral, noise = parts
+            integral_term, half = a @ integral_term * (h / k), a @ noise_term * (h / k)
+            noise_term = half + half.T
+            return integral_term, noise_term, integral + integral_term, noise + noise_term
 
         power, spread = h * xp.eye(len(a)), h * xp.asarray(self.intensity)
         parts = power, spread, power, spread
@@ -130,29 +130,29 @@ def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[A
 
     F(2h) = F F, F(2h) - I = 2 (F - I) + (F - I)^2, and Q(2h) = Q + F Q F', written with `growth`, F - I.
     """
-    moved = noise + growth @ noise
+    matrix_times_noise = noise + growth @ noise  # F Q
     return (
         2 * growth + growth @ growth,
         matrix @ matrix,
         2 * integral + growth @ integral,
-        noise + moved + moved @ growth.T,
+        noise + matrix_times_noise + matrix_times_noise @ growth.T,
     )
 
 
 def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
-    """Return the body of a loop that doubles a step in its first `count` turns, and then leaves its parts as they are.
+    """Return the body of a loop that doubles a step in its first `count` turns, and then leaves it as it is.
 
     A compiled loop has a fixed number of turns, while `count` may be traced.
     """
 
-    def double_if_left(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    def double_up_to_count(i: Any, matrices: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return the matrices of twice the step in turn i of the loop, if i is below `count`, else those given."""
         # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
-        doubled = _double_step(*(jnp.where(goes_on, part, 0.0) for part in parts))
-        return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, parts, strict=True))
+        doubled = _double_step(*(jnp.where(goes_on, matrix, 0.0) for matrix in matrices))
+        return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, matrices, strict=True))
 
-    return double_if_left
+    return double_up_to_count
 
 
 def _read_continuous_matrices(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
@@ -256,7 +256,7 @@ def continuous_plant(
 
 def append_time_step(inputs: Names) -> list[str]:
     """Return the names of inputs with "dt" (TIME_STEP) behind them, the length of a step; raise if it is among them."""
-    listed = name_list("input names", inputs)
-    if TIME_STEP in listed:
-        raise fail("input names", f"no {TIME_STEP!r}, which is added as the length of a step", listed)
-    return [*listed, TIME_STEP]
+    names = name_list("input names", inputs)
+    if TIME_STEP in names:
+        raise fail("input names", f"no {TIME_STEP!r}, which is added as the length of a step", names)
+    return [*names, TIME_STEP]

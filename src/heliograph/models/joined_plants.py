@@ -37,11 +37,12 @@ class TransitionSideBySide(Module):
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return the joint state after a step: each plant moves its own part of x by its own inputs of u."""
-        parts, start = [], 0  # start: where the plant's part of x begins
-        for plant, own in zip(self.plants, split_inputs(u, self.places), strict=True):
-            parts.append(plant.transition(x[start : start + len(plant.states)], own))
-            start += len(plant.states)
-        return jnp.concatenate(parts)
+        states_after, begin = [], 0
+        for plant, own_inputs in zip(self.plants, split_inputs(u, self.places), strict=True):
+            end = begin + len(plant.states)
+            states_after.append(plant.transition(x[begin:end], own_inputs))
+            begin = end
+        return jnp.concatenate(states_after)
 
 
 class MatrixSideBySide(TransitionSideBySide):
@@ -50,8 +51,9 @@ class MatrixSideBySide(TransitionSideBySide):
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return A (n, n) of the joint state under the inputs u of all plants: the plants' own along the diagonal."""
         plants: list[Any] = list(self.plants)  # linear ones
-        pairs = zip(plants, split_inputs(u, self.places), strict=True)
-        return jnp.asarray(block_diagonal([jnp.asarray(plant.transition_matrix(own)) for plant, own in pairs]))
+        plants_and_inputs = zip(plants, split_inputs(u, self.places), strict=True)
+        matrices = [jnp.asarray(plant.transition_matrix(own_inputs)) for plant, own_inputs in plants_and_inputs]
+        return jnp.asarray(block_diagonal(matrices))
 
 
 class InputsSideBySide(TransitionSideBySide):
@@ -60,9 +62,9 @@ class InputsSideBySide(TransitionSideBySide):
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return B (n, inputs) under the inputs u: each plant's rows, zero but in the columns of its own inputs."""
         rows, plants = [], list[Any](self.plants)  # linear ones
-        for plant, own, at in zip(plants, split_inputs(u, self.places), self.places, strict=True):
-            matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own))
-            rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(at, int)].set(matrix))
+        for plant, own_inputs, columns in zip(plants, split_inputs(u, self.places), self.places, strict=True):
+            matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own_inputs))
+            rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(columns, int)].set(matrix))
         return jnp.concatenate(rows)
 
 
@@ -141,6 +143,6 @@ def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count:
     if any(isinstance(value, MatrixOfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
         plants = tuple(parts)
         return MatrixSideBySide(plants, places), InputsSideBySide(plants, places)
-    pick = np.eye(count)  # its rows at a plant's places move the columns of B to those places
-    rows = [plant.input_matrix @ pick[list(at)] for plant, at in zip(parts, places, strict=True)]
+    identity = np.eye(count)  # its rows at a plant's places move the columns of B to those places
+    rows = [plant.input_matrix @ identity[list(own)] for plant, own in zip(parts, places, strict=True)]
     return block_diagonal([plant.matrix for plant in parts]), library(*rows).concatenate(rows)

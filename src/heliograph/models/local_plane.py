@@ -143,10 +143,10 @@ class LocalPlane(Module):
         """
         phi, turn, _ = self._subtract_origin(latitude, longitude, self.height)
         matrix = _read_coordinates("covariance of positions", covariance, 3, 3)
-        axes = _make_axes(
-            np.radians(self.latitude) + phi, turn
-        )  # rows east, north, up; columns out, east, along the axis
-        T = _make_axes(np.radians(self.latitude), 0.0) @ np.swapaxes(axes, -1, -2)
+        # Rows east, north, up; columns out of the earth's axis, east, along the axis.
+        axes_at_points = _make_axes(np.radians(self.latitude) + phi, turn)
+        axes_at_origin = _make_axes(np.radians(self.latitude), turn=0.0)
+        T = axes_at_origin @ np.swapaxes(axes_at_points, -1, -2)
         return np.asarray(T @ matrix @ np.swapaxes(T, -1, -2))
 
     def _subtract_origin(
@@ -158,11 +158,11 @@ class LocalPlane(Module):
         try:
             phi, turn, rise = np.broadcast_arrays(*values)
         except ValueError:
-            raise fail("coordinates of points", "the same shape of all", [v.shape for v in values]) from None
-        beyond = np.abs(phi) > 90
-        if np.any(beyond):
+            raise fail("coordinates of points", "the same shape of all", [value.shape for value in values]) from None
+        is_no_latitude = np.abs(phi) > 90
+        if np.any(is_no_latitude):
             expected = "-90 to 90 degrees (radians, longitudes and whole numbers of 1e-7 degrees are none)"
-            raise fail("latitude of points", expected, f"{phi[beyond].flat[0]:g}")
+            raise fail("latitude of points", expected, f"{phi[is_no_latitude].flat[0]:g}")
         return np.radians(phi - self.latitude), np.radians(_wrap_degrees(turn - self.longitude)), rise - self.height
 
     def _from_meridian(self, east: np.ndarray, out: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -203,10 +203,11 @@ class LocalPlane(Module):
 def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
     """Return an array whose last axes have the lengths `last`, with any axes before them; NaN is missing."""
     try:
-        free = max(np.ndim(value) - len(last), 0)
+        leading_axes = max(np.ndim(value) - len(last), 0)
     except ValueError:  # rows of different lengths, which the check names
-        free = 0
-    return np.asarray(array(name, value, (*(None for _ in range(free)), *last), missing=True))
+        leading_axes = 0
+    shape = *[None] * leading_axes, *last  # None: any length
+    return np.asarray(array(name, value, shape, missing=True))
 
 
 def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray, np.ndarray]:
@@ -214,9 +215,10 @@ def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray,
 
     z = (N (1 - e^2) + h) sin lat. Latitude in radians; N is the radius of curvature across the meridian.
     """
-    normal = SEMI_MAJOR / np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
-    above = normal * (1 - SQUARED_ECCENTRICITY) + height
-    return np.asarray((normal + height) * np.cos(latitude)), np.asarray(above * np.sin(latitude))
+    N = SEMI_MAJOR / np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
+    r = (N + height) * np.cos(latitude)
+    z = (N * (1 - SQUARED_ECCENTRICITY) + height) * np.sin(latitude)
+    return np.asarray(r), np.asarray(z)
 
 
 def _subtract_on_meridian(
@@ -245,12 +247,13 @@ def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
 
     beta: the parametric latitude, estimated from the point's direction.
     """
-    ratio = 1 - FLATTENING  # b / a
-    size = np.hypot(r, z)
-    second = SQUARED_ECCENTRICITY / (1 - SQUARED_ECCENTRICITY)  # e'^2
-    beta = np.arctan2(ratio * z * (1 + second * ratio * SEMI_MAJOR / size), r)
-    top = z + second * ratio * SEMI_MAJOR * np.sin(beta) ** 3
-    return np.asarray(np.arctan2(top, r - SQUARED_ECCENTRICITY * SEMI_MAJOR * np.cos(beta) ** 3))
+    axis_ratio = 1 - FLATTENING  # b / a
+    distance = np.hypot(r, z)
+    second_eccentricity = SQUARED_ECCENTRICITY / (1 - SQUARED_ECCENTRICITY)  # e'^2
+    beta = np.arctan2(axis_ratio * z * (1 + second_eccentricity * axis_ratio * SEMI_MAJOR / distance), r)
+    numerator = z + second_eccentricity * axis_ratio * SEMI_MAJOR * np.sin(beta) ** 3
+    denominator = r - SQUARED_ECCENTRICITY * SEMI_MAJOR * np.cos(beta) ** 3
+    return np.asarray(np.arctan2(numerator, denominator))
 
 
 def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
@@ -259,10 +262,12 @@ def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
     Their coordinates are out of the earth's axis in the origin's meridian, east of it, and along the axis. Latitude of
     the points, and `turn`, their longitude less the origin's, in radians.
     """
-    c, s, cl, sl = np.cos(latitude), np.sin(latitude), np.cos(turn), np.sin(turn)
-    c, s, cl, sl = np.broadcast_arrays(c, s, cl, sl)
-    rows = [[-sl, cl, np.zeros_like(c)], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    c, s, c_turn, s_turn = np.cos(latitude), np.sin(latitude), np.cos(turn), np.sin(turn)
+    c, s, c_turn, s_turn = np.broadcast_arrays(c, s, c_turn, s_turn)
+    east = [-s_turn, c_turn, np.zeros_like(c)]
+    north = [-s * c_turn, -s * s_turn, c]
+    up = [c * c_turn, c * s_turn, s]
+    return np.moveaxis(np.array([east, north, up]), (0, 1), (-2, -1))
 
 
 def _wrap_degrees(degrees: np.ndarray) -> np.ndarray:

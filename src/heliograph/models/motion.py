@@ -126,10 +126,11 @@ def gauss_markov(
     Source: Gelb, Applied optimal estimation (1974), 3.8.
     """
     size, rate = _read_deviation_and_rate(deviation, time)  # rate: 1 / T
-    named = name_list("states", states)
-    eye = np.eye(len(named))
+    names = name_list("states", states)
+    identity = np.eye(len(names))
+    matrix, intensity, initial_covariance = -rate * identity, 2 * size**2 * rate * identity, size**2 * identity
     return continuous_plant(
-        -rate * eye, 2 * size**2 * rate * eye, np.zeros(len(named)), size**2 * eye, dt=dt, states=_keep_units(named)
+        matrix, intensity, np.zeros(len(names)), initial_covariance, dt=dt, states=_keep_units(names)
     )
 
 
@@ -174,10 +175,10 @@ def read_two_axes(axes: Names) -> list[str]:
     Raises:
         ValueError: another number of them.
     """
-    named = name_list("axes", axes)
-    if len(named) != 2:
-        raise fail("axes", "two, such as ['x', 'y']", named)
-    return named
+    names = name_list("axes", axes)
+    if len(names) != 2:
+        raise fail("axes", "two, such as ['x', 'y']", names)
+    return names
 
 
 def _read_deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any]:
@@ -196,11 +197,11 @@ def _name_states(axes: Sequence[str], order: int) -> list[str]:
 
     "x", "x_velocity", ...; of the axis "position" the derivatives are called "velocity" and "acceleration" alone.
     """
-    named = []
+    names, derivatives = list[str](), ("velocity", "acceleration")[: order - 1]
     for axis in axes:
         prefix = "" if axis == "position" else f"{axis}_"
-        named += [axis, *(f"{prefix}{derivative}" for derivative in ("velocity", "acceleration")[: order - 1])]
-    return named
+        names += [axis, *(f"{prefix}{derivative}" for derivative in derivatives)]
+    return names
 
 
 def _keep_units(states: Sequence[str]) -> Sequence[str]:

@@ -71,11 +71,11 @@ class Components:
         Raises:
             ValueError: a coverage that is no probability between 0 and 1.
         """
-        inside = float(scalar("coverage", coverage, 0.0, 1.0))
-        if not 0 < inside < 1:
+        p = float(scalar("coverage", coverage, 0.0, 1.0))
+        if not 0 < p < 1:
             raise fail("coverage", "a probability between 0 and 1", coverage)
-        half = ndtri((1 + inside) / 2) * self.deviation  # ndtri: quantile of the standard normal law
-        return self.mean - half, self.mean + half
+        half_width = ndtri((1 + p) / 2) * self.deviation  # ndtri: quantile of the standard normal law
+        return self.mean - half_width, self.mean + half_width
 
     def of(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (steps,) of one combination of states, by its name.
@@ -85,8 +85,8 @@ class Components:
         """
         if name not in self.names:
             raise fail("component", f"one of {list(self.names)}", show_value(name))
-        place = self.names.index(name)
-        return self.mean[..., place], self.deviation[..., place]
+        index = self.names.index(name)
+        return self.mean[..., index], self.deviation[..., index]
 
     def figure(self, time: "Float[ArrayLike, ' steps'] | None" = None, coverage: float = BAND) -> "Figure":
         """Return a figure with a panel for each combination: its mean, and the band that holds it.
@@ -147,7 +147,7 @@ def _read_weights(name: str, value: ArrayLike, mean: np.ndarray) -> np.ndarray:
 
     Given once (n,) they hold for all rows. `name`: of the combination, for errors.
     """
-    given = np.asarray(value)
-    shape = mean.shape if given.ndim > 1 else mean.shape[-1:]
+    is_given_by_row = np.ndim(value) > 1
+    shape = mean.shape if is_given_by_row else mean.shape[-1:]
     weights: np.ndarray = np.broadcast_to(array(f"weights of {name!r}", value, shape), mean.shape)
     return weights

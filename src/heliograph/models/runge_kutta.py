@@ -39,12 +39,12 @@ class RungeKuttaStep(DriftAndStepLength):
 
         def take_substep(_: object, x: jax.Array) -> jax.Array:
             """Return the state x after one shorter step of length h: Runge and Kutta's fourth order, inputs held."""
-            first = as_real(self.drift(x, inputs))
-            second = as_real(self.drift(x + h / 2 * first, inputs))
-            third = as_real(self.drift(x + h / 2 * second, inputs))
-            fourth = as_real(self.drift(x + h * third, inputs))
-            moved: jax.Array = x + h / 6 * (first + 2 * second + 2 * third + fourth)
-            return moved
+            k1 = as_real(self.drift(x, inputs))
+            k2 = as_real(self.drift(x + h / 2 * k1, inputs))
+            k3 = as_real(self.drift(x + h / 2 * k2, inputs))
+            k4 = as_real(self.drift(x + h * k3, inputs))
+            x_after: jax.Array = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            return x_after
 
         moved: jax.Array = (
             take_substep(0, x) if self.substeps == 1 else jax.lax.fori_loop(0, self.substeps, take_substep, x)
@@ -63,8 +63,8 @@ class LinearizedNoise(DriftAndStepLength):
 
         The inputs u are those of the drift and, where no number is given, the step's length.
         """
-        own, dt = self.split(u)
-        jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, own)))(jnp.asarray(self.state))
+        inputs_of_drift, dt = self.split(u)
+        jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, inputs_of_drift)))(jnp.asarray(self.state))
         linearized = ContinuousSystem(jacobian, np.zeros((len(self.state), 0)), self.intensity)
         return jnp.asarray(linearized.discretize_over(dt).noise)
 

@@ -42,7 +42,8 @@ class SumOfComponents(Module):
         """
         xp = library(u) if not isinstance(u, jax.Array) else jnp
         one = xp.ones(u.shape[:-1])
-        return xp.stack([one if at is None else u[..., at] for at in self.places], axis=-1) * self.weights
+        factors = [one if place is None else u[..., place] for place in self.places]
+        return xp.stack(factors, axis=-1) * self.weights
 
 
 @readable

@@ -69,13 +69,11 @@ def level(
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 2.1.
     """
-    q, mean, start = (
-        scalar("variance of the level", variance, 0.0),
-        scalar("initial mean", initial_mean),
-        _read_initial_variance(initial_variance),
-    )
-    xp = library(mean)
-    return Component(name, LinearPlant([[1.0]], q, xp.reshape(mean, (1,)), start, states=[name]), [1.0])
+    q = scalar("variance of the level", variance, 0.0)
+    mean = scalar("initial mean", initial_mean)
+    start = _read_initial_variance(initial_variance)
+    plant = LinearPlant([[1.0]], q, library(mean).reshape(mean, (1,)), start, states=[name])
+    return Component(name, plant, loading=[1.0])
 
 
 def trend(
@@ -214,10 +212,11 @@ def cycle(
     """
     length, q = scalar("period", period, 2.0), scalar("variance of the cycle", variance, 0.0)
     factor = scalar("damping", damping, 0.0, STATIONARY)
-    named = text("name of a component", name)
+    name = text("name of a component", name)
     matrix = factor * _make_rotation(2 * np.pi / length)
-    start = q / (1 - factor**2)
-    return Component(named, LinearPlant(matrix, q, np.zeros(2), start, states=[named, f"{named}_shifted"]), [1.0, 0.0])
+    stationary_variance = q / (1 - factor**2)
+    plant = LinearPlant(matrix, q, np.zeros(2), stationary_variance, states=[name, f"{name}_shifted"])
+    return Component(name, plant, loading=[1.0, 0.0])
 
 
 def arma(
@@ -307,10 +306,10 @@ def stationary(x: "Float[ArrayLike, ' p']") -> Any:
     numbers = array("x", x, (None,))
     xp = library(numbers)
     partial = numbers / xp.sqrt(1 + numbers**2)
-    found = partial[:0]  # coefficients of the order 0: none
+    coefficients = partial[:0]  # of the order 0: none
     for k in range(len(partial)):
-        found = xp.concatenate([found - partial[k] * found[::-1], partial[k : k + 1]])
-    return found
+        coefficients = xp.concatenate([coefficients - partial[k] * coefficients[::-1], partial[k : k + 1]])
+    return coefficients
 
 
 def stationary_covariance(matrix: Any, noise: Any) -> Any:
@@ -319,9 +318,10 @@ def stationary_covariance(matrix: Any, noise: Any) -> Any:
     (I - F kron F) vec P = vec Q.
     """
     xp, n = library(matrix, noise), len(matrix)
-    pairs = np.eye(n * n) - xp.kron(matrix, matrix)
-    found = xp.reshape(xp.linalg.solve(pairs, xp.reshape(noise, (n * n,))), (n, n))
-    return (found + found.T) / 2
+    equations = np.eye(n * n) - xp.kron(matrix, matrix)
+    vec_P = xp.linalg.solve(equations, xp.reshape(noise, (n * n,)))
+    P = xp.reshape(vec_P, (n, n))
+    return (P + P.T) / 2
 
 
 def _read_initial_variance(variance: "ArrayLike | DiffuseStart") -> Any:

@@ -56,9 +56,9 @@ class TurnNoise(StepLength):
         `intensity` and `turn_intensity`: the variance that a velocity and the rate gain in a unit of time.
         """
         dt = jnp.asarray(self.length(u))
-        axis = self.intensity * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        rate = jnp.reshape(self.turn_intensity * dt, (1, 1))
-        return jnp.asarray(jax.scipy.linalg.block_diag(axis, axis, rate))
+        of_axis = self.intensity * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        of_turn_rate = jnp.reshape(self.turn_intensity * dt, (1, 1))
+        return jnp.asarray(jax.scipy.linalg.block_diag(of_axis, of_axis, of_turn_rate))
 
 
 class ArcMotion(StepLength):
@@ -76,11 +76,11 @@ class ArcMotion(StepLength):
         """
         dt, speed = self.length(u), u[0]
         rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
-        half = rate * dt / 2
-        chord = speed * dt * sine_ratio(half)
-        direction = x[2] + half
-        moved = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction), rate * dt])
-        return jnp.asarray(x + moved)
+        half_turn = rate * dt / 2
+        chord = speed * dt * sine_ratio(half_turn)
+        direction = x[2] + half_turn
+        change = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction), rate * dt])
+        return jnp.asarray(x + change)
 
 
 class NoiseTimesStep(StepLength):
@@ -95,9 +95,9 @@ class NoiseTimesStep(StepLength):
 
 def sine_ratio(angle: jax.Array) -> jax.Array:
     """Return sin(a) / a, 1 at 0; below NEAR, a small angle in radians, by its series."""
-    small = jnp.abs(angle) < NEAR
-    safe = jnp.where(small, 1.0, angle)  # so that the quotient that is not taken has derivatives, too
-    return jnp.where(small, 1 - angle**2 / 6, jnp.sin(safe) / safe)
+    is_small = jnp.abs(angle) < NEAR
+    safe_angle = jnp.where(is_small, 1.0, angle)  # so that the quotient that is not taken has derivatives, too
+    return jnp.where(is_small, 1 - angle**2 / 6, jnp.sin(safe_angle) / safe_angle)
 
 
 def cosine_ratio(angle: jax.Array) -> jax.Array:

@@ -84,8 +84,8 @@ class _DenseInverseHessian:
             return
         if is_first:  # in place of the guess, I at the curvature that this step has shown
             self.matrix = np.eye(len(s)) * curvature / float(y @ y)
-        left = np.eye(len(s)) - np.outer(s, y) / curvature
-        self.matrix = left @ self.matrix @ left.T + np.outer(s, s) / curvature
+        factor = np.eye(len(s)) - np.outer(s, y) / curvature  # I - s y'/s'y
+        self.matrix = factor @ self.matrix @ factor.T + np.outer(s, s) / curvature
 
 
 class _LimitedInverseHessian:
@@ -103,8 +103,9 @@ class _LimitedInverseHessian:
         """
         v, weights = vector, []
         for s, y in reversed(self.updates):
-            weights.append(float(s @ v / (s @ y)))
-            v = v - weights[-1] * y
+            weight = float(s @ v / (s @ y))
+            weights.append(weight)
+            v = v - weight * y
         if self.updates:
             s, y = self.updates[-1]
             v = v * float(s @ y / (y @ y))

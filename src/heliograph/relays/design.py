@@ -214,8 +214,9 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
     # Equal to the rounding of both; of a periodic design, first and last are equal as far as its iteration went.
     expected, start = initial_error_covariance(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
-        periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)
-        got = "a periodic one (use given_design with its gains repeated)" if periodic else "one from another start"
+        ends_as_it_begins = np.allclose(start, design.moments[-1], rtol=1e-6)
+        is_periodic = len(design.moments) == len(network.slots) + 1 and ends_as_it_begins
+        got = "a periodic one (use given_design with its gains repeated)" if is_periodic else "one from another start"
         raise fail("design", "one from the network's start on", got)
 
 
@@ -390,8 +391,9 @@ def _list_receiver_views(
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:
         """Return the moments of x and all filters' errors after a step, and the system that the receiver sees at it."""
         step, gain = row
-        # Predicted, then corrected by the gains, without those on numbers that no link brings in this slot.
-        after = correct_moments(step_moments(step, moments)[0], gain * step.receives_in_slot)
-        return after, make_receiver_view(step, moments, gain)
+        uncorrected, _ = step_moments(step, moments)
+        # Corrected by the gains, without those on numbers that no link brings in this slot.
+        corrected = correct_moments(uncorrected, gain * step.receives_in_slot)
+        return corrected, make_receiver_view(step, moments, gain)
 
     return jax.lax.scan(move, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

@@ -91,9 +91,9 @@ def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
     for r in range(len(steps.received) - 1):  # the last filter is the receiver, which sends nothing
-        s = np.zeros((n, d))
-        s[:, :n], s[:, (1 + r) * n : (2 + r) * n] = np.eye(n), -np.eye(n)  # s_r = x - e_r
-        sent = steps.sensing @ s
+        estimate = np.zeros((n, d))  # s_r = x - e_r, as a matrix that acts on (x, e_1 .. e_F)
+        estimate[:, :n], estimate[:, (1 + r) * n : (2 + r) * n] = np.eye(n), -np.eye(n)
+        sent = steps.sensing @ estimate
         forms += np.swapaxes(sent, 1, 2) @ sent * steps.transmits_in_slot[:, 1 + r, None, None]
     return forms
 
@@ -202,9 +202,9 @@ def _compute_cost_with_barrier(
         `gains`, `units` (of x), `barrier` (a weight) and `problem` stay. Infinite where a limit is passed.
         """
         cost, slack = _compute_cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
-        inside = jnp.all(slack > 0)  # outside, the logarithm is of 1, so that no gradient becomes NaN
-        logarithms = jnp.log(jnp.where(inside, slack, 1.0))
-        return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
+        meets_limits = jnp.all(slack > 0)  # where not, the logarithm is of 1, so that no gradient becomes NaN
+        logarithms = jnp.log(jnp.where(meets_limits, slack, 1.0))
+        return jnp.where(meets_limits, cost - barrier * jnp.sum(logarithms), jnp.inf)
 
     value_and_slope: tuple[jax.Array, jax.Array] = jax.value_and_grad(value)(x)
     return value_and_slope
@@ -252,7 +252,6 @@ def _choose_step_units(
         # 1 for a gain on what is transmitted, else 0: such a gain stays.
         _gain_rows, received = np.nonzero(gain_mask(step))
         is_free = jnp.asarray(step.receives_in_slot)[received]
-        # With the Hessian L L' the columns of L'^-1 are changes of the gains that all curve the cost alike.
         # Units are the columns of L'^-1, with L L' the Hessian: along each the cost curves alike.
         unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, jnp.diag(is_free))
         return moment_adjoint(step, gain, lam), is_free[:, None] * unit
@@ -359,11 +358,11 @@ def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         """Return the moments after a step with its best gain; and this gain and these moments."""
-        step, gain, ahead_k = row  # ahead_k: gradient of the cost by the moments after the step
-        z, _ = step_moments(step, moments)  # those before its correction
-        gain = minimise_cost_ahead(z, ahead_k, gain, step)
-        after = correct_moments(z, gain)
-        return after, (gain, after)
+        step, old_gain, gradient = row  # the gradient of the cost by the moments after the step
+        uncorrected, _ = step_moments(step, moments)
+        gain = minimise_cost_ahead(uncorrected, gradient, old_gain, step)
+        corrected = correct_moments(uncorrected, gain)
+        return corrected, (gain, corrected)
 
     return jax.lax.scan(improve_step, jnp.asarray(start), (steps, gains, ahead))[1]
 
@@ -388,11 +387,12 @@ def _alternate_sweeps(
 
     def sweep(search: SweepState, _: jax.Array) -> tuple[SweepState, None]:
         """Sweep backward and forward once; keep the best gains so far with their cost, sum_k <cost_k, moments_k>."""
-        gains, moments = _sweep_forward(steps, start, search.gains, _sweep_backward(steps, start, cost, search.gains))
-        value = jnp.sum(cost * moments)
-        better = value < search.cost
-        best = jnp.where(better, gains, search.best)
-        return SweepState(gains, best, jnp.where(better, value, search.cost)), None
+        gradients = _sweep_backward(steps, start, cost, search.gains)
+        gains, moments = _sweep_forward(steps, start, search.gains, gradients)
+        new_cost = jnp.sum(cost * moments)
+        is_better = new_cost < search.cost
+        best = jnp.where(is_better, gains, search.best)
+        return SweepState(gains, best, jnp.where(is_better, new_cost, search.cost)), None
 
     first = jnp.asarray(local_gains)
     value = jnp.sum(cost * propagate_error_moments(steps, start, first).moments[1:])

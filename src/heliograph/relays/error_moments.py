@@ -68,9 +68,9 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
     y = C x+ + v is measured after the step, s_r are the relays' estimates before it. Each is unbiased, so the mean is
     that of C x whatever the gains are.
     """
-    y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
-    relayed = step.sensing @ step.state_mean
-    return jnp.concatenate([y, *[relayed] * (len(step.received) - 1), jnp.ones(1)])
+    mean_of_y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
+    mean_of_each_relay, relays = step.sensing @ step.state_mean, len(step.received) - 1
+    return jnp.concatenate([mean_of_y, *[mean_of_each_relay] * relays, jnp.ones(1)])
 
 
 def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], SentMoments]:
@@ -100,8 +100,9 @@ def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float
     """
     rows, received = gain.shape
     d = z.shape[0] - received
-    full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, received)), -gain])], axis=1)
-    return symmetrize(propagate_by_mode(full, z, 0.0))
+    identity, zeros_for_x = jnp.eye(d), jnp.zeros((d - rows, received))
+    correction = jnp.concatenate([identity, jnp.concatenate([zeros_for_x, -gain])], axis=1)  # [I, -(0; K)]
+    return symmetrize(propagate_by_mode(correction, z, 0.0))
 
 
 def gain_mask(step: RelaySteps) -> Bool[np.ndarray, "Fn R"]:
@@ -207,12 +208,12 @@ def gain_hessian(
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
-    free = jnp.asarray(step.receives_in_slot)[columns]
-    normal = jnp.asarray(ahead)[n:, n:][np.ix_(rows, rows)] * predicted[d:, d:][np.ix_(columns, columns)]
-    normal = normal * free[:, None] * free
-    trace = jnp.trace(normal)
+    is_free = jnp.asarray(step.receives_in_slot)[columns]
+    hessian = jnp.asarray(ahead)[n:, n:][np.ix_(rows, rows)] * predicted[d:, d:][np.ix_(columns, columns)]
+    hessian = hessian * is_free[:, None] * is_free
+    trace = jnp.trace(hessian)
     added = jnp.where(trace > 0, damping * trace / len(rows), 1.0)  # 1 where nothing hangs on any gain
-    return normal + jnp.diag(jnp.where(free > 0, added, 1.0)), added
+    return hessian + jnp.diag(jnp.where(is_free > 0, added, 1.0)), added
 
 
 def minimise_cost_ahead(
@@ -226,10 +227,10 @@ def minimise_cost_ahead(
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
-    normal, damping = gain_hessian(predicted, ahead, step, DAMPING)
+    hessian, damping = gain_hessian(predicted, ahead, step, DAMPING)
     cross = ahead[n:] @ predicted[:d, d:]
-    right = (cross[rows, columns] + damping * old[rows, columns]) * step.receives_in_slot[columns]
-    return jnp.zeros_like(old).at[rows, columns].set(jnp.linalg.solve(normal, right))
+    right_side = (cross[rows, columns] + damping * old[rows, columns]) * step.receives_in_slot[columns]
+    return jnp.zeros_like(old).at[rows, columns].set(jnp.linalg.solve(hessian, right_side))
 
 
 def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:

@@ -240,10 +240,11 @@ def _repeat_until_steady(
 
     def repeat(carry: RepeatedPeriods) -> RepeatedPeriods:
         """Return the value after one more `period`, its change (relative to its largest entry), and their count."""
-        value, _, count = carry
-        after = period(value)
-        size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
-        return after, jnp.max(jnp.abs(after - value)) / size, count + 1
+        value, _change_before, count = carry
+        value_after = period(value)
+        size = jnp.maximum(jnp.max(jnp.abs(value_after)), np.finfo(float).tiny)
+        change = jnp.max(jnp.abs(value_after - value)) / size
+        return value_after, change, count + 1
 
     def changes(carry: RepeatedPeriods) -> jax.Array:
         """Return whether the last change is above the tolerance, and periods are left."""
@@ -301,9 +302,9 @@ def periodic_relays_for_best_receiver(
     gains = relay_gains(network, periodic_local_error_design(network).gains if start is None else start)
     # The receiver, whose received numbers are the last, is the best one whatever the relays do: its gains are not free.
     received = gains.shape[-1]
-    free = np.arange(received) < received - network.received[-1]
-    tuned = split_gains(network, _tune_gains(network, gains, free, _best_receiver_cost, power_limit))
-    return {name: gain for name, gain in tuned.items() if name != RECEIVER}
+    is_free = np.arange(received) < received - network.received[-1]
+    tuned = _tune_gains(network, gains, is_free, _best_receiver_cost, power_limit)
+    return {name: gain for name, gain in split_gains(network, tuned).items() if name != RECEIVER}
 
 
 def _tune_gains(
@@ -342,9 +343,9 @@ def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[ja
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     covariance = steady_receiver_covariance(steps, gains)
     # The receiver's own part of the moments is left out: its gains among `gains` are not used.
-    sound = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
+    are_sound = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
-    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), sound, relay_powers
+    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), are_sound, relay_powers
 
 
 _receiver_cost = make_penalised_cost(_trace_receiver_errors)

@@ -103,13 +103,11 @@ def _find_largest_entries(
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
     # Of a filter whose gains are small or zero in a slot, a thousandth of the largest of all.
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
-    return join_gains(
-        network,
-        {
-            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), size))
-            for (name, value), size in zip(largest.items(), network.received, strict=True)
-        },
-    )
+    units = {}
+    for (name, value), received in zip(largest.items(), network.received, strict=True):
+        shape = len(gains), len(network.states), received
+        units[name] = np.broadcast_to(np.maximum(value, floor)[:, None, None], shape)
+    return join_gains(network, units)
 
 
 def _penalise_power(
@@ -125,10 +123,10 @@ def _penalise_power(
     multiplier in an augmented Lagrangian. Infinite where the moments are not `sound`, so that a search turns back.
     """
     total = jnp.sum(traces)
-    sound = sound & (total > 0)
-    pressure = jnp.maximum(0.0, multipliers + STIFFNESS * (power / limit - 1))
-    penalty = jnp.sum(pressure**2) / (2 * STIFFNESS)
-    return jnp.where(sound, jnp.log(jnp.where(sound, total, 1.0)) + penalty, jnp.inf)
+    has_cost = sound & (total > 0)
+    excess = jnp.maximum(0.0, multipliers + STIFFNESS * (power / limit - 1))
+    penalty = jnp.sum(excess**2) / (2 * STIFFNESS)
+    return jnp.where(has_cost, jnp.log(jnp.where(has_cost, total, 1.0)) + penalty, jnp.inf)
 
 
 def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:

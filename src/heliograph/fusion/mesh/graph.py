@@ -57,11 +57,11 @@ class Graph(NamedTuple):
         widths = {counts.max()}
         if len(counts) > FEW:
             widths = {int(width) for width in np.quantile(counts, PARTS, method="higher")}
-        parts, least = [], 0
+        parts, width_before = [], 0
         for width in sorted(widths):
-            rows = np.flatnonzero((counts > least) & (counts <= width))
+            rows = np.flatnonzero((counts > width_before) & (counts <= width))
             parts.append(Graph(self.nodes, self.senders[rows, :width], self.present[rows, :width]))
-            least = width
+            width_before = width
         return parts
 
 
@@ -74,12 +74,14 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
     Raises:
         ValueError: neither of them, names that are no texts, a node as its own neighbour, or one twice.
     """
-    listed = _list_senders(value) if isinstance(value, GraphLike) else value
-    given = table("neighbours", listed, "names of those whom a node receives (or a networkx graph of names)")
-    results = {name: _check_senders(name, senders) for name, senders in given.items()}
+    senders_by_node = _list_senders(value) if isinstance(value, GraphLike) else value
+    expected = "names of those whom a node receives (or a networkx graph of names)"
+    unchecked = table("neighbours", senders_by_node, expected)
+    results = {name: _check_senders(name, senders) for name, senders in unchecked.items()}
     # A sender without an entry of its own receives nobody.
-    for sender in {sender: None for senders in results.values() for sender in senders}:
-        results.setdefault(sender, ())
+    for senders in list(results.values()):
+        for sender in senders:
+            results.setdefault(sender, ())
     if not results:
         raise fail("neighbours", "at least one node", "none")
     return results
@@ -93,10 +95,10 @@ def _list_senders(graph: GraphLike) -> dict[Any, list[Any]]:
     pairs = [tuple(pair[:2]) for pair in graph.edges()]
     if not graph.is_directed():
         pairs += [pair[::-1] for pair in pairs]
-    listed: dict[Any, list[Any]] = {name: [] for name in graph.nodes()}
+    senders: dict[Any, list[Any]] = {name: [] for name in graph.nodes()}
     for sender, receiver in pairs:
-        listed[receiver].append(sender)
-    return listed
+        senders[receiver].append(sender)
+    return senders
 
 
 def _check_senders(name: str, value: object) -> tuple[str, ...]:
@@ -161,9 +163,10 @@ def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> G
     """
     index = {name: i for i, name in enumerate(nodes)}
     rows = [[i, *(index[sender] for sender in neighbours[name])] for i, name in enumerate(nodes)]
+    lengths = np.array([len(row) for row in rows])
     degree = max(map(len, rows))
-    senders = np.array([row + row[:1] * (degree - len(row)) for row in rows])
-    present = np.arange(degree) < np.array([len(row) for row in rows])[:, None]
+    senders = np.array([row + [row[0]] * (degree - len(row)) for row in rows])
+    present = np.arange(degree) < lengths[:, None]
     return Graph(tuple(nodes), senders, present)
 
 

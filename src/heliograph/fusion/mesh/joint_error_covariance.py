@@ -56,12 +56,12 @@ def scatter_blocks(
     if is_traced(blocks):
         # Padding adds zeros at the node itself.
         masked = jnp.where(present[:, :, None, None], blocks, 0.0)
-        places = jnp.zeros((nodes, nodes, n, n)).at[np.arange(nodes)[:, None], senders]
-        return places.add(masked).swapaxes(1, 2).reshape(nodes * n, nodes * n)
-    ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
-    return scipy.sparse.bsr_array(
-        (np.asarray(blocks)[present], senders[present], ends), shape=(nodes * n,) * 2, blocksize=(n, n)
-    )
+        zeros = jnp.zeros((nodes, nodes, n, n))
+        by_node_and_sender = zeros.at[np.arange(nodes)[:, None], senders].add(masked)
+        return by_node_and_sender.swapaxes(1, 2).reshape(nodes * n, nodes * n)
+    row_ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])  # as the format of block sparse rows has them
+    blocks_columns_and_ends = np.asarray(blocks)[present], senders[present], row_ends
+    return scipy.sparse.bsr_array(blocks_columns_and_ends, shape=(nodes * n, nodes * n), blocksize=(n, n))
 
 
 def propagate_joint_covariance(

@@ -56,9 +56,11 @@ class TraceIntersection(AbstractIntersection):
 
         Shares are larger for smaller traces, to a `power`, and then improved so many times. All estimates are there.
         """
-        traces, all_there = jnp.trace(covariances, axis1=1, axis2=2), jnp.ones(len(covariances), dtype=bool)
-        believed = NeighbourEstimates(covariances[0], traces, information, None, all_there)
-        return choose_shares_by_trace(believed, self.power, self.improvements)[0]
+        traces = jnp.trace(covariances, axis1=1, axis2=2)
+        all_are_there = jnp.ones(len(covariances), dtype=bool)
+        estimates = NeighbourEstimates(covariances[0], traces, information, joint=None, present=all_are_there)
+        shares, *_ = choose_shares_by_trace(estimates, self.power, self.improvements)
+        return shares
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Find the weights by which a node intersects what arrived from its neighbours."""
@@ -223,8 +225,8 @@ def _check_shares(name: str, row: object) -> dict[str, float]:
     They are not negative, and their sum is at most 1; it is 1 where the node's own share is among them.
     """
     what = f"diffusion shares of {name!r}"
-    given = table(what, row, "shares by neighbour")
-    shares = {sender: float(scalar(what, share, 0.0)) for sender, share in given.items()}
+    unchecked = table(what, row, "shares by neighbour")
+    shares = {sender: float(scalar(what, share, 0.0)) for sender, share in unchecked.items()}
     total = sum(shares.values())
     if total > 1 + SUM or (name in shares and total < 1 - SUM):  # SUM: rounding
         raise fail(what, "shares that sum to 1", f"{total:g}")

@@ -99,8 +99,9 @@ def correct_by_information(
     n, factors = len(predicted), eliminate(information)
     rows = jnp.diag(square_root(factors.weights)) @ factors.matrix.T  # diag(d)^1/2 L', of unit noise
     x = from_covariance(np.zeros(n), predicted)
-    after, _ = condition_on_observation(x, rows @ x.root, jnp.zeros(n), WeightedColumns(np.eye(n), jnp.ones(n)))
-    return after.covariance, np.eye(n) - after.covariance @ information
+    unit_noise = WeightedColumns(np.eye(n), jnp.ones(n))
+    corrected, _ = condition_on_observation(x, rows @ x.root, jnp.zeros(n), unit_noise)
+    return corrected.covariance, np.eye(n) - corrected.covariance @ information
 
 
 def information_of(
