@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
-from scipy.special import ndtr
 
 from heliograph.filters.event.factory import event_filter
 from heliograph.model.channel import Channel
@@ -16,19 +14,15 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.numerics.module import readable
+from heliograph.planning.send_on_delta_grid import ScalarSystem, compute_rate_on_grid
 from heliograph.random_affine.noise import Gaussian
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo
 
 NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
-POINTS = 200  # of half a grid: a step of its law is 64 million products
-PRODUCTS = 2e10  # of all iterations for a law of cells: seconds
-PRODUCTS_OF_ITERATION = 20  # times the cube of the number of cells: of one iteration for their law
 RAREST = 1e-6  # rate of messages that a grid holds
 LONGEST = 100  # deviations of a step from 0, beyond which there are too many nodes
-HELD = 5.5  # deviations of what is measured over which the grid reaches on either side
-MOST_CELLS = 1e9  # that are counted: more are refused anyway
 GRID_ACCURACY = 1e-3  # relative, of a rate by a grid
 REACH = 12.0  # deviations at which a density ends
 
@@ -48,35 +42,6 @@ class MessageRate(NamedTuple):
     error: np.ndarray
     rate_error: float
     error_error: np.ndarray
-
-
-class _CellGrid(NamedTuple):
-    """Grid of cells: how many lie on either side of 0, how many reach from a cell to delta, and their length."""
-
-    each_side: int
-    of_delta: int
-    length: float
-
-
-class _ScalarSystem(NamedTuple):
-    """Linear plant and sensor of one number each: x+ = a x + N(0, q), y = c x + N(0, r)."""
-
-    a: float
-    q: float
-    c: float
-    r: float
-
-    @property
-    def kalman_variance(self) -> float:
-        """Error variance of the sender's Kalman filter in the long run.
-
-        Of x+ = a x + w with Var w = q, and z / c = x + v with Var v = r. The variance before a measurement is
-        the positive root of prior^2 + b prior - q r = 0.
-        """
-        a, q, r = self.a, self.q, self.r / self.c**2
-        b = r * (1 - a * a) - q
-        prior = (-b + np.sqrt(b * b + 4 * q * r)) / 2
-        return float(prior * r / (prior + r))
 
 
 def simulate_rate(
@@ -226,7 +191,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
     return rate
 
 
-def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
+def _send_on_delta_rate(system: ScalarSystem, delta: float) -> float:
     """Return the rate of messages of send-on-delta, however small, extrapolated from two grids.
 
     `system`: x+ = a x + w and z = c x + v, with the variances q of w and r of v.
@@ -235,114 +200,12 @@ def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {system.a:g}")
     # In units of the state: c is 1.
     delta, system = delta / abs(system.c), system._replace(c=1.0, r=system.r / system.c**2)
-    coarse_rate, coarse_cell = _compute_rate_on_grid(system, delta, share=0.8)
-    fine_rate, fine_cell = _compute_rate_on_grid(system, delta, share=0.5)
+    coarse_rate, coarse_cell = compute_rate_on_grid(system, delta, share=0.8)
+    fine_rate, fine_cell = compute_rate_on_grid(system, delta, share=0.5)
     if fine_rate == coarse_rate:  # where nothing is ever sent both grids are one, and say 0
         return fine_rate
     # The rectangle rule next to the cut at delta is wrong by a multiple of the cell's size squared: that is taken off.
     return float(fine_rate + (fine_rate - coarse_rate) * fine_cell**2 / (coarse_cell**2 - fine_cell**2))
-
-
-def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _CellGrid:
-    """Return the grid of cells for a state and a value sent last.
-
-    Cells are at most `share` of the deviation of either noise, in units of the state.
-
-    Raises:
-        ValueError: more cells than can be computed.
-    """
-    a, q, r = system.a, system.q, system.r
-    # delta is the edge of a cell, so h = delta / (cells + 1/2).
-    cells_of_delta = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), MOST_CELLS) - 0.5))
-    h = delta / (cells_of_delta + 0.5)
-    # As many as reach over HELD deviations of what is measured.
-    measured = np.sqrt(q / (1 - a * a) + r)
-    cells_each_side = int(np.ceil(min(HELD * measured / h, MOST_CELLS)))
-    if cells_each_side > POINTS:
-        raise fail(
-            "plant, sensor and delta",
-            f"a measurement whose deviation is at most {POINTS / HELD:.3g} cells of the grid (of at most {share:g} of "
-            "the deviation of either noise, and of 2 delta)",
-            f"{measured / h:.3g} cells of {h:.3g}",
-        )
-    return _CellGrid(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
-
-
-def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> tuple[float, float]:
-    """Return the share of steps with a message of send-on-delta, by a grid of cells, and the cells' length.
-
-    x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta. So
-    (x, last sent) is a Markov chain. Its law is held as f[i, j] = P(x in cell i, last sent in cell j), on cells no
-    longer than `share` of the lesser noise's deviation. It is the same of (-x, -last sent), so that the rows of x >= 0
-    are all.
-    """
-    a, q, r = system.a, system.q, system.r
-    cells = _choose_cells(system, delta, share)
-    # Probabilities of a cell given the middle of another: T[new, old] of x after a step, noise[x, z] of z given x.
-    x = np.arange(-cells.each_side, cells.each_side + 1) * cells.length
-    size, upper = len(x), x[cells.each_side :]  # of x >= 0
-    T = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T[cells.each_side :]
-    noise = _compute_cell_probabilities(x, upper, np.sqrt(r))
-    # silence[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
-    silence = ndtr((x + delta - upper[:, None]) / np.sqrt(r)) - ndtr((x - delta - upper[:, None]) / np.sqrt(r))
-
-    def move_law(half: np.ndarray) -> np.ndarray:
-        """Return the rows of x >= 0 after x moves, from those before."""
-        below = half[:0:-1, ::-1]  # of x < 0: the same with both signs turned
-        return np.asarray(T @ np.concatenate([below, half]))
-
-    def step_law(vector: np.ndarray) -> np.ndarray:
-        """Return the rows of x >= 0 after a step, from those before it, in one vector: x moves by T, then is sent or not.
-
-        Without a message (probability `silence`) the value sent last stays; with one it is what was measured, x + v,
-        whose probabilities given x are `noise`.
-        """
-        f = move_law(vector.reshape(-1, size))
-        return np.asarray(f * silence + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
-
-    # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
-    # law of the state and a value that was just sent.
-    deviation = np.sqrt(q / (1 - a * a))
-    start = _compute_cell_probabilities(x, np.zeros(1), deviation).T[cells.each_side :] * noise
-    operator = LinearOperator((start.size, start.size), matvec=step_law, dtype=np.float64)
-    most_iterations = int(PRODUCTS / size**3 / PRODUCTS_OF_ITERATION) + 2
-    try:
-        _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=most_iterations, tol=1e-9)
-    except ArpackError as why:
-        raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
-    f = np.real(vectors[:, 0] / vectors.sum()).reshape(-1, size)
-    sent = _compute_law_after_message(move_law(f), noise, cells.of_delta)
-    times = np.where(upper > 0, 2.0, 1.0)  # of each row, which is one of two but for that of x = 0
-    return float(times @ sent.sum(axis=1) / (times @ f.sum(axis=1))), cells.length
-
-
-def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
-    """Return the part of the law f that sends a message, after it: last sent is what is measured now.
-
-    Args:
-        f: [i, j] = P(x in cell i, last sent in cell j), before the message.
-        noise: [i, z] = P(measured in cell z | x in cell i).
-        cells_of_delta: number of cells on either side of a measured one that are no further than delta from it.
-    """
-    # So many cells have values more than delta above them; as many, at the other end, have such values below.
-    size = f.shape[1]
-    count = max(size - cells_of_delta - 1, 0)
-    mass_up_to = np.cumsum(f, axis=1)  # [i, j] = P(x in cell i, last sent in cell j or below)
-    # [i, z] = P(x in cell i, last sent more than delta from cell z): above it, then below.
-    mass_beyond_delta = np.zeros_like(f)
-    mass_above = mass_up_to[:, -1:] - mass_up_to[:, size - count - 1 : -1]
-    mass_beyond_delta[:, :count] = mass_above
-    mass_beyond_delta[:, size - count :] += mass_up_to[:, :count]
-    return np.asarray(mass_beyond_delta * noise)
-
-
-def _compute_cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
-    """Return the probabilities [i, j] that a Gaussian of mean i falls into the cell around x[j].
-
-    Cells end halfway between neighbours; the outermost reach to infinity.
-    """
-    edges = np.concatenate([[-np.inf], (x[1:] + x[:-1]) / 2, [np.inf]])
-    return np.diff(ndtr((edges - means[:, None]) / deviation), axis=1)
 
 
 def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
@@ -361,7 +224,7 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
 
 
 def _find_threshold(
-    rate: float, rate_at: Callable[[float], float], system: _ScalarSystem, accuracy: float = 1e-10
+    rate: float, rate_at: Callable[[float], float], system: ScalarSystem, accuracy: float = 1e-10
 ) -> float:
     """Return the threshold delta at which `rate_at(delta)`, which falls as delta rises, is this rate."""
     if not 0 < scalar("rate", rate) < 1:
@@ -376,7 +239,7 @@ def _find_threshold(
     return float(brentq(lambda delta: rate_at(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
 
 
-def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: bool = False) -> _ScalarSystem:
+def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: bool = False) -> ScalarSystem:
     """Return a, q, c, r of a linear plant and sensor of one number and Gaussian noise each; ValueError for others."""
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
@@ -390,7 +253,7 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
     if not (isinstance(plant.noise, Gaussian) and isinstance(sensor.noise, Gaussian)):
         laws = f"{type(plant.noise).__name__} and {type(sensor.noise).__name__}"
         raise fail("rate before any data", "Gaussian noises (simulate_rate takes any)", laws)
-    return _ScalarSystem(
+    return ScalarSystem(
         a=float(np.asarray(plant.matrix)[0, 0]),
         q=float(np.asarray(plant.noise.covariance)[0, 0]),
         c=float(np.asarray(sensor.matrix)[0, 0]),
