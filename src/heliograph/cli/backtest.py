@@ -50,6 +50,7 @@ def backtest(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several.
     """
+    from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
     from heliograph.disk.quoted_text import visible
     from heliograph.numerics.check import check_count, fail
     from heliograph.report.results_folder import write_results
@@ -59,6 +60,7 @@ def backtest(
     rows_ahead = _parse_rows_ahead(horizons)
     check_count("--refit", refit, 0)
     check_count("--skip", skip, 1 if refit else 0)
+    refuse_replacing([measurements, find_network_file(network)], [], target)
 
     def compute(advance: "Advance") -> "heliograph.forecasting.Backtest":
         """Read the data of one plant, and forecast from its rows."""
