@@ -70,6 +70,40 @@ network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_
     assert "nan" not in said.out
 
 
+EVENTS = "node,sequence,time,arrival,push,pos\ninputs,0,0,0,0.1,\nremote,0,0.5,0.5,,1.0\nremote,1,1.0,1.1,,1.2\n"
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "options", "lost"),
+    [
+        ("out.lagged.csv", EVENTS, ["--out", "out.csv", "--lag", "1"], "output file out.lagged.csv"),
+        ("out.a.csv", EVENTS.replace("\n", ",a\n").replace("pos,a", "pos,plant", 1) + "remote,0,2,2,,1,b\n",
+         ["--out", "out.csv"], "output file out.a.csv"),
+        ("page/data.csv", None, ["--report", "page"], "output folder page"),
+        ("data.csv", None, ["--report", "page", "--out", "page/out.csv"], "output folder page"),
+    ],
+)  # fmt: skip
+def test_nothing_that_is_read_or_written_is_lost_by_what_is_written(folder, capsys, read, text, options, lost):
+    """A lagged file and a plant's replaced the measurements; a page took its folder with all that stood there."""
+    (folder / "page").mkdir()
+    (folder / "page" / "summary.json").write_text("{}")  # of an earlier page, so that the folder may be replaced
+    (folder / read).write_text((folder / "data.csv").read_text() if text is None else text)
+    before = contents(folder)
+    assert cli.main(["run", "net.py", "--measurements", read, *options]) == 2
+    assert f"{lost}: expected " in capsys.readouterr().err and contents(folder) == before
+
+
+@pytest.mark.parametrize("command", ["fit", "backtest"])
+def test_a_page_does_not_replace_a_folder_with_the_data_it_is_made_of(folder, capsys, command):
+    target = folder / "page" / ("backtest" if command == "backtest" else "")
+    target.mkdir(parents=True)
+    (target / "summary.json").write_text("{}")
+    data = (target / "data.csv").relative_to(folder)
+    data.write_text((folder / "data.csv").read_text())
+    assert cli.main([command, "net.py", "--measurements", str(data), "--out", "page"]) == 2
+    assert "without data.csv, which would be lost with it" in capsys.readouterr().err and data.is_file()
+
+
 @pytest.mark.slow
 def test_run_writes_what_later_rows_say_too(folder, capsys):
     assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0

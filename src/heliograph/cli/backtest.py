@@ -55,7 +55,7 @@ def backtest(
     from heliograph.report.results_folder import write_results
 
     # Check the options before anything is computed.
-    target = choose_results_folder("backtest", out, NAME) / NAME
+    target = _choose_target(network, measurements, out)
     rows_ahead = _parse_rows_ahead(horizons)
     check_count("--refit", refit, 0)
     check_count("--skip", skip, 1 if refit else 0)
@@ -89,6 +89,15 @@ def backtest(
     for score in found.scores:
         print(visible(_describe_coverage(score)))
     print(visible(str(target / "report.html")))
+
+
+def _choose_target(network: str, measurements: Path | StoreAddress, out: Path) -> Path:
+    """Return the folder of the results in `out`; raise ValueError where it holds what is read, by the user's names."""
+    from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
+
+    target = choose_results_folder("backtest", out, NAME) / NAME
+    refuse_replacing([measurements, find_network_file(network)], [], target)
+    return target
 
 
 def _parse_rows_ahead(horizons: str) -> list[int]:

@@ -27,6 +27,7 @@ def design(
     task:
         A TOML file that names the network, the budget or the target error, and what is free.
     """
+    from heliograph.disk.kept_inputs import refuse_replacing
     from heliograph.disk.quoted_text import visible
     from heliograph.files.design_file import read_design
     from heliograph.report.results_folder import write_results
@@ -34,6 +35,7 @@ def design(
     # Read and check everything before the computation starts.
     target = choose_results_folder("design", out, NAME) / NAME
     file = read_design(task)
+    refuse_replacing([task], [], target)
 
     def results_of(designed: "DesignResults") -> "ResultsContent":
         """Return the content of the results folder of a design: figures, page, summary and networks."""

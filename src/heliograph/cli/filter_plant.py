@@ -106,6 +106,13 @@ def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) 
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}")
 
 
+def choose_lagged_output(place: Path | StoreAddress) -> Path | StoreAddress:
+    """Return where estimates of a lag later go, beside `place`: a file or table of their own."""
+    if isinstance(place, Path):
+        return place.with_suffix(f".lagged{place.suffix}")
+    return place.with_table(f"{place.table_for_estimates}_lagged")
+
+
 def filter_rows(
     network: "Network",
     recording: "Recording",
@@ -244,11 +251,7 @@ def _write_lagged_estimates(
     lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if lagged is None:
         return []
-    beside: Path | StoreAddress
-    if isinstance(place, Path):
-        beside = place.with_suffix(f".lagged{place.suffix}")
-    else:
-        beside = place.with_table(f"{place.table_for_estimates}_lagged")
+    beside = choose_lagged_output(place)
     write(lagged, beside)
     return [f"{beside}: {len(lagged.time)} rows, each given what came {lag:g} later"]
 

@@ -55,6 +55,7 @@ def fit(
         A Python file or module that holds a heliograph.Network with hg.free in it: my_network.py, or my_network.py:name
         where it holds several. The name may be that of a function that returns one.
     """
+    from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
     from heliograph.numerics.check import check_count, check_seed, scalar
     from heliograph.report.results_folder import write_results
 
@@ -62,6 +63,7 @@ def fit(
     share = float(scalar("--held-out", held_out, 0.0, 0.9))
     check_count("--starts", starts)
     check_seed("--seed", seed)
+    refuse_replacing([measurements, truth, find_network_file(network)], [], out)
 
     with GentleStop() as stop:
 

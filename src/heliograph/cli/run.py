@@ -9,7 +9,13 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
-from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
+from heliograph.cli.filter_plant import (
+    FilteredPlant,
+    choose_lagged_output,
+    choose_output_of_plant,
+    filter_plant,
+    write_plant_estimates,
+)
 from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants
 from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_blocks
 from heliograph.files.stores.store_address import StoreAddress
@@ -70,6 +76,7 @@ def run(
     more = {"--report": report, "--smooth": smooth, "--forecast": forecast, "--predicted": predicted}
     needing_all_rows = [name for name, value in more.items() if value]
     _check_options(measurements, out, report, lag, options, needing_all_rows)
+    _refuse_losing_files(network, measurements, [out], lag, report)
     horizons = horizons_in(forecast) if forecast else None
     with progress(STAGES) as advance:
         advance("starting")
@@ -81,12 +88,13 @@ def run(
         measured = list[MeasuredPlant]()
         if not said_of_blocks:
             measured = read_measured_plants(measurements, network, loaded, module, options, advance, lag)
-        # Each plant by itself, with the place where its estimates were written.
+        # Each plant by itself, with the place where its estimates are written.
+        places = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
+        _refuse_losing_files(network, measurements, places, lag, report)
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
-        for data in measured:
+        for data, place in zip(measured, places, strict=True):
             advance(f"filtering {len(data.recording.time)} rows")
             plant = filter_plant(loaded, data, smoother, horizons, predicted)
-            place = out and choose_output_of_plant(out, data.plant, several=len(measured) > 1)
             if place is not None:
                 advance(f"writing {place}")
                 plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
@@ -192,7 +200,6 @@ def _check_output_places(
     """Check before the work starts that packages for these files are installed, and that they can be written."""
     from heliograph.disk.atomic_files import FORMATS, check_writable
     from heliograph.files.logs.vehicle_log import PACKAGES
-    from heliograph.numerics.check import fail
     from heliograph.numerics.process.optional_packages import check_installed
     from heliograph.report.results_folder import NEEDS
 
@@ -209,13 +216,28 @@ def _check_output_places(
         check_store(out)
     elif out is not None:
         check_writable(out, (*FORMATS, ".mcap"))
-        if isinstance(measurements, Path) and out.resolve() == measurements.resolve():
-            raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
         from heliograph.disk.atomic_files import check_replaceable
         from heliograph.report.results_folder import SUMMARY
 
         check_replaceable(report, SUMMARY)
+
+
+def _refuse_losing_files(
+    network: str,
+    measurements: Path | StoreAddress,
+    places: "Sequence[Path | StoreAddress | None]",
+    lag: float | None,
+    report: Path | None,
+) -> None:
+    """Raise ValueError where a file that is read or written would be lost by what is written.
+
+    `places`: where estimates go; with a `lag` others go beside these.
+    """
+    from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
+
+    later = [choose_lagged_output(place) for place in places if place is not None and lag is not None]
+    refuse_replacing([measurements, find_network_file(network)], [*places, *later], report)
 
 
 def _refuse_replacing_inputs(

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.angle_indices import FilterAngles
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.model.checks.plant_inputs import do_inputs_spoil
@@ -78,7 +77,7 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = is_implausible(innovation, z, filter.angles_used(), real) | (judgement.input > 0)
+        implausible = is_implausible(filter, innovation, z, real) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
 
@@ -119,7 +118,7 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         judgement = Judgement.judge_correction(
             filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, filter.angles_used()
         )
-        implausible = is_implausible(innovation, z, filter.angles_used(), real)
+        implausible = is_implausible(filter, innovation, z, real)
         beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
@@ -127,10 +126,10 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     return correct
 
 
-def is_implausible(innovation: Innovation, z: jax.Array, angles: FilterAngles | None, real: str) -> jax.Array:
+def is_implausible(filter: AbstractFilter, innovation: Innovation, z: jax.Array, real: str) -> jax.Array:
     """Return whether some component of z is larger than expected, and too many of its own deviations away from that.
 
-    Or whether one of its `angles` has too many turns for numbers of type `real`.
+    Or whether one of the filter's angles has too many turns for numbers of type `real`.
 
     The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
     z, such as a neighbour's measurement, every component that is so far away counts. A difference within ROUNDING,
@@ -140,6 +139,6 @@ def is_implausible(innovation: Innovation, z: jax.Array, angles: FilterAngles | 
     if differs.shape == z.shape:
         larger = jnp.abs(z) > jnp.abs(z - innovation.value)
         far &= larger & (differs > ROUNDING[real] * jnp.maximum(jnp.abs(z), 1e-33))
-        if angles:
-            far |= Judgement.find_unreadable(innovation, z, angles.received, float(np.finfo(PRECISION[real]).eps))
+        if used := filter.angles_used():
+            far |= Judgement.find_unreadable(innovation, z, used.received, float(np.finfo(PRECISION[real]).eps))
     return jnp.any(far)

@@ -76,3 +76,19 @@ def continue_angles(
         slope = jax.jvp(function, (center,), (direction,))[1]
         D = D.at[:, i].set(jnp.round(slope))
     return lambda x: wrap_near(function(x), value_at_center + D @ (x - center), angles)
+
+
+def find_wraps(values: Array, most: float) -> np.ndarray:
+    """Return before which rows an angle goes around: from near pi to near -pi, or back.
+
+    Values (time,) that never leave +-`most`, and of which two in a row are further apart than pi, are such an angle's.
+    """
+    values = np.asarray(values)
+    jumps = np.flatnonzero(np.abs(np.diff(values)) > TURN / 2) + 1
+    return jumps if jumps.size and np.nanmax(np.abs(values)) <= most + 1e-9 else jumps[:0]
+
+
+def insert_gaps(time: Array, rows: np.ndarray, *parts: Array) -> tuple[np.ndarray, ...]:
+    """Return times and what is drawn over them, each (time,), with a NaN before these rows, which breaks the curve."""
+    time = np.asarray(time)
+    return np.insert(time, rows, time[rows]), *(np.insert(np.asarray(part), rows, np.nan) for part in parts)

@@ -42,9 +42,11 @@ def _is_out_of_range(value: Any, least: Any, most: Any) -> Any:
     return (most > least) & ((value < least) | (value > most))
 
 
+POSITION = ("latitude", "longitude", "altitude")
 # Of the comments in the definitions of the types.
 MARKS = {
-    "sensor_msgs/msg/NavSatFix": [Mark(("latitude", "longitude", "altitude"), ("status.status",), _is_negative)],
+    "sensor_msgs/msg/NavSatFix": [Mark(POSITION, ("status.status",), _is_negative)],
+    "gps_msgs/msg/GPSFix": [Mark((*POSITION, "track", "speed", "climb"), ("status.status",), _is_negative)],
     "sensor_msgs/msg/Imu": [
         Mark((field,), (f"{field}_covariance.0",), _is_minus_one)
         for field in ("orientation", "angular_velocity", "linear_acceleration")

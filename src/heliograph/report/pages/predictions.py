@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 import heliograph
 from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.numerics.angle import find_wraps, insert_gaps
 from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
 from heliograph.report.innovations_section import (
     BAND,
@@ -20,7 +21,6 @@ from heliograph.report.innovations_section import (
 )
 from heliograph.report.pages.page import Picture, Section, Text
 from heliograph.report.recording_diagnosis import Health
-from heliograph.simulation.results.plots import HALF_TURN, find_wraps, insert_gaps
 
 PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
@@ -110,7 +110,7 @@ def _draw_predicted(health: Health, node: str) -> Figure:
     for i, panel in enumerate(panels):
         for (name, law), colour in zip(laws.items(), COLOURS, strict=False):
             mean, band = law.mean[:, i], BAND * law.deviation[:, i]
-            time, mean, band = insert_gaps(record.time, find_wraps(mean, HALF_TURN), mean, band)
+            time, mean, band = insert_gaps(record.time, find_wraps(mean, np.pi), mean, band)
             panel.plot(time, mean, color=colour, linewidth=1.2, label=quote_for_figure(name))
             panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
         panel.plot(record.time, data[:, i], ".", markersize=3, color=INK, label="data")

@@ -8,10 +8,9 @@ import numpy as np
 from heliograph.disk.colours_of_figures import COLOURS
 from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.model.estimate import Estimate
+from heliograph.numerics.angle import find_wraps, insert_gaps
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.types import ArrayLike
 
-HALF_TURN = np.pi  # of an angle
 FAR = 10.0  # times the best filter's error: from there an axis is logarithmic
 
 if TYPE_CHECKING:  # an extra
@@ -88,8 +87,8 @@ def draw_state(
     """
     run, i = run_and_state
     # Estimates of an angle between -pi and pi are then between -2 pi and 2 pi.
-    turns = truth is not None and find_wraps(truth[~np.isnan(truth)], HALF_TURN).size
-    most = 2 * HALF_TURN if turns else HALF_TURN
+    turns = truth is not None and find_wraps(truth[~np.isnan(truth)], np.pi).size
+    most = 2 * np.pi if turns else np.pi
     for number, (name, estimate) in enumerate(estimates.items()):
         mean = np.asarray(estimate.mean)[run][..., i]
         variance = np.asarray(estimate.covariance)[run][..., i, i]
@@ -100,7 +99,7 @@ def draw_state(
             low, high = mean - band, mean + band
             panel.fill_between(drawn_time, low, high, color=choose_colour(number), alpha=0.2, linewidth=0)
     if truth is not None:
-        wraps = find_wraps(truth, HALF_TURN)
+        wraps = find_wraps(truth, np.pi)
         panel.plot(*insert_gaps(time, wraps, truth), color="0.25", linestyle=":", label="truth")
 
 
@@ -153,19 +152,3 @@ def legend_outside(axes: "Axes", title: str | None = None) -> None:
 def choose_colour(number: int) -> str:
     """Return the colour of the pages for the filter of this number; colours repeat."""
     return COLOURS[number % len(COLOURS)]
-
-
-def find_wraps(values: ArrayLike, most: float) -> np.ndarray:
-    """Return before which rows an angle goes around: from near pi to near -pi, or back.
-
-    Values (time,) that never leave +-`most`, and of which two in a row are further apart than pi, are such an angle's.
-    """
-    values = np.asarray(values)
-    jumps = np.flatnonzero(np.abs(np.diff(values)) > HALF_TURN) + 1
-    return jumps if jumps.size and np.nanmax(np.abs(values)) <= most + 1e-9 else jumps[:0]
-
-
-def insert_gaps(time: ArrayLike, rows: np.ndarray, *parts: ArrayLike) -> tuple[np.ndarray, ...]:
-    """Return times and what is drawn over them, each (time,), with a NaN before these rows, which breaks the curve."""
-    time = np.asarray(time)
-    return np.insert(time, rows, time[rows]), *(np.insert(np.asarray(part), rows, np.nan) for part in parts)

@@ -1,0 +1,33 @@
+"""Files that a command reads, and those that it writes, are neither replaced nor removed by what else it writes."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from heliograph.numerics.check import fail
+
+
+def refuse_replacing(read: Iterable[object], written: Iterable[object], folder: Path | None = None) -> None:
+    """Raise ValueError where a file would be lost by what a command writes.
+
+    Args:
+        read: files and folders that the command reads; anything but a path is no file.
+        written: files that it writes.
+        folder: folder that it replaces as a whole; None for none.
+    """
+    sources = [path for path in read if isinstance(path, Path)]
+    places = [path for path in written if isinstance(path, Path)]
+    for place in places:
+        if any(place.resolve() == source.resolve() for source in sources):
+            raise fail(f"output file {place}", "another file than the measurements", "the same")
+    if folder is None:
+        return
+    replaced = folder.resolve()
+    for path in [*sources, *places]:
+        if replaced in (path.resolve(), *path.resolve().parents) and (path in places or path.exists()):
+            raise fail(f"output folder {folder}", f"one without {path.name}, which would be lost with it", str(path))
+
+
+def find_network_file(reference: str) -> Path:
+    """Return the file of a user's name of a network, "my_network.py:name"; of a module one that is not there."""
+    stem, _, _ = reference.rpartition(".py")
+    return Path(f"{stem}.py")
