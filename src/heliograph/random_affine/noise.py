@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.factors.covariance_factors import WeightedColumns, columns_of, eliminate, square_root
 from heliograph.numerics import check
-from heliograph.numerics.check import array, fail, instance, items, show_value
+from heliograph.numerics.check import array, fail, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
@@ -74,6 +74,14 @@ class AbstractNoise(Module):
         """Return each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
         variances = library(self.covariance).diagonal(self.covariance)[:, None]
         return GaussianBranches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
+
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return each component of B n as a mixture of Gaussian branches about its mean; one unless the law says more.
+
+        `matrix`: B (rows, dimension).
+        """
+        variances = library(matrix, self.covariance).diagonal(matrix @ self.covariance @ matrix.T)[:, None]
+        return GaussianBranches(np.zeros((len(matrix), 1)), np.zeros((len(matrix), 1)), variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean, relative to that of the whole, and covariance of the noise without its outliers."""
@@ -273,6 +281,22 @@ class Independent(AbstractNoise):
         """Return the branches of the parts, one above the other."""
         return stack_branches([component.branches() for component in self.parts])
 
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return for each component of B n every branch of each part that it holds with every one of the others."""
+        ends = np.cumsum([component.dimension for component in self.parts])[:-1]
+        blocks = library(matrix).split(matrix, ends, axis=1)
+        return stack_branches([self._add_branches([block[[i]] for block in blocks]) for i in range(len(matrix))])
+
+    def _add_branches(self, rows: Sequence[Matrix]) -> GaussianBranches:
+        """Return the branches of sum_p rows_p n_p, one number, over the parts n_p whose row (1, size) is not 0."""
+        total = GaussianBranches(*np.zeros((3, 1, 1)))
+        for component, row in zip(self.parts, rows, strict=True):
+            if not is_zero(row):
+                of_part = component.branches_through(row)
+                sums = (a[:, :, None] + b[:, None] for a, b in zip(total, of_part, strict=True))
+                total = GaussianBranches(*(pairs.reshape(1, -1) for pairs in sums))
+        return total
+
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return mean and covariance of the independent parts without their outliers, one above the other."""
         parts = [component.without_outliers() for component in self.parts]
@@ -310,61 +334,6 @@ class Independent(AbstractNoise):
             start += component.dimension
             value *= component.moment(component_powers) if any(component_powers) else 1.0
         return value
-
-
-class Shaped(AbstractNoise):
-    """Noise n = B u: a noise u that enters through a known matrix B, as process noise does.
-
-    Args:
-        matrix: B (dimension, source.dimension).
-        source: law of u.
-    """
-
-    matrix: Matrix
-    source: AbstractNoise
-    mean: Vector
-    covariance: Square
-
-    def __init__(self, matrix: "Float[ArrayLike, 'dimension source']", source: AbstractNoise):
-        instance("source of a shaped noise", source, AbstractNoise, "a law of a noise vector")
-        self.matrix = array("noise matrix", matrix, (None, source.dimension))
-        self.source = source
-        self.mean = self.matrix @ source.mean
-        self.covariance = self.matrix @ source.covariance @ self.matrix.T
-
-    @property
-    def columns(self) -> WeightedColumns:
-        """Covariance B W diag(w) (B W)' as columns B W with weights w."""
-        return self.source.columns.through(self.matrix)
-
-    def list_atoms(self) -> list[NoiseAtom]:
-        """Return every atom of u mapped, B c and B R B'."""
-        b = self.matrix
-        return [NoiseAtom(p, b @ c, b @ r @ b.T) for p, c, r in self.source.list_atoms()]
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw B u."""
-        return jnp.asarray(self.matrix) @ self.source.sample(key)
-
-    def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a] = E[prod_i (sum_j B_ij u_j)^a_i]: of a polynomial in u, the source, term by term."""
-        polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
-        for i, power in enumerate(powers):
-            for _ in range(power):
-                polynomial = _multiply_by_linear(polynomial, self.matrix[i])
-        moment = self.source.moment
-        return sum(c * (moment(a) if any(a) else 1.0) for a, c in polynomial.items())
-
-
-def _multiply_by_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
-    """Return the coefficients, by exponents of u, of the polynomial p(u) times sum_j row_j u_j."""
-    product: dict[Exponents, Number] = {}
-    used = [j for j, entry in enumerate(row) if not is_zero(entry)]
-    for a, c in polynomial.items():
-        for j in used:
-            raised = (*a[:j], a[j] + 1, *a[j + 1 :])
-            product[raised] = product.get(raised, 0.0) + c * plain(row[j])
-    return product
 
 
 NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a covariance, or a variance

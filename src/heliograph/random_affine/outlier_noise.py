@@ -81,6 +81,10 @@ class StudentT(AbstractNoise):
         shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
         return GaussianBranches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
 
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return the branches of B n, Student's noise of the scale B S B' and as many degrees; `matrix`: B."""
+        return StudentT(matrix @ self.scale @ matrix.T, self.degrees).branches()
+
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the Gaussian noise of the scale."""
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
@@ -213,10 +217,17 @@ class Contaminated(AbstractNoise):
 
         By component and branch: logarithm of the probability, mean and variance.
         """
-        xp, n = library(self.shares), self.dimension
+        return self._list_branches(self.means - self.mean, self.covariances)
+
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return the branches of each component of B n, about its mean: those of n, mapped; `matrix`: B."""
+        return self._list_branches((self.means - self.mean) @ matrix.T, matrix @ self.covariances @ matrix.T)
+
+    def _list_branches(self, means: Matrix, covariances: Stack) -> GaussianBranches:
+        """Return the branches of these means (branches, n), about that of the whole, and covariances, by component."""
+        xp, n = library(self.shares), means.shape[1]
         shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
-        variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
-        return GaussianBranches(shares, (self.means - self.mean).T, variances)
+        return GaussianBranches(shares, means.T, xp.diagonal(covariances, axis1=1, axis2=2).T)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean and covariance of the first branch: the noise without outliers."""
