@@ -23,7 +23,9 @@ InputsAhead: TypeAlias = Literal["none", "given", "held"]
 class Prediction:
     """The law of some numbers at each horizon: a Gaussian, or a mixture of K of them, of which each part is Gaussian.
 
-    Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. The quantiles of an
+    Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. Noise counts by its
+    mean and covariance, whatever its law: of noise with outliers quantiles and probabilities are those of Gaussian
+    noise of this variance, and `hg.forecasting.draw_paths` and `crossing` draw the law itself. The quantiles of an
     angle go on from its mean, so that a band about pi stays a band. Of several sources all arrays have one more axis,
     of sources, before that of horizons. Of what nothing has been heard yet (`hg.diffuse`), and behind noise that has no
     variance (`StudentT` of at most two degrees), the deviation is infinite, and so are the ends of intervals; a
