@@ -125,7 +125,8 @@ def fit_and_judge(
         call = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
         raise fail("network to be learned", f"no trigger of a node (in Python {call} learns it)", "one with a trigger")
     data = _read_rows_to_fit(measurements, network, start, advance, truth, reading)
-    recording = _drop_refused_readings(start, data.recording)
+    kept = start.drop_refused_readings(data.recording.measurements, data.recording.inputs)
+    recording = data.recording._replace(measurements=kept)
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     learned_rows = rows - int(Fraction(str(held_out)) * rows)  # of 0.29 as it is written, not of the nearest double
@@ -147,18 +148,6 @@ def fit_and_judge(
     advance("looking at losses")
     losses = stop.run_unless_stopped(lambda: _estimate_losses_by_node(start, data.recording)) or {}
     return FitResults(network, str(measurements), fitted, learned_rows, rows - learned_rows, changes, uniform, losses)
-
-
-def _drop_refused_readings(network: "Network", recording: "Recording") -> "Recording":
-    """Return the recording without the readings that its nodes refuse, and warn of these, as `heliograph run` does."""
-    import warnings
-
-    from heliograph.simulation.screened_recording import screen_recording
-
-    screened = screen_recording(network, recording.measurements, recording.inputs, {})
-    for line in screened.said:
-        warnings.warn(line, stacklevel=2)
-    return recording._replace(measurements=screened.measurements)
 
 
 def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":

@@ -46,6 +46,8 @@ from .noise import (
     AbstractNoise as AbstractNoise,
     FiniteSupport as FiniteSupport,
     Independent as Independent,
+)
+from .shaped_noise import (
     Shaped as Shaped,
 )
 from .moments.second_moments import (

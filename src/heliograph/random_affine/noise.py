@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.factors.covariance_factors import WeightedColumns, columns_of, eliminate, square_root
 from heliograph.numerics import check
-from heliograph.numerics.check import array, fail, instance, items, show_value
+from heliograph.numerics.check import array, fail, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
@@ -25,7 +25,7 @@ from heliograph.random_affine.moments.mixture_components import (
     combine_atoms,
     stack_branches,
 )
-from heliograph.random_affine.moments.monomials import Exponents, list_exponents, multiply_by_linear_form
+from heliograph.random_affine.moments.monomials import Exponents, list_exponents
 
 LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
 FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
@@ -75,6 +75,14 @@ class AbstractNoise(Module):
         """Return each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
         variances = library(self.covariance).diagonal(self.covariance)[:, None]
         return GaussianBranches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
+
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return each component of B n as a mixture of Gaussian branches about its mean; one unless the law says more.
+
+        `matrix`: B (rows, dimension).
+        """
+        variances = library(matrix, self.covariance).diagonal(matrix @ self.covariance @ matrix.T)[:, None]
+        return GaussianBranches(np.zeros((len(matrix), 1)), np.zeros((len(matrix), 1)), variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean, relative to that of the whole, and covariance of the noise without its outliers."""
@@ -277,6 +285,22 @@ class Independent(AbstractNoise):
         """Return the branches of the parts, one above the other."""
         return stack_branches([component.branches() for component in self.parts])
 
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return for each component of B n every branch of each part that it holds with every one of the others."""
+        ends = np.cumsum([component.dimension for component in self.parts])[:-1]
+        blocks = library(matrix).split(matrix, ends, axis=1)
+        return stack_branches([self._add_branches([block[[i]] for block in blocks]) for i in range(len(matrix))])
+
+    def _add_branches(self, rows: Sequence[Matrix]) -> GaussianBranches:
+        """Return the branches of sum_p rows_p n_p, one number, over the parts n_p whose row (1, size) is not 0."""
+        total = GaussianBranches(*np.zeros((3, 1, 1)))
+        for component, row in zip(self.parts, rows, strict=True):
+            if not is_zero(row):
+                of_part = component.branches_through(row)
+                sums = (a[:, :, None] + b[:, None] for a, b in zip(total, of_part, strict=True))
+                total = GaussianBranches(*(pairs.reshape(1, -1) for pairs in sums))
+        return total
+
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return mean and covariance of the independent parts without their outliers, one above the other."""
         inliers = [noise.without_outliers() for noise in self.parts]
@@ -316,51 +340,6 @@ class Independent(AbstractNoise):
             exponents = tuple(islice(next_powers, noise.dimension))
             product *= noise.moment(exponents) if any(exponents) else 1.0
         return product
-
-
-class Shaped(AbstractNoise):
-    """Noise n = B u: a noise u that enters through a known matrix B, as process noise does.
-
-    Args:
-        matrix: B (dimension, source.dimension).
-        source: law of u.
-    """
-
-    matrix: Matrix
-    source: AbstractNoise
-    mean: Vector
-    covariance: Square
-
-    def __init__(self, matrix: "Float[ArrayLike, 'dimension source']", source: AbstractNoise):
-        """Hold B and the law of u; mean and covariance are B E[u] and B Cov[u] B'."""
-        instance("source of a shaped noise", source, AbstractNoise, "a law of a noise vector")
-        self.matrix = array("noise matrix", matrix, (None, source.dimension))
-        self.source = source
-        self.mean = self.matrix @ source.mean
-        self.covariance = self.matrix @ source.covariance @ self.matrix.T
-
-    @property
-    def columns(self) -> WeightedColumns:
-        """Covariance B W diag(w) (B W)' as columns B W with weights w."""
-        return self.source.columns.through(self.matrix)
-
-    def list_atoms(self) -> list[NoiseAtom]:
-        """Return every atom of u mapped, B c and B R B'."""
-        b = self.matrix
-        return [NoiseAtom(p, b @ c, b @ r @ b.T) for p, c, r in self.source.list_atoms()]
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw B u."""
-        return jnp.asarray(self.matrix) @ self.source.sample(key)
-
-    def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a] = E[prod_i (sum_j B_ij u_j)^a_i]: of a polynomial in u, the source, term by term."""
-        polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
-        for i, power in enumerate(powers):
-            for _ in range(power):
-                polynomial = multiply_by_linear_form(polynomial, self.matrix[i])
-        moment = self.source.moment
-        return sum(coefficient * (moment(a) if any(a) else 1.0) for a, coefficient in polynomial.items())
 
 
 NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a covariance, or a variance

@@ -83,6 +83,10 @@ class StudentT(AbstractNoise):
         variances = xp.diagonal(self.scale)[:, None] / PRECISIONS
         return GaussianBranches(log_shares, np.zeros(shape), variances)
 
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return the branches of B n, Student's noise of the scale B S B' and as many degrees; `matrix`: B."""
+        return StudentT(matrix @ self.scale @ matrix.T, self.degrees).branches()
+
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the Gaussian noise of the scale."""
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
@@ -220,11 +224,18 @@ class Contaminated(AbstractNoise):
 
         By component and branch: logarithm of the probability, mean and variance.
         """
-        xp, n = library(self.shares), self.dimension
+        return self._list_branches(self.means - self.mean, self.covariances)
+
+    def branches_through(self, matrix: Matrix) -> GaussianBranches:
+        """Return the branches of each component of B n, about its mean: those of n, mapped; `matrix`: B."""
+        return self._list_branches((self.means - self.mean) @ matrix.T, matrix @ self.covariances @ matrix.T)
+
+    def _list_branches(self, means: Matrix, covariances: Stack) -> GaussianBranches:
+        """Return the branches of these means (branches, n), about that of the whole, and covariances, by component."""
+        xp, n = library(self.shares), means.shape[1]
         log_shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
-        variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
-        means = (self.means - self.mean).T
-        return GaussianBranches(log_shares, means, variances)
+        variances = xp.diagonal(covariances, axis1=1, axis2=2).T
+        return GaussianBranches(log_shares, means.T, variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean and covariance of the first branch: the noise without outliers."""

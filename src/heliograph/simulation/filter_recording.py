@@ -41,7 +41,6 @@ from heliograph.simulation.scan_recording import (
     find_central_states_before_rows,
     read_recording_start,
 )
-from heliograph.simulation.screened_recording import screen_recording
 from heliograph.simulation.smoothed import SmoothingPlan, add_truth, make_smoothed_record, select_smoothed_part
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
@@ -116,7 +115,7 @@ def run(
     warn_of_unequal_steps(network.inputs, None if times is None else joined)
     refuse_shared_dithers(network, z)
     # Readings that the nodes refuse count as not arrived.
-    z, refused, said, repeats = screen_recording(network, z, u, {} if before is None else before.repeats)
+    z, refused, said, repeats = network.screen_readings(z, u, {} if before is None else before.repeats)
     _warn_of_each((*said, *doubt_angles_beyond_a_turn(network, z)))
     # Filters, on what is left without implausible data.
     begin = None if before is None else RecordingStart(before.state, np.asarray(first))

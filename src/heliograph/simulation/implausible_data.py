@@ -10,18 +10,13 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import INPUT, Judgement
 from heliograph.model.checks.non_finite_results import describe_non_finite_function
-from heliograph.model.over_time import first
-from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import UplinkDraws
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.network_index import EstimatePlace
-from heliograph.simulation.node import Node, ReceivingNode
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
-
-RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
 def is_implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
@@ -264,33 +259,3 @@ def _format_rows(rows: Sequence[int]) -> str:
     """Return "row 3 is", or "7 rows (1, 2, ...) are" with the first five, counted from 1."""
     listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"
-
-
-def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
-    """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
-
-    Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
-    uses such a value and gives it a floor of 1e-6 as its probability.
-    """
-    trigger = node.trigger if isinstance(node, Node) else None
-    if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
-        return []
-    assert isinstance(node, Node)  # as it has a trigger
-    channel = first(node.channel)
-    is_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
-    if not is_as_sent:
-        return []
-    # Each row that came whole against the one before it, `last`.
-    forbidden, last = list[int](), None
-    for k, row in enumerate(z[:, : len(node.outputs)]):
-        if np.isnan(row).any():
-            continue
-        if last is not None:
-            heartbeat_is_due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
-            change = np.abs(row - z[last, : len(row)])
-            delta = (1 - RIM) * np.asarray(trigger.delta)
-            is_inside = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
-            if is_inside and not heartbeat_is_due:
-                forbidden.append(k)
-        last = k
-    return forbidden

@@ -1,5 +1,6 @@
 """Network: one plant, and nodes that receive measurements of it, with their filters."""
 
+import warnings
 from collections.abc import Iterable, Mapping
 from copy import copy
 from functools import cached_property
@@ -7,6 +8,7 @@ from typing import ClassVar
 from zlib import crc32
 
 import equinox as eqx
+import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
@@ -17,6 +19,7 @@ from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
+from heliograph.model.repeated_readings import Repeats
 from heliograph.model.sensor import AnySensor, without_output_names
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
@@ -58,6 +61,7 @@ from heliograph.simulation.node import (
     check_states,
     get_parts_of_reception,
 )
+from heliograph.simulation.screened_recording import ScreenedRecording, screen_recording
 from heliograph.simulation.sender_checks import check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
@@ -367,6 +371,19 @@ class Network(Module):
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
         one_of_each = [self.nodes[names[0]] for names in self.groups]  # a group's nodes cover the same steps
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
+
+    def screen_readings(
+        self, measurements: dict[str, np.ndarray], inputs: np.ndarray, before: Mapping[str, Repeats]
+    ) -> ScreenedRecording:
+        """Return measurements by node, without the readings that nodes refuse; `before`: equal ones in earlier rows."""
+        return screen_recording(self.nodes, self.inputs, measurements, inputs, before)
+
+    def drop_refused_readings(self, measurements: dict[str, np.ndarray], inputs: np.ndarray) -> dict[str, np.ndarray]:
+        """Return measurements by node, (steps, received), without the readings that nodes refuse; warn of these."""
+        screened = self.screen_readings(measurements, inputs, {})
+        for line in screened.said:
+            warnings.warn(line, stacklevel=3)
+        return screened.measurements
 
     def check_sends_each_step(self, what: str) -> None:
         """Raise ValueError if a node has a trigger: `what` is computed for senders that transmit at each step."""

@@ -1,18 +1,20 @@
 """Measurements of a recording without readings that their nodes refuse, and what is said of these and of silences."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of_reason
+from heliograph.model.over_time import first
 from heliograph.model.reading_limits import ReadingLimits
 from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import find_long_silences
+from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, Int
-from heliograph.simulation.implausible_data import find_forbidden_rows
-from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
+
+RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
 class ScreenedRecording(NamedTuple):
@@ -33,19 +35,24 @@ class ScreenedRecording(NamedTuple):
 
 
 def screen_recording(
-    network: Network, z: dict[str, np.ndarray], u: np.ndarray, before: Mapping[str, Repeats]
+    nodes: Mapping[str, Node | ReceivingNode],
+    inputs: Sequence[str],
+    z: dict[str, np.ndarray],
+    u: np.ndarray,
+    before: Mapping[str, Repeats],
 ) -> ScreenedRecording:
     """Return the measurements without readings that their nodes refuse, with the reason of each.
 
     Args:
-        network: the network.
+        nodes: of the network, by name.
+        inputs: names of the plant's.
         z: by node, (steps, received), NaN where nothing arrived.
         u: inputs (steps, inputs).
         before: the runs of equal readings with which the rows before these ended, by node; {} before the first ones.
     """
     kept, refused, said = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
     repeats = dict[str, Repeats]()
-    for name, node in network.nodes.items():
+    for name, node in nodes.items():
         # Readings beyond limits, codes, and readings that are stuck; none of a node without limits.
         kept[name], refused[name] = z[name], np.zeros(z[name].shape, dtype=np.int8)
         lines = list[str]()
@@ -65,8 +72,8 @@ def screen_recording(
             )
         said += [f"node {name!r}: {line}" for line in lines]
     # Silences longer than a node's timeout.
-    timeouts = {name: node.timeout for name, node in network.nodes.items()}
-    silences = find_long_silences(timeouts, kept, u, network.inputs)
+    timeouts = {name: node.timeout for name, node in nodes.items()}
+    silences = find_long_silences(timeouts, kept, u, inputs)
     said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
     return ScreenedRecording(kept, refused, said, repeats)
 
@@ -93,3 +100,33 @@ def _describe_refused(
     shares = f"{np.count_nonzero(refused_so)} of {np.count_nonzero(~np.isnan(z))} values"
     description = limits.describe_missing(z[row], refused_so[row], node.received_names)
     return f"{shares} count as not arrived, by {reason}; row {row + 1}: {description}"
+
+
+def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
+    """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
+
+    Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
+    uses such a value and gives it a floor of 1e-6 as its probability.
+    """
+    trigger = node.trigger if isinstance(node, Node) else None
+    if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
+        return []
+    assert isinstance(node, Node)  # as it has a trigger
+    channel = first(node.channel)
+    is_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
+    if not is_as_sent:
+        return []
+    # Each row that came whole against the one before it, `last`.
+    forbidden, last = list[int](), None
+    for k, row in enumerate(z[:, : len(node.outputs)]):
+        if np.isnan(row).any():
+            continue
+        if last is not None:
+            heartbeat_is_due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
+            change = np.abs(row - z[last, : len(row)])
+            delta = (1 - RIM) * np.asarray(trigger.delta)
+            is_inside = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
+            if is_inside and not heartbeat_is_due:
+                forbidden.append(k)
+        last = k
+    return forbidden

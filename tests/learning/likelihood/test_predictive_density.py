@@ -172,3 +172,10 @@ def test_a_network_must_have_a_place_for_the_laws():
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.hop(1.0, 0.1), local)})
     with pytest.raises(ValueError, match="network: expected gains of one law, or some whose law is one of the two"):
         hg.learning.samples_to_tell(hg.Rayleigh(1.0), hg.random_affine.LogNormal(0.0, 0.1), network)
+
+
+def test_a_channel_that_delivers_a_number_without_noise_has_no_density():
+    """A lost packet reads as 0 exactly: LAPACK's error was raised."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 0.5), hg.LinearSensor([[1.0]], 0.2)
+    with pytest.raises(hg.InputError, match="expected one behind which every measurement has a density"):
+        hg.learning.predictive(plant, sensor, hg.dropout(hg.perfect(), 0.7), [[1.3]])

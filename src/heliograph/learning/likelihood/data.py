@@ -1,6 +1,5 @@
 """Recordings of a fit, gathered and checked against the network."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -13,7 +12,6 @@ from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
-from heliograph.simulation.screened_recording import screen_recording
 
 FEWEST = 10  # least count of numbers that arrived for each free number
 
@@ -178,10 +176,8 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
         u = np.array(check_rows("inputs", inputs, steps, count, missing=False, names=network.inputs))
     check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
     # Readings that the nodes refuse, by limits, codes or as stuck, count as not arrived, as where filters run.
-    screened = screen_recording(network, measured, u, {})
-    for line in screened.said:
-        warnings.warn(line, stacklevel=2)
-    return np.concatenate([screened.measurements[name] for name in network.names], axis=1), u
+    kept = network.drop_refused_readings(measured, u)
+    return np.concatenate([kept[name] for name in network.names], axis=1), u
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:

@@ -22,10 +22,10 @@ from heliograph.random_affine.noise import (
     Gaussian,
     Independent,
     Number,
-    Shaped,
     Square,
     Vector,
 )
+from heliograph.random_affine.shaped_noise import Shaped
 
 MOMENT_TOLERANCE = 1e-10  # of moments scaled to unit second moment: rounding of the numbers given
 MOMENT_ERROR = 0.1  # standard error of an estimated moment, relative to its largest possible size, that is tolerated
