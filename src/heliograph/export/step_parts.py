@@ -76,10 +76,11 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         The flags: z or u is implausible (see `is_implausible`); u spoils the digits of numbers of type `real`, of which
         ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
-        after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
-        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
-        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
+        state = jax.tree.unflatten(tree, arrays)
+        state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
+        are_implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
+        spoils_digits = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
+        return [*jax.tree.leaves(state_after), estimate.mean, estimate.covariance, are_implausible, spoils_digits]
 
     return step
 
@@ -133,8 +134,9 @@ def is_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax
     z, such as a neighbour's measurement, every component that is so far away counts. A difference within `rounding`,
     relative to z, counts nothing.
     """
-    far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
-    if differs.shape == z.shape:
-        larger = jnp.abs(z) > jnp.abs(z - innovation.value)
-        far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
-    return jnp.any(far)
+    is_far, difference = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
+    if difference.shape == z.shape:
+        is_larger_than_expected = jnp.abs(z) > jnp.abs(z - innovation.value)
+        is_above_rounding = difference > rounding * jnp.maximum(jnp.abs(z), 1e-33)
+        is_far &= is_larger_than_expected & is_above_rounding
+    return jnp.any(is_far)
