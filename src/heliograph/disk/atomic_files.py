@@ -75,12 +75,13 @@ def _open_locked(path: Path) -> int | None:
 
 def _is_path_of_handle(path: Path, handle: int) -> bool:
     """Return whether a path is that of the open file `handle`; False if nothing is there any more."""
-    with suppress(FileNotFoundError):
-        other = os.open(path, os.O_RDONLY)
-        same = os.path.sameopenfile(handle, other)
-        os.close(other)
-        return same
-    return False
+    try:
+        handle_of_path = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    is_same = os.path.sameopenfile(handle, handle_of_path)
+    os.close(handle_of_path)
+    return is_same
 
 
 def _lock_handle(handle: int) -> bool:
@@ -167,9 +168,10 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 def _remove_leftover_files(path: Path) -> None:
     """Remove the temporary files next to `path`, named .NAME.PROCESS.*.partial, of processes that no longer run."""
-    for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
-        if not _is_running(left.name.split(".")[-2]):
-            left.unlink(missing_ok=True)
+    for temporary in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
+        process = temporary.name.split(".")[-2]
+        if not _is_running(process):
+            temporary.unlink(missing_ok=True)
 
 
 def _is_running(process: str) -> bool:
@@ -232,7 +234,8 @@ def check_replaceable(target: Path, mark: str) -> None:
     """
     check_folder_writable(target)
     remove_leftover_folders(target)
-    if target.is_dir() and {p.name for p in target.iterdir()} - {LOCK} and not (target / mark).is_file():
+    names = {path.name for path in target.iterdir()} - {LOCK} if target.is_dir() else set()
+    if names and not (target / mark).is_file():
         raise fail(f"output folder {target}", f"a new or empty folder, or one with {mark} to replace", "other files")
 
 
@@ -293,12 +296,13 @@ def remove_leftover_folders(target: Path) -> None:
     """
     if not target.parent.is_dir():
         return
-    for left in target.parent.glob(f".{glob_escape(target.name)}-*"):
-        if not re.fullmatch(r"-[a-z0-9_]{8}", left.name.removeprefix(f".{target.name}")) or not left.is_dir():
+    for folder in target.parent.glob(f".{glob_escape(target.name)}-*"):
+        ending = folder.name.removeprefix(f".{target.name}")
+        if not re.fullmatch(r"-[a-z0-9_]{8}", ending) or not folder.is_dir():
             continue
-        with try_lock(left) as ours:
-            if not ours or {p.name for p in left.iterdir()} - {"new", "old"}:
+        with try_lock(folder) as is_locked:
+            if not is_locked or {path.name for path in folder.iterdir()} - {"new", "old"}:
                 continue
-            if (left / "old").exists() and not target.exists():
-                (left / "old").rename(target)
-            shutil.rmtree(left)
+            if (folder / "old").exists() and not target.exists():
+                (folder / "old").rename(target)
+            shutil.rmtree(folder)

@@ -218,9 +218,10 @@ def _measure_code_size(folder: Path) -> int | None:
     if shutil.which("size") is None:
         return None
     # Lines of name, size and address; sections named with two underscores are those of macOS.
-    listed = _run_command("size", "-A", "step.o", folder=folder)
-    sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", listed, re.MULTILINE)
-    return sum(int(size) for name, size in sections if name.startswith((".text", ".rodata", "__text", "__const")))
+    table = _run_command("size", "-A", "step.o", folder=folder)
+    sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", table, re.MULTILINE)
+    code_and_constants = (".text", ".rodata", "__text", "__const")
+    return sum(int(size) for name, size in sections if name.startswith(code_and_constants))
 
 
 def _run_command(*command: str, folder: Path) -> str:

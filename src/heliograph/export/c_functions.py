@@ -16,7 +16,9 @@ def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
     start = f"int {prefix}_start_at({state}, const {real} mean[], const {real} covariance[])"
     predict = f"int {prefix}_predict({state}, const {real} u[])"
     correct = f"int {prefix}_correct({state}, const {real} z[], {prefix}_innovation *innovation)"
-    return [*([] if program.start_at is None else [start]), predict, correct, step]
+    if program.start_at is None:
+        return [predict, correct, step]
+    return [start, predict, correct, step]
 
 
 def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
@@ -162,7 +164,9 @@ def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> 
     """
     if not program.counts:
         return "0"
-    return "state->step > 0 ? state->step - 1 : 0" if part.name == "correct" else "state->step"
+    if part.name == "correct":
+        return "state->step > 0 ? state->step - 1 : 0"
+    return "state->step"
 
 
 def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
@@ -170,7 +174,7 @@ def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
 
     The state `after` is written to the caller's only where it is valid; the flag `none` is 1 where there is none.
     """
-    members = ", ".join(f"after.{m.name}" for m in program.members)
+    members = ", ".join(f"after.{member.name}" for member in program.members)
     return [
         f"    {prefix}_state after;",
         "    unsigned char none[1];",

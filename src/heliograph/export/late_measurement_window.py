@@ -112,11 +112,12 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
 
 def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
     """Return the heads of the window's functions in C: its start, a step, and a measurement of steps or time ago."""
-    held, ago = f"{prefix}_window *window", "uint32_t steps" if window.time is None else f"{real} age"
+    pointer = f"{prefix}_window *window"
+    how_late = "uint32_t steps" if window.time is None else f"{real} age"
     return [
-        f"void {prefix}_window_start({held})",
-        f"int {prefix}_window_step({held}, const {real} z[], const {real} u[])",
-        f"int {prefix}_window_late({held}, {ago}, const {real} z[])",
+        f"void {prefix}_window_start({pointer})",
+        f"int {prefix}_window_step({pointer}, const {real} z[], const {real} u[])",
+        f"int {prefix}_window_late({pointer}, {how_late}, const {real} z[])",
     ]
 
 

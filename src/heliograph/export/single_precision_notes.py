@@ -23,7 +23,11 @@ def explain_ranges(filter: AbstractFilter) -> list[str]:
     deviations = _find_noise_deviations(filter)
     if deviations is None:
         return [""] * filter.received
-    return [f" (up to {_round_down(SHARE * x / HALF_UNIT):g}, see below)" if x > 0 else "" for x in deviations]
+    notes = []
+    for deviation in deviations:
+        largest = _round_down(SHARE * deviation / HALF_UNIT) if deviation > 0 else 0.0
+        notes.append(f" (up to {largest:g}, see below)" if deviation > 0 else "")
+    return notes
 
 
 def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
@@ -31,15 +35,16 @@ def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
 
     A state in single precision may keep the digits of the mean that a float leaves out in a second array, `low`.
     """
-    lines = [
+    on_ranges = [
         "Up to the size that is noted, single precision rounds a component of z by a hundredth of its noise at most;",
         "beyond it take an origin off before it becomes a float, and off plant and sensor.",
     ]
-    apart = [
+    on_low_digits = [
         "mean is rounded to single precision. What that leaves out of mean[i] is state->low[i]: take an origin off",
         "mean[i] first, and then add it.",
     ]
-    return [*(lines if ranged else []), *(apart if isinstance(filter.init(), SplitMeanGaussian) else [])]
+    has_low_digits = isinstance(filter.init(), SplitMeanGaussian)
+    return [*(on_ranges if ranged else []), *(on_low_digits if has_low_digits else [])]
 
 
 def _find_noise_deviations(filter: AbstractFilter) -> np.ndarray | None:

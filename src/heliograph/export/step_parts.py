@@ -76,10 +76,11 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         The flags: z or u is implausible (see `is_implausible`); u spoils the digits of numbers of type `real`, of which
         ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
-        after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = is_implausible(filter, innovation, z, real) | (judgement.input > 0)
-        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
-        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
+        state = jax.tree.unflatten(tree, arrays)
+        state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
+        are_implausible = is_implausible(filter, innovation, z, real) | (judgement.input > 0)
+        spoils_digits = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
+        return [*jax.tree.leaves(state_after), estimate.mean, estimate.covariance, are_implausible, spoils_digits]
 
     return step
 
@@ -135,10 +136,11 @@ def is_implausible(filter: AbstractFilter, innovation: Innovation, z: jax.Array,
     z, such as a neighbour's measurement, every component that is so far away counts. A difference within ROUNDING,
     relative to z, counts nothing.
     """
-    far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
-    if differs.shape == z.shape:
-        larger = jnp.abs(z) > jnp.abs(z - innovation.value)
-        far &= larger & (differs > ROUNDING[real] * jnp.maximum(jnp.abs(z), 1e-33))
+    is_far, difference = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
+    if difference.shape == z.shape:
+        is_larger_than_expected = jnp.abs(z) > jnp.abs(z - innovation.value)
+        is_above_rounding = difference > ROUNDING[real] * jnp.maximum(jnp.abs(z), 1e-33)
+        is_far &= is_larger_than_expected & is_above_rounding
         if used := filter.angles_used():
-            far |= Judgement.find_unreadable(innovation, z, used.received, float(np.finfo(PRECISION[real]).eps))
-    return jnp.any(far)
+            is_far |= Judgement.find_unreadable(innovation, z, used.received, float(np.finfo(PRECISION[real]).eps))
+    return jnp.any(is_far)

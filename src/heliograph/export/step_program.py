@@ -248,10 +248,10 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
     symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
     while symmetric:
         codes = [_lower_part_to_c(part, symmetric, "step", "double") for part in parts]
-        lost = {n for n in symmetric if not all(code.results[n].symmetric for code in codes)}
-        if not lost:
+        made_otherwise = {n for n in symmetric if not all(code.results[n].symmetric for code in codes)}
+        if not made_otherwise:
             break
-        symmetric -= lost
+        symmetric -= made_otherwise
     return symmetric
 
 
@@ -264,14 +264,15 @@ def name_state_arrays(state: PyTree) -> list[str]:
     """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
-        # Each key of the path is that of an attribute, of a dictionary, or a place in a sequence.
-        parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
-        joined = "_".join(part for part in parts if part != "gaussian")
-        text = "".join(c if c.isalnum() and c.isascii() else "_" for c in joined)
-        text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
-        while text in RESERVED | ADDED or text in names:  # words of C, members beside these, names given before
-            text += "_"
-        names.append(text)
+        # Each key of the path is that of an attribute, of a dictionary, or an index in a sequence.
+        keys = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", "")))) for key in path]
+        joined = "_".join(key for key in keys if key != "gaussian")
+        name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in joined)
+        if not name or not name[0].isalpha():
+            name = f"state_{name}".rstrip("_")
+        while name in RESERVED | ADDED or name in names:  # words of C, members beside these, names given before
+            name += "_"
+        names.append(name)
     return names
 
 

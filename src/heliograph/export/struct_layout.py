@@ -1,6 +1,7 @@
 """Bytes of the structs of C in which a device holds an estimate."""
 
 from collections.abc import Sequence
+from math import ceil
 from typing import NamedTuple
 
 BYTES = {"double": 8, "float": 4, "unsigned char": 1, "int32_t": 4, "uint32_t": 4, "int64_t": 8, "uint64_t": 8}
@@ -24,11 +25,12 @@ def lay_out_struct(parts: Sequence[StructLayout]) -> StructLayout:
     Each part begins at a multiple of its alignment; the whole is filled up to a multiple of the largest of them.
     """
 
-    def round_up(total: int, alignment: int) -> int:
-        """Return the next multiple of `alignment`."""
-        return -(-total // alignment) * alignment
+    def round_up(size: int, alignment: int) -> int:
+        """Return the least multiple of `alignment` that is not below a size."""
+        return ceil(size / alignment) * alignment
 
-    total, largest = 0, max(part.alignment for part in parts)
+    size, largest_alignment = 0, max(part.alignment for part in parts)
     for part in parts:
-        total = round_up(total, part.alignment) + part.size
-    return StructLayout(round_up(total, largest), largest)
+        begin = round_up(size, part.alignment)
+        size = begin + part.size
+    return StructLayout(round_up(size, largest_alignment), largest_alignment)

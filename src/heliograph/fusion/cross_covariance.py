@@ -141,7 +141,9 @@ def make_initial_errors(
     The state x and all errors x - start have the covariance of x_0, and are fully correlated.
     """
     mean, starts = jnp.asarray(mean), jnp.asarray(starts)
-    return ErrorMoments(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
+    count = 1 + len(starts)  # the state itself, and the error of each node
+    means = jnp.concatenate([mean[None], mean - starts])
+    return ErrorMoments(means, jnp.tile(covariance, (count, count)))
 
 
 def make_error_step(filters: LinearStep, motion: Motion, observation: JointObservation) -> ErrorStep:
@@ -170,7 +172,9 @@ def propagate_state(
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Return E x and Cov x after a step x+ = matrix x + shift + w, Cov w = noise."""
     matrix = jnp.asarray(motion.matrix)
-    return matrix @ mean + motion.shift, symmetric(propagate_by_mode(matrix, covariance, motion.noise))
+    mean_after = matrix @ mean + motion.shift
+    covariance_after = symmetric(propagate_by_mode(matrix, covariance, motion.noise))
+    return mean_after, covariance_after
 
 
 def propagate_errors_jointly(errors: ErrorMoments, step: ErrorStep) -> ErrorMoments:

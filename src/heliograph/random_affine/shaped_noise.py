@@ -25,6 +25,7 @@ class Shaped(AbstractNoise):
     covariance: Square
 
     def __init__(self, matrix: "Float[ArrayLike, 'dimension source']", source: AbstractNoise):
+        """Hold B and the law of u; mean and covariance are B E[u] and B Cov[u] B'."""
         instance("source of a shaped noise", source, AbstractNoise, "a law of a noise vector")
         self.matrix = array("noise matrix", matrix, (None, source.dimension))
         self.source = source

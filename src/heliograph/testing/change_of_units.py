@@ -150,13 +150,14 @@ def _rescale_parts(filter: SequentialFilter, units: Units) -> list[AbstractFilte
 
     Factors of the parts' outputs, and of their measurements, follow one another in `units`.
     """
-    parts, output, received = [], 0, 0  # where those of the next part begin
-    for part in filter.filters:
-        next_output, next_received = output + len(first(part.sensor).outputs), received + part.received
-        own = units._replace(outputs=units.outputs[output:next_output], received=units.received[received:next_received])
-        parts.append(rescale_filter(part, own))
-        output, received = next_output, next_received
-    return parts
+    rescaled, output_begin, received_begin = [], 0, 0
+    for single in filter.filters:
+        output_end = output_begin + len(first(single.sensor).outputs)
+        received_end = received_begin + single.received
+        outputs, received = units.outputs[output_begin:output_end], units.received[received_begin:received_end]
+        rescaled.append(rescale_filter(single, units._replace(outputs=outputs, received=received)))
+        output_begin, received_begin = output_end, received_end
+    return rescaled
 
 
 def _rescale_noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
@@ -231,13 +232,10 @@ def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
     S and R are diagonal, of the factors of states and outputs in `units`; V: covariance of the noise.
     """
     s, r = units.states, units.outputs
+    noise = _rescale_noise(sensor.noise, r)
     if isinstance(sensor, LinearSensor):
-        return LinearSensor(
-            r[:, None] * sensor.matrix / s, _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
-        )
-    return Sensor(
-        FunctionInUnits(sensor.measure, r, (s,)), _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
-    )
+        return LinearSensor(r[:, None] * sensor.matrix / s, noise, sensor.outputs, sensor.circular)
+    return Sensor(FunctionInUnits(sensor.measure, r, (s,)), noise, sensor.outputs, sensor.circular)
 
 
 def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
@@ -255,12 +253,12 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """
     q, (_, factor) = units.received, _list_channel_factors(units)
 
-    def scaled(quadratic: QuadraticMap) -> QuadraticMap:
+    def scale(moments: QuadraticMap) -> QuadraticMap:
         """Return second moments of (G, n) in the other units."""
-        return QuadraticMap(factor * quadratic.center, factor * quadratic.radius)
+        return QuadraticMap(factor * moments.center, factor * moments.radius)
 
     gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
-    spread, shift, power, nominal = map(scaled, (channel.spread, channel.shift, channel.power, channel.nominal))
+    spread, shift, power, nominal = map(scale, (channel.spread, channel.shift, channel.power, channel.nominal))
     mean = np.concatenate([gain, offset[:, None]], axis=1)
     return describe_second_moments(mean, spread, shift, power, nominal, channel.uncertain)
 
@@ -309,14 +307,13 @@ def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> Unconditi
         return None
     s = units.states
 
-    def scaled(matrix: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
+    def scale(matrix: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
         """Return the product of each element with its factor, at each step."""
         return OverTime(factors * matrix.values) if isinstance(matrix, OverTime) else factors * matrix
 
-    received = scaled(centre.received, units.received[:, None] / s)
-    return UnconditionalMean(
-        s * centre.start, scaled(centre.transition, s[:, None] / s), scaled(centre.drift, s), received
-    )
+    transition, drift = scale(centre.transition, s[:, None] / s), scale(centre.drift, s)
+    received = scale(centre.received, units.received[:, None] / s)
+    return UnconditionalMean(s * centre.start, transition, drift, received)
 
 
 def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:

@@ -74,10 +74,10 @@ def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -
         The largest difference between samples and moments, in standard errors.
     """
     # Without the last row of each mean, that of the constant 1.
-    means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
+    means = np.array([mode_map.moments(1).mean[:-1] for mode_map in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
-    seen = np.einsum("sab,scd->sabcd", now, later)
-    return _compare_means("two draws in a row", expected.reshape(-1), seen.reshape(len(now), -1))
+    products = np.einsum("sab,scd->sabcd", now, later)
+    return _compare_means("two draws in a row", expected.reshape(-1), products.reshape(len(now), -1))
 
 
 def _compare_modes(
@@ -169,9 +169,9 @@ def _compare_means(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray
     standard_error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)
     scale = np.abs(seen).max(axis=0) + np.abs(expected)
-    certain = standard_error <= 1e-12 * scale  # the number does not vary: moments must agree to rounding
-    assert np.all(difference[certain] <= 1e-9 * scale[certain]), f"{what}: a known moment differs"
-    ratios = difference[~certain] / standard_error[~certain]
+    is_constant = standard_error <= 1e-12 * scale  # the number does not vary: moments must agree to rounding
+    assert np.all(difference[is_constant] <= 1e-9 * scale[is_constant]), f"{what}: a known moment differs"
+    ratios = difference[~is_constant] / standard_error[~is_constant]
     # Two-sided, with the probability of a false alarm shared by all numbers.
     limit = float(scipy.stats.norm.isf(FALSE_ALARM / 2 / max(len(ratios), 1)))
     largest = float(ratios.max(initial=0.0))

@@ -87,7 +87,8 @@ def _predict_and_correct(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Innovation]:
     """Return state, estimate and innovation after a prediction and a correction."""
-    corrected, innovation = filter.correct(filter.predict(state, u, k), z, k)
+    predicted = filter.predict(state, u, k)
+    corrected, innovation = filter.correct(predicted, z, k)
     return corrected, filter.estimate(corrected), innovation
 
 

@@ -76,15 +76,17 @@ def _find_worst_excess(
         claimed: B (n, n).
         generator: draws the directions from which the ascents begin.
     """
-    parts = [w @ p @ w.T for w, p in zip(np.split(gains, len(bounds), axis=1), bounds, strict=True)]
-    inverse, worst = np.linalg.pinv(claimed), -np.inf
+    weighted_bounds = [W @ P @ W.T for W, P in zip(np.split(gains, len(bounds), axis=1), bounds, strict=True)]
+    inverse_of_B, worst = np.linalg.pinv(claimed), -np.inf
     for v in generator.normal(size=(STARTS, len(claimed))):
         for _ in range(ASCENTS):
             v = v / np.linalg.norm(v)
-            sizes = [np.sqrt(v @ part @ v) for part in parts]
-            worst = max(worst, float(sum(sizes) ** 2 - v @ claimed @ v))
-            ascended = inverse @ sum(part @ v / size for part, size in zip(parts, sizes, strict=True) if size > 0)
-            v = ascended if np.linalg.norm(ascended) > 0 else v
+            deviations = [np.sqrt(v @ bound @ v) for bound in weighted_bounds]
+            worst = max(worst, float(sum(deviations) ** 2 - v @ claimed @ v))
+            pairs = zip(weighted_bounds, deviations, strict=True)
+            gradient = sum(bound @ v / deviation for bound, deviation in pairs if deviation > 0)
+            next_v = inverse_of_B @ gradient
+            v = next_v if np.linalg.norm(next_v) > 0 else v
     return worst
 
 
@@ -154,9 +156,10 @@ def _check_quantizer_steps(quantizer: AbstractQuantizer, n: int, steps: int, gen
 def _check_quantized(sent: Quantized, value: np.ndarray, n: int) -> None:
     """Check that what a quantizer delivers has the right shape, NaN in the right places, and keeps its bound."""
     assert all(np.shape(field) == (n,) for field in sent), f"step: expected parts of shape ({n},)"
-    unusable = np.asarray(sent.saturated) | np.isnan(value)
-    assert np.array_equal(np.isnan(sent.error), unusable), "error: expected NaN where saturated or NaN, and only there"
+    has_no_bound = np.asarray(sent.saturated) | np.isnan(value)
+    expectation = "error: expected NaN where saturated or NaN, and only there"
+    assert np.array_equal(np.isnan(sent.error), has_no_bound), expectation
     assert np.array_equal(np.isnan(sent.value), np.isnan(value)), "value: expected NaN for NaN, and only there"
     assert np.all(np.asarray(sent.symbols) >= 1), "symbols: expected at least one"
-    excess = (np.abs(sent.value - value) - sent.error * (1 + ROUNDING))[~unusable]
+    excess = (np.abs(sent.value - value) - sent.error * (1 + ROUNDING))[~has_no_bound]
     assert np.all(excess <= 0), f"error: expected a bound, exceeded by {excess.max(initial=0.0):g}"

@@ -166,13 +166,14 @@ def _count_possible_rows(network: Network, node: str, name: str, z: dict[str, np
     """
     fusion = network.fused[name] if node == Network.FUSED else network.nodes[node].filters[name]
     if isinstance(fusion, AbstractFilter):
-        central = node == Network.FUSED
-        runs = [(fusion, np.concatenate([z[n] for n in network.names], axis=1) if central else z[node])]
+        of_all_nodes = [z[single] for single in network.names]
+        filters = [(fusion, np.concatenate(of_all_nodes, axis=1) if node == Network.FUSED else z[node])]
     else:
-        runs = [(network.nodes[n].filters[fusion.filter], z[n]) for n in network.nodes_with(fusion.filter)]
-    impossible = [np.isneginf(filter.run(rows, u).log_likelihoods) for filter, rows in runs]
+        nodes = network.nodes_with(fusion.filter)
+        filters = [(network.nodes[single].filters[fusion.filter], z[single]) for single in nodes]
+    is_impossible = [np.isneginf(filter.run(rows, u).log_likelihoods) for filter, rows in filters]
     # The index of the first impossible row; a True behind all rows stands for none.
-    return int(np.argmax(np.append(np.any(impossible, axis=0), True)))
+    return int(np.argmax(np.append(np.any(is_impossible, axis=0), True)))
 
 
 def _check_differences(name: str, differences: np.ndarray) -> float:
@@ -209,11 +210,11 @@ def _rescale_node(name: str, node: Node, units: Units) -> Node:
     # Of a channel without memory: the map of each set of losses.
     maps = [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]
     for affine in maps:
-        turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
-        off = _measure_difference(rescale_channel(second_order(affine), units), second_order(turned))
+        in_units = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
+        difference = _measure_difference(rescale_channel(second_order(affine), units), second_order(in_units))
         # DIGITS: the largest relative difference that is allowed.
-        assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
-    filters = {f: rescale_filter(filter, units) for f, filter in node.filters.items()}
+        assert difference <= DIGITS, f"{name}: expected the channel's moments in other units, off by {difference:.3g}"
+    filters = {filter_name: rescale_filter(filter, units) for filter_name, filter in node.filters.items()}
     return Node(rescale_sensor(node.sensor, units), _change_units_of_channel(node.channel, units), filters)
 
 
