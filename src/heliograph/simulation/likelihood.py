@@ -1,6 +1,7 @@
 """Log-likelihood of recorded data under a filter's model: the sum over its innovations."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,7 @@ def log_likelihood(
     instance("filter", filter, AbstractFilter, "a filter")
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
-        return _sum_log_likelihoods(*arguments)
+        return _sum_traced(*arguments)
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if total is not None:  # it could be done in chunks
         return float(total)
@@ -56,6 +57,15 @@ def _sum_log_likelihoods(
     """Return the sum of the innovations' log-likelihoods over all rows, filtered one after another."""
     log_likelihoods = filter.scan(z, u, partial(_judge_likelihood, filter))
     return jnp.sum(log_likelihoods)
+
+
+def _sum_traced(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
+    """Return `_sum_log_likelihoods` within a trace, with derivatives by the filter's own way where it has one."""
+    if not filter.has_score_recursion:
+        return _sum_log_likelihoods(filter, z, u)
+    linear: Any = filter  # a `LinearFilter`
+    traced: jax.Array = linear.trace_log_likelihood(_sum_log_likelihoods, z, u)
+    return traced
 
 
 def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:

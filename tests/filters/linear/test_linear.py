@@ -159,3 +159,11 @@ def test_a_random_gain_makes_the_claim_one_for_inputs_known_in_advance(closed, l
 
 
 SCALAR_SENSOR = hg.LinearSensor([[1.0]], 0.1)
+
+
+def test_a_mean_that_decays_for_ever_stays_a_normal_number():
+    """0.9^8000 is 1e-366: below 2e-308 processors compute ten times as long, and by 0.9 the least number stays."""
+    plant, sensor = hg.LinearPlant([[0.9]], [[0.1]], [1.0], [[1.0]]), hg.LinearSensor([[1.0]], [[0.2]])
+    filtered = hg.linear_filter(plant, sensor, hg.hop(hg.Rayleigh(0.8), 0.1)).run(np.zeros((8000, 1)))
+    mean = abs(float(filtered.origin.state.state_mean[0]))
+    assert mean == 0 or mean > 1e-150  # and so is its square

@@ -41,6 +41,15 @@ def everywhere():
     return hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(2), {})})
 
 
+def fading():
+    """A plant whose moments before data settle, from a start with a mean, behind a random gain with a free law."""
+    plant = hg.LinearPlant(
+        [[0.95, 0.1], [-0.1, 0.9]], hg.free(0.1, "q") * np.eye(2), hg.free(1.0, "start", "real") * np.ones(2), np.eye(2)
+    )
+    link = hg.hop(hg.Rayleigh(hg.free(0.8, "scale")), 0.05, dimension=2)
+    return hg.Network(plant, {"node": hg.Node(hg.LinearSensor(np.eye(2), hg.free(0.2, "r") * np.eye(2)), link, {})})
+
+
 def evaluated(network, z, u, by_row=False):
     objective = make_objectives(describe(network))[0]
     data = LikelihoodData(z[None], u[None], (len(z),))
@@ -51,8 +60,8 @@ def evaluated(network, z, u, by_row=False):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("network", "z"),
-    [(walk, FEW_HOLES), (walk, HOLES), (everywhere, FEW_HOLES), (everywhere, HOLES)],
-    ids=["walk, few missing", "walk, missing", "everywhere, few missing", "everywhere, missing"],
+    [(walk, FEW_HOLES), (walk, HOLES), (everywhere, FEW_HOLES), (everywhere, HOLES), (fading, FEW_HOLES)],
+    ids=["walk, few missing", "walk, missing", "everywhere, few missing", "everywhere, missing", "fading, few missing"],
 )
 def test_the_gradient_is_that_of_the_sequential_pass(monkeypatch, network, z):
     """To 1e-10 of a standard deviation of the score, sqrt(I), and information to 1e-10 of two of them."""

@@ -39,6 +39,7 @@ from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memories_of_channels import is_memory_dependent
@@ -120,6 +121,12 @@ class LinearFilter(AbstractSizedFilter):
         """Whether the channel's law is known and no noise depends on the signal but by a random gain."""
         return not (stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor))
 
+    @property
+    def has_known_gain(self) -> bool:
+        """Whether no gain is random, so that no moment before data matters; of a traced law it counts as random."""
+        spread = stack_over_time(self.channel).gain_spread
+        return not (is_traced(spread) or np.any(np.asarray(spread)))
+
     def score_rows(
         self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array
     ) -> "ScoreRecursion":
@@ -134,9 +141,15 @@ class LinearFilter(AbstractSizedFilter):
         """
         from heliograph.filters.linear.likelihood_scores import ScoreRecursion  # not before a fit needs it
 
-        # Behind a known gain no moment before data matters.
-        known_gain = not np.any(np.asarray(stack_over_time(self.channel).gain_spread))
-        return ScoreRecursion(make, x, half, known_gain, informed=True)
+        return ScoreRecursion(make, x, half, self.has_known_gain, informed=True)
+
+    def trace_log_likelihood(
+        self, plain: Callable[..., jax.Array], z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+    ) -> jax.Array:
+        """Return plain(self, z, u), the log-likelihood, with the derivatives of a filter that `has_score_recursion`."""
+        from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
+
+        return trace_log_likelihood(plain, self, z, u)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

@@ -81,14 +81,12 @@ def evaluate_at_points(
 def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodData, by_row: bool) -> Evaluation | None:
     """Return the evaluation at one point x (p,), each recording in chunks side by side; None where that cannot be done.
 
-    It cannot where recordings are short, true states are learned from, or the filter's gains are random.
+    It cannot where recordings are short, true states are learned from, or the filter forgets too late.
     """
     linear = _find_linear_filter(objective) if data.truth is None else None
     if linear is None:
         return None
     recursion = linear.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2))
-    if not recursion.known_gain:
-        return None
     by_recording = []
     for z, u in zip(data.measurements, data.inputs, strict=True):
         evaluated = recursion.scan_long(z, u) if by_row else recursion.sum_long(z, u)

@@ -1,0 +1,103 @@
+"""Log-likelihood of rows under a linear filter of traced numbers: of few operations where JAX differentiates it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from heliograph.filters.linear.linear_filter_state import LinearBelief, MomentsBeforeData
+from heliograph.filters.linear.step_by_covariances import (
+    FactoredStep,
+    StateMoments,
+    find_model_matrices,
+    find_moments_at_start,
+    step_by_covariances,
+    take_derivatives_of_log_density,
+)
+from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.types import Array, Float, PyTree
+
+# The filter's state; the moments of its estimate; those before any data, None behind a known gain.
+Carried = tuple[LinearBelief, StateMoments, MomentsBeforeData | None]
+
+
+def trace_log_likelihood(
+    plain: Callable[..., jax.Array], filter: Any, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+) -> jax.Array:
+    """Return the log-likelihood of rows by the filter's factors, with derivatives by its covariances.
+
+    Args:
+        plain: the log-likelihood by the factors, a function of filter, z and u.
+        filter: a `LinearFilter` with `has_score_recursion`, of which some numbers are traced.
+        z: measurements, NaN for what did not arrive.
+        u: inputs.
+    """
+    leaves, form = jax.tree.flatten((filter, z, u))
+    traced = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]  # what is known stays known
+
+    @jax.custom_jvp
+    def evaluate(values: list[jax.Array]) -> jax.Array:
+        """Return the log-likelihood at these values of what is traced."""
+        return plain(*jax.tree.unflatten(form, _replace_entries(leaves, traced, values)))
+
+    def differentiate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+        """Return the log-likelihood and its derivative along the tangents, of which some are known to be zero."""
+        (values,), (slopes,) = primals, tangents
+        moving = [n for n, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
+
+        def by_covariances(moved: list[jax.Array]) -> jax.Array:
+            """Return the log-likelihood with other values of what moves."""
+            all_values = _replace_entries(values, moving, moved)
+            return _sum_by_covariances(*jax.tree.unflatten(form, _replace_entries(leaves, traced, all_values)))
+
+        return jax.jvp(by_covariances, ([values[n] for n in moving],), ([slopes[n] for n in moving],))
+
+    evaluate.defjvp(differentiate, symbolic_zeros=True)
+    return evaluate([leaves[i] for i in traced])
+
+
+def _replace_entries(entries: list[Any], places: list[int], values: list[jax.Array]) -> list[Any]:
+    """Return a list with these values in these places."""
+    changed = dict(zip(places, values, strict=True))
+    return [changed.get(i, entry) for i, entry in enumerate(entries)]
+
+
+def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
+    """Return the log-likelihood of all rows; NaN where the estimate is no number, as such a row looks lost.
+
+    Values are by the filter's factors, derivatives by its covariances (`step_by_covariances`).
+
+    Args:
+        filter: a `LinearFilter` with `has_score_recursion`.
+        z: measurements, NaN for what did not arrive.
+        u: inputs.
+    """
+    constant = _hold_constant(filter)
+
+    def step(before: Carried, row: tuple[jax.Array, ...]) -> tuple[Carried, jax.Array]:
+        """Filter a row (number, measurement, input) in factors, nothing of which is differentiated, and by covariances.
+
+        Return what is carried to the next row, and the log-likelihood of this one.
+        """
+        (state, moments, before_data), (k, z, u) = before, row
+        prior = constant.predict(state, _hold_constant(u), k)
+        after, innovation = constant.correct(prior, _hold_constant(z), k)
+        factored = FactoredStep(prior.gaussian, after.gaussian, innovation.value, innovation.covariance)
+        matrices, before_data = find_model_matrices(filter, before_data, u, k, by_columns=True)
+        moments, e, S = step_by_covariances(matrices, moments, z, factored)
+        lost = jnp.any(jnp.isnan(after.gaussian.mean))
+        density = take_derivatives_of_log_density(e, S, innovation.log_likelihood)
+        return (after, moments, before_data), jnp.where(lost, jnp.nan, density)
+
+    moments = find_moments_at_start(filter)
+    start = jax.tree.map(jnp.asarray, constant.init())
+    before_data = None if filter.has_known_gain else MomentsBeforeData(*moments)
+    rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)
+    return jnp.sum(jax.lax.scan(step, (start, moments, before_data), rows)[1])
+
+
+def _hold_constant(tree: PyTree) -> PyTree:
+    """Return the same numbers, of which the traced ones are not differentiated, and known ones stay known."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf, tree)
