@@ -14,6 +14,8 @@ from .atomic_files import whole_file as whole_file
 from .atomic_files import whole_files as whole_files
 from .atomic_files import whole_folder as whole_folder
 from .colours_of_figures import COLOURS as COLOURS
+from .kept_inputs import find_network_file as find_network_file
+from .kept_inputs import refuse_replacing as refuse_replacing
 from .quoted_text import join_names as join_names
 from .quoted_text import label_with_unit as label_with_unit
 from .quoted_text import quote_for_cell as quote_for_cell

@@ -4,6 +4,8 @@ from .angle import Angles as Angles
 from .angle import TURN as TURN
 from .angle import angles_at as angles_at
 from .angle import continue_angles as continue_angles
+from .angle import find_wraps as find_wraps
+from .angle import insert_gaps as insert_gaps
 from .angle import read_angles as read_angles
 from .angle import wrap_angles as wrap_angles
 from .angle import wrap_near as wrap_near
@@ -152,11 +154,14 @@ from .times.dates import parse_dates as parse_dates
 from .times.dates import parse_instant as parse_instant
 from .times.dates import parse_moment as parse_moment
 from .times.dates import read_compact_date as read_compact_date
+from .times.dates import round_to_nanoseconds as round_to_nanoseconds
 from .times.dates import seconds_between as seconds_between
 from .times.dates import unequal_steps as unequal_steps
 from .times.row_times import backwards_text as backwards_text
+from .times.row_times import check_dates as check_dates
 from .times.row_times import check_times as check_times
 from .times.row_times import find_backwards_row as find_backwards_row
+from .times.row_times import is_mix_of_units as is_mix_of_units
 from .times.row_times import row_dates as row_dates
 from .times.timestamp_order import SECOND as SECOND
 from .times.timestamp_order import YEAR as YEAR
