@@ -6,8 +6,8 @@ of one program, a lane each. Nothing is taken on trust: the state in which a chu
 with which the next one began agree to `TOLERANCE` of a deviation, or the latter is filtered again from the former. The
 difference e that is left between two means has an e' P^-1 e that never grows, P the covariance that the filter claims.
 
-Behind a random gain the noise holds the moments of the state before data. Where these grow without end, so does it, the
-gains go to zero, and ever more rows are needed to forget: such recordings are filtered row after row.
+Behind a random gain the noise grows with the moments of the state before data. Where these have no end, ever more rows
+are needed to forget: such recordings are filtered row after row.
 
 Products of a row, of 4 states and 2 outputs: 257. The elements (A, b, C, eta, J) of a scan by an associative operation,
 which need no forgetting, take 257, 128 for the columns of A and 120 for the factors of J, before the row is filtered
@@ -279,9 +279,8 @@ def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, 
     for begin in range(0, len(jax.tree.leaves(rows)[0]), rows_at_once):
         blocks = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
                               take_windows(rows, np.array([begin]), rows_at_once))  # fmt: skip
-        choice = choose_code(
-            _predict_data_free_parts, (recursion, state, blocks, np.asarray(begin)), differs_by_run=[False] * 4
-        )
+        arguments = recursion, state, blocks, np.asarray(begin)
+        choice = choose_code(_predict_data_free_parts, arguments, differs_by_run=[False] * 4)
         if choice.code is None:
             return None
         last, before = jax.tree.map(lambda leaf: leaf[0, ...], choice.results())
@@ -363,8 +362,7 @@ def scan_means_where_settled(
         scan_in_full: results of some chunks from the states with which these begin.
         scan_means: results of all chunks, as if they were settled; None where these do not settle.
     """
-    # The means are scanned of all chunks, which does not pay where few are settled.
-    # `covered`: which chunks are settled.
+    # `covered`: which chunks are settled. The means of all are scanned, which does not pay where few are settled.
     settled = None if np.mean(begun.covered) < 0.5 else begun.settled
     results = None if settled is None else scan_means(settled)
     if results is None:

@@ -22,6 +22,7 @@ from heliograph.forecasting.scores import (
     compute_probability_below,
     crps,
     log_score,
+    select_law,
 )
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.angle import wrap_angles
@@ -274,7 +275,7 @@ def _score_filter(
             number = node, target.filter, forecasts.part, name
             came, is_angle = forecasts.came[:, i], i in forecasts.angles
             for j, horizon in enumerate(ahead):
-                law = _select_law(forecasts.moments, i, j)
+                law = select_law(forecasts.moments, i, j)
                 scores.append(_score_number(number, horizon, law, came, first, is_angle))
     return scores
 
@@ -297,17 +298,6 @@ def _roll_segments(
 
     joined: tuple[Moments, Moments | None] = jax.tree.map(join, *rolled)
     return joined
-
-
-def _select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
-    """Return the law of one number at one horizon (its index), from each row."""
-    if moments.laws is not None:
-        weights, means, variances = map(np.asarray, moments.laws)
-        of_number = (slice(None), horizon, slice(None), number)
-        return MixtureLaws(weights[of_number], means[of_number], variances[of_number])
-    weights, means = np.asarray(moments.weights), np.asarray(moments.means)
-    variances = np.asarray(moments.covariances)  # of numbers by themselves, in the place of covariances
-    return MixtureLaws(weights[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
 def _score_number(

@@ -242,7 +242,7 @@ def _draw_paths_from_states(
         """Draw row k of a path; return state and mode there, which the next row begins with, and state and output.
 
         `plant` and `sensor` are the models of all rows, `switching` is how their modes move, `step` the number of the
-        first row, and `learned` the deviations of the sensor's noise in units of its own.
+        first row.
         """
         (x, mode), (u_k, k) = before, row
         key_of_row = jax.random.fold_in(key, k)
@@ -256,12 +256,7 @@ def _draw_paths_from_states(
         x = limits.hold(limits.mirror(plant_k.plus(moved, plant_k.sample_noise(key_of_plant, u_k))))
         if sensor_k is None:
             return (x, mode), (x, jnp.zeros(0))
-        sensor_k = sensor_k.under(plant_k.inputs, u_k)
-        law, noise = sensor_k.noise, sensor_k.noise.sample(key_of_sensor)
-        if learned is not None:
-            noise = law.mean + jnp.asarray(learned) * (noise - law.mean)
-        y = wrap_angles(sensor_k.measure(x) + noise, sensor_k.angles)
-        return (x, mode), (x, y)
+        return (x, mode), (x, _draw_outputs(sensor_k.under(plant_k.inputs, u_k), x, key_of_sensor, learned))
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from a state and a mode.
@@ -275,3 +270,15 @@ def _draw_paths_from_states(
 
     paths: tuple[jax.Array, jax.Array] = jax.vmap(draw_path)(jax.tree.map(jnp.asarray, starts), keys)
     return paths
+
+
+def _draw_outputs(sensor: Any, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
+    """Return what a sensor measures (m,) of a state x, with noise drawn from its law.
+
+    `learned`: deviations of the noise in units of its own (m,), where a filter learned them; else None.
+    """
+    law, noise = sensor.noise, sensor.noise.sample(key)
+    if learned is not None:
+        noise = law.mean + jnp.asarray(learned) * (noise - law.mean)
+    y: jax.Array = wrap_angles(sensor.measure(x) + noise, sensor.angles)
+    return y

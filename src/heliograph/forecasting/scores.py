@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from heliograph.forecasting.mixture_moments import Moments
 from heliograph.numerics.gaussian_density import LOG_TURN
 
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the central intervals whose coverage is counted
@@ -22,6 +23,17 @@ class MixtureLaws(NamedTuple):
     def mean(self) -> np.ndarray:
         """Mean of each row's forecast (rows,)."""
         return np.asarray(np.sum(self.weights * self.means, axis=1))
+
+
+def select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
+    """Return the law of one number at one horizon (its index), from each row."""
+    if moments.laws is not None:
+        weights, means, variances = map(np.asarray, moments.laws)
+        of_number = (slice(None), horizon, slice(None), number)
+        return MixtureLaws(weights[of_number], means[of_number], variances[of_number])
+    weights, means = np.asarray(moments.weights), np.asarray(moments.means)
+    variances = np.asarray(moments.covariances)  # of numbers by themselves, in the place of covariances
+    return MixtureLaws(weights[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
 def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:

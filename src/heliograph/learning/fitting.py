@@ -261,8 +261,7 @@ def fit(
         recording: what `hg.run` takes, measurements (steps, received) by node, or rows of the one node alone, NaN for
             what did not arrive; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
             Readings that a node refuses count as not arrived.
-        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
-            none).
+        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording (default none).
         starts: number of starts: the given one, and others drawn around it (default 6).
         seed: seed of the starts that are drawn (default 0).
         progress: called with a line of text at each step (default none).
