@@ -105,7 +105,7 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
             Rows count from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    return read_rows(file_path("table", path), None, strict=True).columns
+    return read_rows(file_path("table", path), only=None, strict=True).columns
 
 
 def read_rows(path: Path, only: Container[str] | None, strict: bool) -> TableRows:
