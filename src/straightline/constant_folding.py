@@ -382,6 +382,6 @@ SIMPLER: dict[str, Callable[..., Node | None]] = {
     "and": _fold_and, "or": _fold_or, "xor": _fold_xor, "not": _fold_not, "select": _fold_select,
     "shift_left": _fold_shift, "shift_right": _fold_shift, "max": _fold_extremum, "min": _fold_extremum,
     "eq": _make_equality_rule("eq"), "ne": _make_equality_rule("ne"), "convert": _fold_convert,
-    "lt": _make_flag_order_rule(True, False), "le": _make_flag_order_rule(False, False),
-    "gt": _make_flag_order_rule(True, True), "ge": _make_flag_order_rule(False, True),
+    "lt": _make_flag_order_rule(strict=True, turned=False), "le": _make_flag_order_rule(strict=False, turned=False),
+    "gt": _make_flag_order_rule(strict=True, turned=True), "ge": _make_flag_order_rule(strict=False, turned=True),
 }  # fmt: skip

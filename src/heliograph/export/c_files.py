@@ -199,7 +199,7 @@ def measure_step_cost(header: Path, source: Path, received: int, inputs: int, re
     """Return the bytes of code and the time of a step, compiled in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:
-        return StepCost(None, None)
+        return StepCost(code_bytes=None, nanoseconds=None)
     with tempfile.TemporaryDirectory() as temporary:
         folder, name = Path(temporary), source.stem
         for path in (header, source):

@@ -52,7 +52,7 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
             return _find_network(module, name, source_name, path), vars(module)
     # A module, by its name.
     with _allow_imports_from(Path.cwd()):
-        source = _call_user_code(lambda: _find_source_file(source_name), source_name, None)
+        source = _call_user_code(lambda: _find_source_file(source_name), source_name, path=None)
         module = _call_user_code(lambda: importlib.import_module(source_name), source_name, source)
         return _find_network(module, name, source_name, source), vars(module)
 

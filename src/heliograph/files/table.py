@@ -124,7 +124,7 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
             Rows count from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    columns = read_rows(file_path("table", path), None, strict=True).columns
+    columns = read_rows(file_path("table", path), only=None, strict=True).columns
     # Of a whole number that is missing a user knows NaN alone.
     return {
         name: convert_to_doubles(column) if column.dtype.kind == "i" and np.any(find_missing(column)) else column

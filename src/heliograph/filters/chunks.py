@@ -364,8 +364,7 @@ def scan_means_where_settled(
     """
     # `covered`: which chunks are settled. The means of all are scanned, which does not pay where few are settled.
     settled = None if np.mean(begun.covered) < 0.5 else begun.settled
-    results = None if settled is None else scan_means(settled)
-    if results is None:
+    if settled is None or (results := scan_means(settled)) is None:
         return scan_in_full(begun.states, slice(None))
     if len(unsettled_chunks := np.flatnonzero(~begun.covered)):
         replace_chunk(results, unsettled_chunks, scan_in_full(take(begun.states, unsettled_chunks), unsettled_chunks))

@@ -150,7 +150,7 @@ def _judge_identifiability(
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
     identifiability = Identifiability(parameters, groups, ridges, weakest, ())
-    return replace(identifiability, sentences=describe_unidentified(identifiability, None))
+    return replace(identifiability, sentences=describe_unidentified(identifiability, solution=None))
 
 
 def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:

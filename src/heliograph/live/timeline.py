@@ -93,7 +93,7 @@ class Timeline:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot of its table to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
-        self._plant, self._spare = self._fleet.begin_plant("", start, None), self._fleet.pool.take_slot()
+        self._plant, self._spare = self._fleet.begin_plant("", start, origin=None), self._fleet.pool.take_slot()
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
@@ -279,7 +279,7 @@ class Timeline:
         are kept.
         """
         time, outputs = self._finals.take_all()
-        return Record(time, self.network.states, None, {}, self._arrange_outputs(outputs))
+        return Record(time, self.network.states, truth=None, measurements={}, estimates=self._arrange_outputs(outputs))
 
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""

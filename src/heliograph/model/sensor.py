@@ -152,7 +152,7 @@ class Sensor(AbstractSensor):
         self.inputs = read_input_names(inputs)
         if self.inputs:
             self.function = function("measure of a sensor", measure, "(x, u)")
-            self.outputs, self.noise = read_noise_of_inputs(noise, outputs, None, self.inputs)
+            self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows=None, inputs=self.inputs)
             self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
             return
@@ -314,11 +314,11 @@ def _drop_names(model: Any) -> Any:
     """Return the sensor with outputs called y0, y1, ..., and so the sensors inside it; what is no sensor as it is."""
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
-    parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))
-    bare = jax.tree.unflatten(tree, [_drop_names(part) for part in parts])  # a copy, so that it may be changed
-    object.__setattr__(bare, "outputs", names("sensor outputs", None, len(model.outputs), "y"))
-    object.__setattr__(bare, "circular", tuple(f"y{i}" for i in model.angles))
-    return bare
+    leaves, tree = jax.tree.flatten(model, is_leaf=lambda leaf: leaf is not model and _is_sensor(leaf))
+    copy = jax.tree.unflatten(tree, [_drop_names(leaf) for leaf in leaves])
+    object.__setattr__(copy, "outputs", names("sensor outputs", None, count=len(model.outputs), prefix="y"))
+    object.__setattr__(copy, "circular", tuple(f"y{i}" for i in model.angles))
+    return copy
 
 
 AnySensor = TypeAliasType("AnySensor", AbstractSensor | OverTime)  # an OverTime holds one sensor per step

@@ -310,7 +310,7 @@ def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
 
 def _take(x: Any, i: int, axis: int) -> Any:
     """Return entry i along an axis; of a known array a known one."""
-    return lax.index_in_dim(x, i, axis, False) if isinstance(x, jax.Array) else np.take(x, i, axis)
+    return lax.index_in_dim(x, i, axis, keepdims=False) if isinstance(x, jax.Array) else np.take(x, i, axis)
 
 
 def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int], left: bool) -> Compensated:

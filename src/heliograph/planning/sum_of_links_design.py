@@ -325,7 +325,7 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
     # The sum in which each transmitter sends what it measures (an amplification of None).
     unit = channel
     for hop in transmitter_names(channel):
-        amplified = amplify_transmitter(unit, hop, None)
+        amplified = amplify_transmitter(unit, hop, factor=None)
         assert isinstance(amplified, Superposed)
         unit = amplified
     # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver. The

@@ -157,7 +157,7 @@ def set_transmitter_powers(
         if name in powers:
             power_now = compute_sent_powers(channel, second, step)[name]
             if power_now <= 0 < powers[name]:  # silent so far: it sends what it receives, and is scaled then
-                channel = amplify_transmitter(channel, name, None)
+                channel = amplify_transmitter(channel, name, factor=None)
                 power_now = compute_sent_powers(channel, second, step)[name]
             if power_now <= 0 < powers[name]:
                 raise fail(f"transmitter {name!r}", "a signal that can be amplified", "none")

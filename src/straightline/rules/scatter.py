@@ -149,7 +149,7 @@ def _yield_starts(
 
 
 RULES |= {
-    "scatter": _make_scatter_rule(None), "scatter-sub": _make_scatter_rule("sub"),
+    "scatter": _make_scatter_rule(op=None), "scatter-sub": _make_scatter_rule("sub"),
     "scatter-add": _make_scatter_rule("add"), "scatter_add": _make_scatter_rule("add"),
     "scatter-mul": _make_scatter_rule("mul"), "scatter_mul": _make_scatter_rule("mul"),
     "scatter-min": _make_scatter_rule("min"), "scatter-max": _make_scatter_rule("max"),

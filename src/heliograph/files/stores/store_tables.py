@@ -141,7 +141,7 @@ def read_store(url: str) -> dict[str, np.ndarray]:
         ValueError: the server is away or refuses, no rows, no `time` in InfluxDB's answer, a column of text. One line.
         ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
     """
-    return query_store(parse_store(url)).rows(None).columns
+    return query_store(parse_store(url)).rows(only=None).columns
 
 
 def store_estimates(record: Record, url: str, plant: str = "", origin: np.datetime64 | None = None) -> None:

@@ -62,10 +62,10 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     # All filled up to the longest: nothing arrives in the rows that are added, the last inputs go on.
     longest = max(lengths)
     data = LikelihoodData(
-        measurements=np.stack([_pad_rows(z, longest, np.nan) for z, _ in runs]),
-        inputs=np.stack([_pad_rows(u, longest, None) for _, u in runs]),
+        measurements=np.stack([_pad_rows(z, longest, filler=np.nan) for z, _ in runs]),
+        inputs=np.stack([_pad_rows(u, longest, filler=None) for _, u in runs]),
         lengths=tuple(lengths),
-        truth=np.stack([_pad_rows(x, longest, np.nan) for x in true_states]) if true_states else None,
+        truth=np.stack([_pad_rows(x, longest, filler=np.nan) for x in true_states]) if true_states else None,
     )
     _check_enough_data(data, free)
     return data

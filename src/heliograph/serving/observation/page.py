@@ -82,7 +82,7 @@ def parse_page_address(
             raise fail("page, host", "a name without scheme and port, such as pages.example.org", repr(name))
     token = (os.environ if environment is None else environment).get(TOKEN, "")
     if _is_loopback(host) and not token:
-        return PageAddress(host, int(port), None, tuple(hosts))
+        return PageAddress(host, int(port), token=None, hosts=tuple(hosts))
     if len(token) < LEAST_TOKEN:
         expected = f"a token of {LEAST_TOKEN} characters at least in {TOKEN}"
         raise fail(f"page at {host}", expected, f"one of {len(token)}")
