@@ -122,9 +122,7 @@ def test_other_than_gaussian_noise_is_refused(law):
     """By its variance alone send-on-delta behind this contaminated noise had a rate of .511, which is .433."""
     plant = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0)
     for compute in (send_on_delta_rate, delta_for_rate, prediction_error_rate, least_error):
-        with pytest.raises(
-            hg.InputError, match=r"Gaussian noises \(simulate_rate takes any\), got Gaussian and"
-        ):
+        with pytest.raises(hg.InputError, match=r"Gaussian noises \(simulate_rate takes any\), got Gaussian and"):
             compute(plant, hg.LinearSensor([[1.0]], law), 0.3)
         with pytest.raises(hg.InputError, match="expected Gaussian noises"):
             compute(hg.LinearPlant([[0.9]], law, [0.0], 1.0), NOISY, 0.3)
