@@ -114,3 +114,17 @@ def test_what_cannot_be_compared_is_refused(values, dimension, words):
         hg.consistency(values, dimension)
     with pytest.raises(ValueError, match="confidence"):
         hg.consistency([1.0], 1, confidence=1.0)
+
+
+@pytest.mark.parametrize("judge", [lambda e, p: hg.nees(e, 0 * e, p), hg.nis])
+def test_a_matrix_that_is_no_covariance_is_refused(judge):
+    """Of an asymmetric one only a triangle would count; an indefinite one gave NaN, which counts as missing."""
+    e = np.ones((3, 2))
+    with pytest.raises(hg.InputError, match="covariance: expected symmetric matrices, got entries that differ by 1 "):
+        judge(e, np.array([[2.0, 1.0], [0.0, 2.0]]))
+    indefinite = np.stack([np.eye(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.eye(2)])
+    with pytest.raises(hg.InputError, match="covariance at 1: expected a positive semidefinite .* eigenvalue -1$"):
+        judge(e, indefinite)
+    # What is missing is no claim, and a state known exactly is one.
+    assert np.isnan(judge(e, np.full((2, 2), np.nan))).all()
+    assert judge(e, np.diag([0.0, 1.0])).tolist() == [np.inf] * 3

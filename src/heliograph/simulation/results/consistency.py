@@ -12,11 +12,12 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.model.plant import AnyPlant, read_manifold
 from heliograph.model.sensor import AnySensor, angles_of_outputs
 from heliograph.numerics.angle import wrap_angles
-from heliograph.numerics.check import array, check_count, fail, rank, scalar
+from heliograph.numerics.check import array, check_count, fail, rank, scalar, standard_deviations
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
+ASYMMETRY = 1e-6  # of two standard deviations: covariances come from other programs, too, and from files
 DIMENSION_WORDS = "the degrees of freedom: a positive number, or one of each value"
 
 
@@ -71,7 +72,8 @@ def nees(
             states they are, whose attitudes err by turns then; none by default.
 
     Raises:
-        ValueError: shapes that do not fit, numbers that are not finite, angles that are no places in the state.
+        ValueError: shapes that do not fit, numbers that are not finite, a matrix that is no covariance, angles that are
+            no places in the state.
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
@@ -100,7 +102,8 @@ def nis(
             as a filter's own innovations are between -pi and pi already.
 
     Raises:
-        ValueError: shapes that do not fit, infinite numbers, angles that are no places in the innovation.
+        ValueError: shapes that do not fit, infinite numbers, a matrix that is no covariance, angles that are no places
+            in the innovation.
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
@@ -114,10 +117,16 @@ def nis(
 def _broadcast_covariance_to_steps(
     covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps n n"]:
-    """Return the covariance of each step; one matrix is that of all steps."""
+    """Return the covariance of each step; one matrix is that of all steps. Raise ValueError if one is not symmetric."""
     n = x.shape[-1]
     shape = (n, n) if rank("covariance", covariance) == 2 else (*x.shape, n)
-    return np.broadcast_to(array("covariance", covariance, shape, missing=True), (*x.shape, n))
+    matrices = array("covariance", covariance, shape, missing=True)
+    deviations = standard_deviations(matrices)
+    asymmetry = np.abs(matrices - np.swapaxes(matrices, -1, -2))
+    if np.any(asymmetry > ASYMMETRY * deviations[..., :, None] * deviations[..., None, :]):
+        largest = np.nanmax(asymmetry)
+        raise fail("covariance", "symmetric matrices", f"entries that differ by {largest:.3g} across the diagonal")
+    return np.broadcast_to(matrices, (*x.shape, n))
 
 
 def _compute_normalised_square(
@@ -129,6 +138,9 @@ def _compute_normalised_square(
         x: errors or innovations.
         covariance: P of each step.
         size: numbers of which x is a difference, by which its rounding is judged.
+
+    Raises:
+        ValueError: a covariance with a negative eigenvalue.
     """
     # A missing component counts as zero, of variance 1, correlated with nothing: it adds 0^2 / 1.
     present, n = ~np.isnan(x), x.shape[-1]
@@ -138,6 +150,14 @@ def _compute_normalised_square(
     # One matrix after another, whatever the leading axes are.
     squares = _square_distances(with_missing.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
     squares_by_step = np.asarray(squares).reshape(x.shape[:-1])
+    # Of an indefinite matrix the square is NaN, which would count as missing.
+    is_known = np.isfinite(with_missing).all(axis=(-1, -2))
+    indefinite = np.argwhere(np.isnan(squares_by_step) & is_known)
+    if len(indefinite):
+        step = tuple(int(place) for place in indefinite[0])
+        smallest = np.linalg.eigvalsh(with_missing[step])[0]
+        where = f" at {', '.join(map(str, step))}" if step else ""
+        raise fail(f"covariance{where}", "a positive semidefinite matrix", f"smallest eigenvalue {smallest:.3g}")
     return np.asarray(np.where(present.any(axis=-1), squares_by_step, np.nan))
 
 
