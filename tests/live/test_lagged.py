@@ -93,7 +93,9 @@ def test_a_moment_costs_the_rows_of_its_lag_and_not_of_the_window(monkeypatch):
     monkeypatch.setattr(
         RowSmoother, "estimates", lambda self, h, *span: lengths.append(span) or estimates(self, h, *span)
     )
-    monkeypatch.setattr(row_smoother, "choose_code", lambda *arguments: engines.append(1) or chosen(*arguments))
+    monkeypatch.setattr(
+        row_smoother, "choose_code", lambda *values, **named: engines.append(1) or chosen(*values, **named)
+    )
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})
     timeline = hg.Timeline(hg.Network(plant, {"a": node}), window=50.0)
