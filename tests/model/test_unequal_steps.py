@@ -150,3 +150,13 @@ def test_times_may_be_dates_of_any_kind(kind):
 def test_times_that_are_none_are_refused_in_a_line(times, said):
     with pytest.raises(ValueError, match=f"^{said}"):
         hg.run(NETWORK, {"a": FLOW}, time=times)
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint64, object])
+def test_whole_numbers_keep_every_digit(kind):
+    """Doubles are 256 apart at today's nanoseconds since 1970: steps of 0, 256 and 0, none of them backwards."""
+    ticks = [1_700_000_000_000_000_000 + 100 * i for i in range(4)]
+    record = hg.run(NETWORK, {"a": np.ones((4, 1))}, time=np.array(ticks, dtype=kind))
+    assert record.time.tolist() == ticks
+    with pytest.raises(hg.InputError, match="got 1700000000000000000 after 1700000000000000100 in row 2"):
+        hg.run(NETWORK, {"a": np.ones((4, 1))}, time=np.array([ticks[1], ticks[0], *ticks[2:]], dtype=kind))

@@ -202,6 +202,8 @@ def format_times(time: np.ndarray) -> list[str]:
     """
     if time.dtype.kind == "M":
         return [text.removesuffix("Z") for text in format_dates(time).tolist()]
+    if time.dtype.kind != "f":  # whole numbers, of which the last digit counts
+        return [str(moment) for moment in time.tolist()]
     return [f"{moment:.{DIGITS}g}" for moment in time.tolist()]
 
 

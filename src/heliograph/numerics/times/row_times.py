@@ -35,6 +35,8 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
             raise fail(name, "numbers, or dates (datetime64, datetimes, texts of ISO 8601)", show_value(value))
         clock = array(name, value, (count,))
         whole = np.asarray(value)
+        if whole.dtype.kind == "O":  # Python's integers, or pandas' own
+            whole = np.asarray(whole.tolist())
         if whole.dtype.kind in "iu" and np.abs(clock).max(initial=0) >= 2**53:  # doubles cannot tell these apart
             clock = whole
     elif clock.shape != (count,) or np.isnat(clock).any():
@@ -165,5 +167,5 @@ def find_backwards_row(clock: np.ndarray) -> int | None:
 
 def backwards_text(clock: np.ndarray, row: int) -> str:
     """Return the two times of that row and the row above in words."""
-    now, before = (str(t) if clock.dtype.kind == "M" else f"{t:.10g}" for t in (clock[row], clock[row - 1]))
+    now, before = (f"{t:.10g}" if clock.dtype.kind == "f" else str(t) for t in (clock[row], clock[row - 1]))
     return f"{now} after {before}"
