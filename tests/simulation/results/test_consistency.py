@@ -123,7 +123,7 @@ def test_a_matrix_that_is_no_covariance_is_refused(judge):
     with pytest.raises(hg.InputError, match="covariance: expected symmetric matrices, got entries that differ by 1 "):
         judge(e, np.array([[2.0, 1.0], [0.0, 2.0]]))
     indefinite = np.stack([np.eye(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.eye(2)])
-    with pytest.raises(hg.InputError, match="covariance at 1: expected a positive semidefinite .* eigenvalue -1$"):
+    with pytest.raises(hg.InputError, match=r"covariance at 1: expected a positive semidefinite .* eigenvalue -1$"):
         judge(e, indefinite)
     # What is missing is no claim, and a state known exactly is one.
     assert np.isnan(judge(e, np.full((2, 2), np.nan))).all()
