@@ -70,10 +70,15 @@ def test_a_mixtures_likelihood_is_that_of_its_sum():
 
 BEHIND = hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2)
 FILTERS = {
-    "kalman": hg.kalman_filter(PLANT, SENSOR),
-    "linear": hg.linear_filter(PLANT, SENSOR, BEHIND),
-    "cubature": hg.cubature_filter(PLANT, SENSOR, BEHIND),
+    "kalman": lambda plant: hg.kalman_filter(plant, SENSOR),
+    "linear": lambda plant: hg.linear_filter(plant, SENSOR, BEHIND),
+    "cubature": lambda plant: hg.cubature_filter(plant, SENSOR, BEHIND),
 }
+
+
+def likelihood_by(name):
+    """Return the log-likelihood of rows by a filter, as a function of the plant's Q."""
+    return lambda q, z: hg.log_likelihood(FILTERS[name](hg.LinearPlant(A, q, START, SPREAD, B)), z, INPUTS)
 
 
 def by_jit(function, *arguments):
@@ -88,16 +93,30 @@ def by_jit(function, *arguments):
 )
 def test_gradients_are_finite_differences(name, over):
     """By either engine."""
-    item, step = FILTERS[name], 1e-5
-
-    def likelihood(q, z):
-        return hg.log_likelihood(eqx.tree_at(lambda f: f.plant.noise.covariance, item, q), z, INPUTS)
-
+    likelihood, step = likelihood_by(name), 1e-5
     both = np.stack([data(False), data(True)])
     for z, gradient in zip(both, over(jax.grad(likelihood), np.stack([Q, Q]), both), strict=True):
         for direction in (np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])):
             difference = (likelihood(Q + step * direction, z) - likelihood(Q - step * direction, z)) / (2 * step)
+            assert abs(difference) > 0.01  # Q matters
             assert np.sum(gradient * direction) == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_traced_covariance_put_into_a_filter_takes_its_factor_along(name):
+    """To roundings of another factor of the same covariance."""
+    item, likelihood = FILTERS[name](PLANT), likelihood_by(name)
+
+    def put(q, z):
+        return hg.log_likelihood(eqx.tree_at(lambda f: f.plant.noise.covariance, item, q), z, INPUTS)
+
+    with jax.enable_x64(True):
+        value, slope = jax.jit(jax.value_and_grad(put))(2 * Q, data(True))
+        expected, expected_slope = jax.jit(jax.value_and_grad(likelihood))(2 * Q, data(True))
+    assert float(value) == pytest.approx(float(expected), rel=1e-13)
+    # In the space of symmetric matrices: the entries above the diagonal are not told from those below.
+    np.testing.assert_allclose(slope + slope.T, expected_slope + expected_slope.T, rtol=1e-11)
 
 
 @pytest.mark.parametrize(

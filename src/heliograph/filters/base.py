@@ -189,9 +189,7 @@ class AbstractFilter(Module):
         return call_with_inputs(self, state, _step_with_smoother, z, u, check_step_number(self, k))
 
     def check_measurement(self, z: ArrayLike) -> Float[Array, " received"]:
-        """Return z as a measurement of the filter's length, NaN where a component did not arrive.
-
-        Empty for a filter that uses no measurements.
+        """Return z as a measurement of the filter's length, NaN where a component did not arrive; empty if unused.
 
         Raises:
             ValueError: another length, infinite values.
@@ -243,6 +241,10 @@ class AbstractFilter(Module):
         """True of a `LinearFilter` of which `score_rows` knows a recursion of the derivatives."""
         return False
 
+    def trace_log_likelihood(self, plain: Callable[..., jax.Array], z: Array, u: Array) -> jax.Array:
+        """Return plain(self, z, u), the log-likelihood of rows in a trace; a linear filter has better derivatives."""
+        return plain(self, z, u)
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
         """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
         return self
@@ -256,10 +258,7 @@ class AbstractFilter(Module):
         return self
 
     def for_single_precision(self) -> "AbstractFilter":
-        """Return the same filter with a mean that keeps its digits in single precision, however far it is from 0.
-
-        By default itself.
-        """
+        """Return the same filter with a mean that keeps its digits in single precision; by default itself."""
         return self
 
     def with_room_for_heartbeats_of(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":

@@ -121,6 +121,8 @@ class AbstractNoise(Module):
 class Gaussian(AbstractNoise):
     """Gaussian noise with the given covariance and mean (zero unless given).
 
+    It holds a factor of the covariance beside it: another covariance is another law, not one put into this object.
+
     Shapes: covariance (n, n), mean (n,).
     """
 
@@ -143,6 +145,9 @@ class Gaussian(AbstractNoise):
     @property
     def columns(self) -> WeightedColumns:
         """Covariance A diag(w) A' as columns A with weights w."""
+        # A traced covariance was put in place of that of numbers (`eqx.tree_at`): the factor is of another one.
+        if is_traced(self.covariance) and not is_traced(self.factor):
+            return eliminate(jnp.asarray(self.covariance))
         return WeightedColumns(self.factor, self.weights)
 
     @property
@@ -164,8 +169,9 @@ class Gaussian(AbstractNoise):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw mean + A e with e normal of variances w."""
-        e = square_root(jnp.asarray(self.weights)) * jax.random.normal(key, self.mean.shape, dtype=float)
-        return jnp.asarray(self.mean + self.factor @ e)
+        A, w = self.columns
+        e = square_root(jnp.asarray(w)) * jax.random.normal(key, self.mean.shape, dtype=float)
+        return jnp.asarray(self.mean + A @ e)
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] by E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j] (Isserlis, Stein)."""

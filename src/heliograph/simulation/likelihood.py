@@ -1,7 +1,6 @@
 """Log-likelihood of recorded data under a filter's model: the sum over its innovations."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +24,11 @@ def log_likelihood(
     """Return log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
 
     Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere.
-    `jax.grad` passes through it, with respect to any array of the filter, in the precision of the trace
-    (`jax.enable_x64`). Many rows are taken in chunks side by side, as by `filter.run`.
+    `jax.grad` passes through it, in any number that the filter is made of, in the precision of the trace
+    (`jax.enable_x64`). Derivatives are right also where covariances are zero by the filters of `hg.kalman_filter` and
+    `hg.linear_filter` themselves (known start, known law of a link without memory, no limits of states, no inputs of
+    the sensor); they have that in a noise's covariance, and none in the factor that the noise holds beside it.
+    Many rows are taken in chunks side by side, as by `filter.run`.
 
     Args:
         filter: the filter.
@@ -44,7 +46,7 @@ def log_likelihood(
     instance("filter", filter, AbstractFilter, "a filter")
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
-        return _sum_traced(*arguments)
+        return filter.trace_log_likelihood(_sum_log_likelihoods, *arguments[1:])
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if total is not None:  # it could be done in chunks
         return float(total)
@@ -57,15 +59,6 @@ def _sum_log_likelihoods(
     """Return the sum of the innovations' log-likelihoods over all rows, filtered one after another."""
     log_likelihoods = filter.scan(z, u, partial(_judge_likelihood, filter))
     return jnp.sum(log_likelihoods)
-
-
-def _sum_traced(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    """Return `_sum_log_likelihoods` within a trace, with derivatives by the filter's own way where it has one."""
-    if not filter.has_score_recursion:
-        return _sum_log_likelihoods(filter, z, u)
-    linear: Any = filter  # a `LinearFilter`
-    traced: jax.Array = linear.trace_log_likelihood(_sum_log_likelihoods, z, u)
-    return traced
 
 
 def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:

@@ -1,5 +1,8 @@
 """Derivatives of a linear filter's likelihood, by covariances, against those of its factors and differences."""
 
+from fractions import Fraction
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,13 +16,18 @@ C, SKEW = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.3]]), np.array([[1.0, 0.2], [0
 NUMBERS = {"matrix": 0.9, "push": 0.3, "q": 0.1, "start": 1.0, "spread": 1.0, "slope": 0.5, "r": 0.25, "bias": 0.3,
            "scale": 0.8, "link": 0.05}  # fmt: skip
 X = np.array(list(NUMBERS.values()))
-LINKS = {"fading": lambda s, n: hg.hop(hg.Rayleigh(s), n, dimension=2), "known": lambda s, n: hg.hop(s, n, dimension=2)}
+FILTERS = {
+    "fading": lambda plant, sensor, s, N: hg.linear_filter(plant, sensor, hg.hop(hg.Rayleigh(s), N, dimension=2)),
+    "known": lambda plant, sensor, s, N: hg.linear_filter(plant, sensor, hg.hop(s, N, dimension=2)),
+    "kalman": lambda plant, sensor, s, N: hg.kalman_filter(plant, sensor),
+}
+KALMANS_LINK = "kalman", ("link",)  # there is none
 U = np.random.default_rng(1).normal(size=(STEPS, 1))
 Z = np.random.default_rng(0).normal(size=(STEPS, 2)) + 1
 Z[5, 0] = Z[9] = Z[11, 1] = np.nan
 
 
-def make(link, x):
+def make(kind, x):
     """Return the filter of a plant, sensor and link of which every part depends on a number in x."""
     matrix, push, q, start, spread, slope, r, bias, scale, noise = x
     plant = hg.LinearPlant(
@@ -30,11 +38,11 @@ def make(link, x):
         push * B,
     )
     sensor = hg.LinearSensor(jnp.asarray(C).at[0, 1].set(slope), hg.Gaussian(r * SKEW, bias * np.array([1.0, 2.0])))
-    return hg.linear_filter(plant, sensor, LINKS[link](scale, noise))
+    return FILTERS[kind](plant, sensor, scale, noise * SKEW)
 
 
-def likelihood(link):
-    return lambda x, z=Z, u=U: hg.log_likelihood(make(link, x), z, u)
+def likelihood(kind):
+    return lambda x, z=Z, u=U: hg.log_likelihood(make(kind, x), z, u)
 
 
 @pytest.mark.slow
@@ -53,17 +61,88 @@ def test_gradients_in_all_numbers_and_data_are_those_of_the_factors():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("link", LINKS)
-def test_gradients_where_nothing_is_uncertain(link):
-    """Of three states: the derivative of the factors of a covariance of zero misses what correlates them."""
+@pytest.mark.parametrize(
+    ("kind", "zero"),
+    [(kind, zero) for kind in FILTERS for zero in (("q", "spread"), ("r",), ("link",)) if (kind, zero) != KALMANS_LINK],
+)
+def test_gradients_where_a_covariance_is_zero(kind, zero):
+    """Of several components: the derivative of the factors of a covariance of zero misses what correlates them."""
     x, step = X.copy(), 1e-6
-    x[[list(NUMBERS).index(name) for name in ("q", "spread")]] = 0.0
+    x[[list(NUMBERS).index(name) for name in zero]] = 0.0
     with jax.enable_x64(True):
-        slopes, value = jax.jit(jax.grad(likelihood(link)))(x), jax.jit(likelihood(link))
+        slopes, value = jax.jit(jax.grad(likelihood(kind)))(x), jax.jit(likelihood(kind))
         # One-sided differences, as variances have none below zero; their error is the square of the step.
         at = [[float(value(x + count * step * e)) for count in (0, 1, 2)] for e in np.eye(len(x))]
     differences = np.array(at) @ [-3.0, 4.0, -1.0] / (2 * step)
     np.testing.assert_allclose(slopes, differences, rtol=1e-6)
+
+
+MOTION, READING = np.array([[0.75, 0.25], [-0.125, 0.5]]), np.array([[1.0, 0.5], [0.0, 1.0]])
+SHAPES = np.array([[[1.0, 0.5], [0.5, 1.0]], [[1.0, -0.25], [-0.25, 0.5]], [[1.0, 0.5], [0.5, 0.75]]])  # of P_0, Q, R
+ROWS = np.array([[1.25, -0.5], [0.375, 2.0], [-1.5, 0.25]])
+
+
+def differentiate_exactly(scales):
+    """Return the derivatives in the scales of P_0, Q and R of the log-density of all rows together, by fractions.
+
+    z = G (x_0, w_1, w_2, w_3) + v has the covariance S = G diag(P_0, Q, Q, Q) G' + diag(R, R, R), and the log-density
+    the derivative (w' S' w - tr(S^-1 S')) / 2 with w = S^-1 z.
+    """
+    F, H, shapes, z = (np.vectorize(Fraction)(a) for a in (MOTION, READING, SHAPES, ROWS.ravel()))
+    steps, none = range(len(ROWS)), np.zeros((2, 2), dtype=int)
+    power = [reduce(np.dot, [F] * i, np.eye(2, dtype=int)) for i in range(len(ROWS) + 1)]
+    G = np.block([[H @ power[t + 1]] + [H @ power[t - j] if j <= t else none for j in steps] for t in steps])
+    at_start, at_steps = np.diag([1, 0, 0, 0]), np.diag([0, 1, 1, 1])
+    parts = [G @ np.kron(where, shape) @ G.T for where, shape in zip((at_start, at_steps), shapes, strict=False)]
+    parts.append(np.kron(np.diag([1, 1, 1]), shapes[2]))
+    inverse = invert(sum(Fraction(scale) * part for scale, part in zip(scales, parts, strict=True)))
+    w = inverse @ z
+    return [float((w @ part @ w - np.sum(inverse * part)) / 2) for part in parts]
+
+
+def invert(S):
+    """Return the inverse of a positive definite matrix of fractions, by elimination."""
+    n = len(S)
+    rows = np.concatenate([S, np.eye(n, dtype=int)], axis=1)
+    for i in range(n):
+        rows[i] = rows[i] / rows[i, i]
+        for j in set(range(n)) - {i}:
+            rows[j] = rows[j] - rows[j, i] * rows[i]
+    return rows[:, n:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (0.0, 0.25, 0.0), (1.0, 0.25, 0.0), (0.5, 0.0, 0.25)])
+def test_kalmans_gradient_is_exact_where_covariances_are_zero(scales):
+    """To some thousand roundings."""
+
+    def function(scales):
+        start, q, r = scales[:, None, None] * SHAPES
+        return hg.log_likelihood(
+            hg.kalman_filter(hg.LinearPlant(MOTION, q, np.zeros(2), start), hg.LinearSensor(READING, r)), ROWS
+        )
+
+    with jax.enable_x64(True):
+        slopes = jax.jit(jax.grad(function))(np.array(scales))
+    expected = differentiate_exactly(scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
+
+
+@pytest.mark.slow
+def test_a_kalman_filter_that_starts_from_another_law_than_its_plant():
+    """The derivatives are by the filter's law of the first state: at zero those of the plant's with the same law."""
+    plant = hg.LinearPlant(MOTION, 0.25 * SHAPES[1], np.ones(2), np.eye(2))
+    sensor = hg.LinearSensor(READING, 0.5 * SHAPES[2])
+
+    def from_filter(x):
+        return hg.log_likelihood(hg.kalman_filter(plant, sensor, x * np.ones(2), x * SHAPES[0]), ROWS)
+
+    def from_plant(x):
+        other = hg.LinearPlant(MOTION, 0.25 * SHAPES[1], x * np.ones(2), x * SHAPES[0])
+        return hg.log_likelihood(hg.kalman_filter(other, sensor), ROWS)
+
+    with jax.enable_x64(True):
+        assert float(jax.grad(from_filter)(0.0)) == pytest.approx(float(jax.grad(from_plant)(0.0)), rel=1e-13)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Gaussian filter: mean and covariance by a transform (cubature, Jacobian), on the channel's second moments."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,11 @@ import jax.numpy as jnp
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
-from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import (
+    AbstractGaussianStateFilter,
+    HasInitialMoments,
+    second_moments_at_start,
+)
 from heliograph.filters.gaussian.moving_origin import make_moving_origin_filter
 from heliograph.filters.gaussian.signal_moments import (
     ArrivedInnovation,
@@ -20,13 +26,14 @@ from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Innovation
-from heliograph.model.over_time import OverTime, at, at_each_step, first
+from heliograph.model.over_time import OverTime, at, at_each_step, first, stack_over_time
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph.random_affine.words.rounding_noise import find_rounded_noises
 
 
 class GaussianFilter(AbstractGaussianStateFilter):
@@ -114,6 +121,26 @@ class GaussianFilter(AbstractGaussianStateFilter):
     def is_linear(self) -> bool:
         """True where the gains depend on no data."""
         return self.linear
+
+    @property
+    def has_known_gain(self) -> bool:
+        """Whether no gain is random and all is linear, so that no moment before data matters."""
+        return self.linear
+
+    @property
+    def law_at_start(self) -> HasInitialMoments:
+        """The filter itself, which may start from another law of the first state than its plant."""
+        return self
+
+    def trace_log_likelihood(
+        self, plain: Callable[..., jax.Array], z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+    ) -> jax.Array:
+        """Return plain(self, z, u), the log-likelihood; of the Kalman filter with derivatives by its covariances."""
+        if not self.linear or stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor):
+            return plain(self, z, u)
+        from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
+
+        return trace_log_likelihood(plain, self, z, u)
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""

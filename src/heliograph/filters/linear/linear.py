@@ -34,7 +34,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_b
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, at, first, stack_over_time
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
@@ -81,7 +81,7 @@ class LinearFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> LinearBelief:
         """Return the prior, both as estimate and as the state's moments before data."""
-        return prior_belief(at(self.plant, k=0))
+        return prior_belief(self.law_at_start)
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
@@ -143,10 +143,18 @@ class LinearFilter(AbstractSizedFilter):
 
         return ScoreRecursion(make, x, half, self.has_known_gain, informed=True)
 
+    @property
+    def law_at_start(self) -> AbstractPlant:
+        """The plant of the first step, from whose law of the first state the filter starts."""
+        plant: AbstractPlant = at(self.plant, k=0)
+        return plant
+
     def trace_log_likelihood(
         self, plain: Callable[..., jax.Array], z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
     ) -> jax.Array:
-        """Return plain(self, z, u), the log-likelihood, with the derivatives of a filter that `has_score_recursion`."""
+        """Return plain(self, z, u), the log-likelihood, with derivatives by covariances where the law is known."""
+        if not self.has_score_recursion:
+            return plain(self, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
 
         return trace_log_likelihood(plain, self, z, u)

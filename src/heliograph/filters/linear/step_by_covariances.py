@@ -32,7 +32,6 @@ from heliograph.model.over_time import at
 from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.linalg import contract, outer, psd_solve, symmetric
 from heliograph.numerics.types import Array, PyTree
-from heliograph.random_affine.noise import AbstractNoise
 
 
 class ModelMatrices(NamedTuple):
@@ -50,32 +49,31 @@ class ModelMatrices(NamedTuple):
 
 
 def find_model_matrices(
-    filter: Any, moments: MomentsBeforeData | None, u: Array, k: Array, by_columns: bool = False
+    filter: Any, moments: MomentsBeforeData | None, u: Array, k: Array
 ) -> tuple[ModelMatrices, MomentsBeforeData | None]:
     """Return F, b, Q, H, c and R of step k of a linear filter, under the input u, and the moments before data after it.
 
-    They are x+ = F x + b + w of covariance Q, and z = H x + c + v of covariance R, as received behind the channel.
+    They are x+ = F x + b + w of covariance Q, and z = H x + c + v of covariance R, as received behind the channel. Q
+    and R are by the noises' covariances, and not by the factors that a noise holds beside: these have no derivative
+    where a covariance is zero.
 
     Args:
         filter: the filter.
         moments: those before data of the state before the step; None behind a known gain, where none are returned.
         u: the input.
         k: the step's number.
-        by_columns: whether Q and R are those of the columns that a noise may hold beside its covariance. So the filter
-            takes them, and has derivatives in each of its arrays; by the covariances there are derivatives at zero too.
     """
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
     F, b, Q = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-    of_sensor = law.columns.covariance if by_columns else jnp.asarray(law.covariance)
-    R = gain @ of_sensor @ gain.T + channel.noise.covariance
+    # Of the channel's noise that is what its spread holds beside the gain's.
+    of_channel = jnp.asarray(channel.nominal.center[..., -1, -1] - channel.gain_spread[..., -1, -1])
+    R = gain @ jnp.asarray(law.covariance) @ gain.T + of_channel
     if moments is not None:
         moments = moments.predict(F, b, Q)
         # A random gain adds its spread times E[(y, 1)(y, 1)'] to the noise.
         y = moments.measure(sensor)
         R = R + contract(channel.gain_spread, augmented_second_moment(y.second, y.mean, 1.0))
-    if by_columns and isinstance(plant.noise, AbstractNoise):
-        Q = plant.noise.columns.covariance
     H, c = gain @ jnp.asarray(sensor.matrix), gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset)
     return ModelMatrices(F=F, b=b, Q=Q, H=H, c=c, R=R), moments
 
@@ -89,8 +87,8 @@ class StateMoments(NamedTuple):
 
 def find_moments_at_start(filter: Any) -> StateMoments:
     """Return the mean and covariance of the state before the first step of a linear filter."""
-    plant = at(filter.plant, 0)
-    return StateMoments(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
+    start = filter.law_at_start
+    return StateMoments(jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance))
 
 
 class FactoredStep(NamedTuple):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from heliograph.filters.linear.linear_filter_state import LinearBelief, MomentsBeforeData
+from heliograph.filters.linear.linear_filter_state import MomentsBeforeData
 from heliograph.filters.linear.step_by_covariances import (
     FactoredStep,
     StateMoments,
@@ -16,11 +16,12 @@ from heliograph.filters.linear.step_by_covariances import (
     step_by_covariances,
     take_derivatives_of_log_density,
 )
+from heliograph.filters.smoother_step import gaussian_of
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, Float, PyTree
 
 # The filter's state; the moments of its estimate; those before any data, None behind a known gain.
-Carried = tuple[LinearBelief, StateMoments, MomentsBeforeData | None]
+Carried = tuple[PyTree, StateMoments, MomentsBeforeData | None]
 
 
 def trace_log_likelihood(
@@ -30,7 +31,7 @@ def trace_log_likelihood(
 
     Args:
         plain: the log-likelihood by the factors, a function of filter, z and u.
-        filter: a `LinearFilter` with `has_score_recursion`, of which some numbers are traced.
+        filter: one of which some numbers are traced, and as `_sum_by_covariances` takes it.
         z: measurements, NaN for what did not arrive.
         u: inputs.
     """
@@ -70,7 +71,8 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
     Values are by the filter's factors, derivatives by its covariances (`step_by_covariances`).
 
     Args:
-        filter: a `LinearFilter` with `has_score_recursion`.
+        filter: the best linear one of a linear plant and sensor behind a channel of known law, without angles: a
+            `LinearFilter`, or a Kalman filter, whose gain is known.
         z: measurements, NaN for what did not arrive.
         u: inputs.
     """
@@ -84,10 +86,11 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
         (state, moments, before_data), (k, z, u) = before, row
         prior = constant.predict(state, _hold_constant(u), k)
         after, innovation = constant.correct(prior, _hold_constant(z), k)
-        factored = FactoredStep(prior.gaussian, after.gaussian, innovation.value, innovation.covariance)
-        matrices, before_data = find_model_matrices(filter, before_data, u, k, by_columns=True)
+        corrected = gaussian_of(after)
+        factored = FactoredStep(gaussian_of(prior), corrected, innovation.value, innovation.covariance)
+        matrices, before_data = find_model_matrices(filter, before_data, u, k)
         moments, e, S = step_by_covariances(matrices, moments, z, factored)
-        lost = jnp.any(jnp.isnan(after.gaussian.mean))
+        lost = jnp.any(jnp.isnan(corrected.mean))
         density = take_derivatives_of_log_density(e, S, innovation.log_likelihood)
         return (after, moments, before_data), jnp.where(lost, jnp.nan, density)
 
