@@ -190,12 +190,12 @@ def _check_growth(steps: int, name: str, value: Constants) -> Growth:
 def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     """Return the initial weight (2n, 2n) from a number or a positive definite matrix.
 
-    It is the weight of (x, e), the first state and error of n components each; a number stands for that times I.
+    It is the weight of (x, e), the first state and error of n components each. A number a stands for the matrix a I.
     """
     name, size = "initial weight", 2 * n
     is_number = rank(name, value) == 0
     matrix: np.ndarray = scalar(name, value) * np.eye(size) if is_number else array(name, value, (size, size))
-    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
+    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # eigenvalues of the largest doubles would overflow
     symmetric = symmetric_weight("initial weight", matrix / unit)
     if smallest_eigenvalue(symmetric) <= 0:
         smallest = smallest_eigenvalue(symmetric) * unit

@@ -207,11 +207,11 @@ def _make_gains(
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
-    """Raise ValueError for a design whose moments at k = 0 are not the network's own, as those of a periodic one.
+    """Raise ValueError if the design's moments at k = 0 are not those of the network's start.
 
-    A periodic design has one step for each slot, and ends with the moments with which it begins.
+    A periodic design fails this check. It has one step for each slot, and ends with the moments with which it begins.
     """
-    # Equal to the rounding of both; of a periodic design, first and last are equal as far as its iteration went.
+    # The start is compared to rounding. A periodic design was found by iteration, so its ends agree less closely.
     expected, start = initial_error_covariance(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
         ends_as_it_begins = np.allclose(start, design.moments[-1], rtol=1e-6)

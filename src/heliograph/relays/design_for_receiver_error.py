@@ -199,7 +199,7 @@ def _compute_cost_with_barrier(
     def value(x: jax.Array) -> jax.Array:
         """Return cost - barrier sum log(slack) at gains moved by x, `slack` the free share of each power limit.
 
-        `gains`, `units` (of x), `barrier` (a weight) and `problem` stay. Infinite where a limit is passed.
+        The value is infinite where a limit is passed. `gains`, `units`, `barrier` (a weight) and `problem` are fixed.
         """
         cost, slack = _compute_cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
         meets_limits = jnp.all(slack > 0)  # where not, the logarithm is of 1, so that no gradient becomes NaN
@@ -219,7 +219,7 @@ def _evaluate_barrier(
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """Return value and gradient of `_compute_cost_with_barrier`, with the changes of all gains in one vector x.
 
-    So a search for the minimum takes it. `units` (steps, r, r): in columns, what the r variables of a step change.
+    A search for the minimum needs one vector. Column i of units[k] (r, r) is what variable i of step k changes.
     """
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
@@ -244,9 +244,9 @@ def _choose_step_units(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, from that of `later` steps, and the gains' units."""
-        step, gain, moments_before, own = row
-        lam = later + own  # by the moments after the step; own: of the step's own cost
+        """Return the cost's gradient by the moments before a step, and the units in which the step's gains change."""
+        step, gain, moments_before, own = row  # own: the gradient of the step's own cost by the moments after it
+        lam = later + own  # the gradient of the whole cost by the moments after the step
         uncorrected, _ = step_moments(step, moments_before)
         hessian, _ = gain_hessian(uncorrected, lam, step, DAMPING)
         # 1 for a gain on what is transmitted, else 0: such a gain stays.
@@ -336,7 +336,7 @@ def _sweep_backward(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, and Lam, that by the moments after it."""
+        """Return the cost's gradient by the moments before a step, and Lam, its gradient by the moments after it."""
         step, gain, uncorrected, own_cost = row
         lam = later + own_cost  # of later steps' cost, and of the step's own
         best_gain = minimise_cost_ahead(uncorrected, lam, gain, step)
@@ -357,7 +357,7 @@ def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax
     def improve_step(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Return the moments after a step with its best gain; and this gain and these moments."""
+        """Return the moments after a step with its best gain, and the pair (best gain, these moments) to collect."""
         step, old_gain, gradient = row  # the gradient of the cost by the moments after the step
         uncorrected, _ = step_moments(step, moments)
         gain = minimise_cost_ahead(uncorrected, gradient, old_gain, step)

@@ -107,9 +107,9 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
 
 
 def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
-    """Return the steps of one period, one for each slot; raise ValueError where moments do not converge by the gains.
+    """Return the steps of one period, one for each slot; raise ValueError if moments diverge under these gains.
 
-    They do where their linear map over a period has a spectral radius below 1.
+    Moments converge if their linear map over a period has a spectral radius below 1.
     """
     check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
@@ -172,13 +172,16 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
 
     def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
-        """Take a Riccati step by a slot's system `side`: return the covariance of (x, e_relays), and best gain."""
+        """Take one Riccati step: return the covariance of (x, e_relays) after a slot, and the receiver's best gain.
+
+        `side` is the system that the receiver sees in the slot.
+        """
         joint = predict(covariance, side)  # with the measurement, before the correction
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
 
     def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
+        """Take one step with a given gain: return the covariance after a slot twice, to go on with and to collect."""
         side, gain = row  # `side`: the system of (x, e_relays) that the receiver sees in the slot
         corrected = correct_moments(predict(covariance, side), gain)
         return corrected, corrected
@@ -224,7 +227,7 @@ def _iterate_local_design(
 ) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
     """Repeat the period of the local design (gains best for each filter's next error) until its moments are steady.
 
-    They are where they change by less than CONVERGED, relative to the largest.
+    Steady moments change over a period by less than CONVERGED, relative to the largest moment.
     Returns gains, moments and power over the last period, and the last relative change of the moments.
     """
     moments, change = _repeat_until_steady(
@@ -314,9 +317,10 @@ def _tune_gains(
     cost: Cost,
     power_limit: ArrayLike | None,
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the gains of least cost near `start`, which are checked to be one block matrix for each slot.
+    """Return the gains of least cost near `start`, which must have one block matrix for each slot.
 
-    `free`: which of the R received numbers have gains that may change; `cost`: of gains, with the penalty of power.
+    `free` is True for the received numbers whose gains may change. `cost` computes the cost of gains, with the penalty
+    of power.
     """
     steps = periodic_steps(network)
     check_gains_of_slots(network, start)
@@ -326,10 +330,10 @@ def _tune_gains(
 def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers.
 
-    P: the receiver's steady error covariance. Sound: positive semidefinite, as moments are that do not diverge.
+    P: the receiver's steady error covariance. Moments are sound if they are positive semidefinite: they then converge.
     """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
-    # The moments begin with those before the first slot. The receiver's error is the last part of what they are of.
+    # The moments begin with those before the first slot. They are of (x, e_1 .. e_F), the receiver's error last.
     receiver = steady.moments[1:, -n:, -n:]
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
     return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), relay_powers
@@ -338,7 +342,7 @@ def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Arr
 def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers.
 
-    P: the steady error covariance. Sound: positive semidefinite, as moments are that do not diverge.
+    P: its steady error covariance. Moments are sound if they are positive semidefinite: they then converge.
     """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     covariance = steady_receiver_covariance(steps, gains)

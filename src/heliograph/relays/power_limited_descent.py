@@ -99,9 +99,12 @@ def _are_within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np
 def _find_largest_entries(
     network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the largest magnitude in each filter's gain in each slot, at every entry of it: units of changes."""
+    """Return for every entry of the gains the largest magnitude in its filter's gain in its slot.
+
+    These are the units in which a descent changes the gains.
+    """
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
-    # Of a filter whose gains are small or zero in a slot, a thousandth of the largest of all.
+    # No unit is below a thousandth of the largest one, since gains in a slot may be small or zero.
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
     units = {}
     for (name, value), received in zip(largest.items(), network.received, strict=True):

@@ -191,10 +191,10 @@ class CentredFilter(AbstractWrapper):
 
 
 def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFilter:
-    """Return a filter about an origin that moves with it; one of attitudes or of modes of motion as it is.
+    """Return a filter about an origin that moves with the estimate.
 
-    Numbers far from zero then keep the digits of small changes. `known_gain`: no gain of the channel is random or
-    uncertain.
+    States far from zero then keep the digits of small changes. A filter whose plant has attitudes, or several modes of
+    motion, is returned as it is. `known_gain` is True if no gain of the channel is random or uncertain.
 
     Args:
         filter: one that uses its fields plant, sensor and channel alone.
