@@ -122,7 +122,7 @@ class MixtureFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> MixtureBelief:
-        """Return the prior, and the initial law of the modes; `moved`: no step was predicted yet."""
+        """Return the prior and the initial law of the modes; `moved` is False until a step is predicted."""
         start = at(self.plant, k=0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
@@ -151,8 +151,8 @@ class MixtureFilter(AbstractSizedFilter):
         def condition_on_combination(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> _CombinationUpdate:
             """Return the Kalman update by z = gain x + offset + noise.
 
-            x: the predicted Gaussian; `size`: roots of E[x_i^2], for rounding; `present`: which of z arrived.
-            `certain`: how many components it determines exactly.
+            x is the predicted Gaussian. `size` (n,) holds the roots of E[x_i^2], which give the rounding. `present`
+            says which components of z arrived. `certain` is the number of components that are determined exactly.
             """
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
@@ -193,10 +193,10 @@ class MixtureFilter(AbstractSizedFilter):
 
 
 def drop_below_point_mass(log_likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
-    """Return log-likelihoods, -inf for combinations whose density another one's point mass outweighs.
+    """Return the log-likelihoods, with -inf for combinations that others outweigh by a point mass.
 
-    `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
-    density is negligible.
+    `certain` (a,) counts the components that each combination determines exactly. It has a point mass there, against
+    which a density is negligible. So only combinations with the largest count among those that agree with z are kept.
     """
     agrees = jnp.isfinite(log_likelihood)
     # -1: no combination agrees with z.
