@@ -190,7 +190,7 @@ def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> C
 
 
 def read_forced_engine() -> str:
-    """Return the engine that the environment variable SETTING forces, one of ENGINES; "" if it is not set."""
+    """Return the engine of ENGINES that the environment variable SETTING forces, or "" if it is not set."""
     engine = os.environ.get(SETTING, "")
     if engine not in ("", *ENGINES):
         raise fail(SETTING, " or ".join(ENGINES), engine)

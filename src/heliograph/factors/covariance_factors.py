@@ -62,7 +62,7 @@ def join_columns(*parts: WeightedColumns) -> WeightedColumns:
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
-    """Return sum_i w_i P_i, w_i the `weights`: the columns of all P_i, (i, n, columns) in `parts`, side by side."""
+    """Return the columns of sum_i w_i P_i: those of all P_i (i, n, columns) in `parts`, with the `weights` w_i."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     scaled_weights = (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1)
@@ -363,7 +363,7 @@ def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
     n = len(rows)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take row j off the rows below it, orthogonal in the columns' `weights`; put column j into L, d_j into d."""
+        """Make the rows below row j orthogonal to it, in the columns' `weights`; put column j into L and d_j into d."""
         rows, lower, variances = carry
         weighted = weights * rows[j]
         d = rows[j] @ weighted

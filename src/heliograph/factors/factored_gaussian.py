@@ -112,7 +112,7 @@ def from_covariance(mean: Array, covariance: Array) -> Gaussian:
 def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumns) -> Gaussian:
     """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w.
 
-    x has the mean m and covariance L diag(d) L'; F is `matrix`, b the `shift`, `noise` columns of Cov w.
+    x has the mean m and covariance L diag(d) L'. F is `matrix`, b is `shift`, and `noise` holds columns of Cov w.
     """
     of_state = WeightedColumns(matrix @ x.root, x.variances)
     return from_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(of_state, noise))
@@ -202,10 +202,9 @@ class Innovations(NamedTuple):
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
         """Return log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
 
-        e (`value`) are the innovations and s (`variance`) their variances, each given those before it; `present` (m,)
-        says what arrived. A component that those before it determine, s_j = 0 to rounding, adds nothing where it
-        agrees with them and -inf where it does not; `size` (m,) is the size of the terms whose difference is the
-        innovation.
+        e (`value`) are the innovations and s (`variance`) their variances, each given those before it. `present` (m,)
+        says what arrived. If those before j determine component j, s_j is 0 up to rounding. It then adds 0 if it agrees
+        with them, and -inf if not. `size` (m,) is the size of the terms whose difference is the innovation.
         """
         determined = self.determined
         variance = jnp.where(determined, 1.0, self.variance)
@@ -270,7 +269,7 @@ def correct_by_gain(
 ) -> Gaussian:
     """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
 
-    e is the innovation. Joseph's form, a sum of squares; with Kalman's gain it is `condition_on_observation`.
+    e is the innovation. The covariance is a sum of squares (Joseph's form), and right for any gain K.
     """
     error = WeightedColumns(x.root - gain @ slopes, x.variances)
     return from_columns(x.mean + gain @ innovation, join_columns(error, noise.through(gain)))

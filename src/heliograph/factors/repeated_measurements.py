@@ -100,9 +100,9 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
     m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
 
     def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take row j, its rounding set to 0, off the rows below it; put column j into L and its variance into d.
+        """Set the rounding of row j to 0, make the rows below orthogonal to it, and fill in column j of L and d_j.
 
-        L diag(d) L' = A diag(weights) A'. Carried are what is left of the m rows of A, the `size` of each entry (its
+        L diag(d) L' = A diag(weights) A'. `carry` holds what is left of the m rows of A, the `size` of each entry (its
         absolute value plus all that was taken off it), L and d. An entry up to `share` of its size is rounding.
         """
         rows, size, lower, variances = carry

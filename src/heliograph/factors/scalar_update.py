@@ -21,8 +21,8 @@ def update_by_scalar(
     x = m + V xi, with uncorrelated xi of variances d (n,).
     With Var v = r, s = f' diag(d) f + r is the variance of the innovation, and K = V diag(d) f / s.
 
-    With s_j = r + sum_{k >= j} f_k^2 d_k and w_j = sum_{k >= j} d_k f_k V_k, columns V_j of V:
-    d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. Ratios of sums of positive terms.
+    With s_j = r + sum_{k >= j} f_k^2 d_k, w_j = sum_{k >= j} d_k f_k V_k and the columns V_j of V,
+    d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. All s_j are sums of positive terms.
 
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, its order reversed
     since L is lower.
@@ -34,7 +34,7 @@ def update_by_scalar(
 def update_by_scalar_given_products(
     root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v of x = V xi, given `products`: d_j f_j and f_j^2 d_j, which are 0 of a slope that is rounding.
+    """Measure f' xi + v of x = V xi, given the `products` d_j f_j and f_j^2 d_j, which are 0 for mere rounding.
 
     Returns the rows V and variances d given the measurement, its gain K = V diag(d) f / s, and the variance s of its
     innovation. `noise` is Var v.
@@ -92,7 +92,7 @@ def update_by_parts(
         def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
             """Measure part i of a vector of n, and put its gain into column i of the gains.
 
-            `least` is the variance up to which a part's slopes are rounding; row `first_part` of the root is part 0's.
+            `least` (n,) are the variances up to which a part's slopes are rounding. Row `first_part` is that of part 0.
             """
             root, d, least, gains = carry
             root, d, gain = measure_part(i, root, d, least[i])

@@ -115,7 +115,7 @@ class Judgement(NamedTuple):
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
         z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
     ) -> "Judgement":  # fmt: skip
-        """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
+        """Judge a correction alone, from states and estimates before and after it; `judge_step` says all arguments."""
         prior, after = states
         expected, corrected = estimates
         # `judge_step` needs states before and after a prediction: the state before the correction stands for both.

@@ -128,7 +128,8 @@ def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFind
 def _list_objections(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """Return reasons against a certificate: refuted constants, and findings about constants above the system's.
 
-    `growth`: constants a of |f(x)| <= a |x| and of differences; `findings`: what checks of these constants found.
+    `growth` holds the constants a of |f(x)| <= a |x| and of |f(x) - f(y)| <= a |x - y|. `findings` are the results of
+    checks of such constants.
     """
     reasons, constants = [], _list_positive(growth.state) + _list_positive(growth.error)
     for finding in findings:
@@ -224,8 +225,8 @@ def make_theorem_matrix(
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
         """Return rows over eta, q long, that multiply its parts by these blocks, given by the letter of the part.
 
-        eta: vector of all that a step depends on; `at`: first place of each part in it, by letter. The other parts
-        have zeros.
+        eta is the vector of all that a step depends on. `at` gives the first place of each part by its letter. Parts
+        without a block get zeros.
         """
         matrix = np.zeros((height, q))
         for name, block in blocks.items():

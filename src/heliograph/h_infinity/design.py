@@ -285,8 +285,8 @@ def _inequality_holds(
 ) -> bool:
     """Decide whether one step is feasible: P1, P2 > 0, and Phi with Z = K'P2 K itself strictly negative.
 
-    P1, P2 (`state`, `error`): next weights; K: gain; Phi: the matrix of the step's inequality in eta; `fixed`: its
-    part without unknowns, S - diag(P, 0).
+    P1 and P2 are the next weights (`state` and `error` of the unknowns), and K is the gain. Phi is the matrix of the
+    step's inequality in eta, and `fixed` is its part without unknowns, S - diag(P, 0).
     """
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)

@@ -65,9 +65,9 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PendingCorrection, z: ArrayLike, k: Step = 0) -> tuple[PendingCorrection, Innovation]:
-        """Compute the correction of the next estimate from z; the current one stays.
+        """Compute the correction of the next estimate from z; the current estimate does not change.
 
-        The correction is the gain of step k times z - mean gain h(x); a number that did not arrive adds nothing.
+        The correction is the gain of step k times (z - mean gain h(x)). A number that did not arrive adds nothing.
         """
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)

@@ -252,9 +252,9 @@ class UnknownsLayout(NamedTuple):
 
 
 def _mirror_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
-    """Return the symmetric matrix (n, n) of the entries of its lower triangle.
+    """Return the symmetric matrix (n, n) that has these entries in its lower triangle.
 
-    `entries`: row after row, as `_triangle_places` lists them.
+    The entries are listed row after row, as `_triangle_places` lists them.
     """
     matrix = np.zeros((n, n))
     rows, columns = _triangle_places(n)

@@ -44,13 +44,13 @@ class KnownLossSystem(NamedTuple):
     noises: tuple[Float[np.ndarray, "_ _"], ...]
 
     def close_loop(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
-        """Return the recursion of V: V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, true of any gains.
+        """Return the recursion V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, which holds for any gains.
 
-        V_j is the error covariance times the flag of mode j, on average, U its mixture by the chain. `gains` has one K
-        for each kind of mode; Q and R are scaled by `noise`.
+        V_j is the mean of the error covariance times the flag of mode j, and U is V mixed by the chain. `gains` has one
+        K for each kind of mode. Q and R are scaled by `noise`. If each step draws its mode anew, one V is enough.
 
         Raises:
-            ValueError: more than SIZE_LIMIT entries in all V_j; one V serves where each step draws its mode anew.
+            ValueError: more than SIZE_LIMIT entries in all V_j.
         """
         n, modes = len(self.transition), len(self.chain)
         size = n * n * (1 if np.all(self.chain == self.chain[0]) else modes)

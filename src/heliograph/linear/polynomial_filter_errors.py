@@ -99,7 +99,7 @@ def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "
 def _make_filter_map(g: Gains) -> np.ndarray:
     """Return the homogeneous matrix of (x+, q, z+) -> (x+, F q + K z+ + c, z+), one step of the linear filter.
 
-    q (n,) is its estimate, z+ (m,) the measurement; `g` has F (transition), K (gain) and c (offset).
+    q (n,) is the filter's estimate, and z+ (m,) the measurement. `g` has F (transition), K (gain) and c (offset).
     """
     n, m = g.gain.shape
     of_q, of_z = slice(n, 2 * n), slice(2 * n, None)
@@ -276,7 +276,7 @@ def _largest_third_moment(
     """Return the largest |k3(a, b, c)| / (sd a sd b sd c) over c, of numbers with this joint covariance and mean.
 
     k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), the third central moment; sd is a standard deviation.
-    `pair` are the places of the product a b, of a and of b among the N numbers, `linear` those of each c.
+    `pair` holds the places of the product a b, of a and of b among the N numbers, and `linear` those of all c.
     """
     product, a, b = pair
     deviations = np.sqrt(np.diag(joint))

@@ -106,7 +106,7 @@ class FreshReading(AbstractFreshDraw):
         return jnp.asarray(state)[1:]
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the gain g and its reading a = g + e, e with the variance `variance`: (2,)."""
+        """Draw (g, a) (2,), a gain g and its reading a = g + e, where the error e has the variance `variance`."""
         gain_key, error_key = jax.random.split(key)
         gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])

@@ -75,9 +75,9 @@ class AbstractCombination(AbstractComposite):
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
     ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
-        """Draw each map by its key: return the next state, and H of each.
+        """Draw each map by its key; return the next state, and the drawn H of each map.
 
-        The state is the tuple of the maps' states; () where all of them forget.
+        The state is the tuple of the maps' states, or () if all maps forget.
         """
         states = state if self.remembers else ((),) * len(self.maps)
         draws = [affine.draw(map_state, key) for affine, map_state, key in zip(self.maps, states, keys, strict=True)]
@@ -255,7 +255,7 @@ class Stack(AbstractCombination):
         return sum(m.outputs for m in self.maps)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map; return the next state, and H: their rows [G, n] one above another, and (0, 1) below."""
+        """Draw each map; return the next state, and H with the maps' rows [G, n] one above another, and (0, 1) last."""
         state, matrices = self._draw_each(state, jax.random.split(key, len(self.maps)))
         rows, last_row = [matrix[:-1] for matrix in matrices], np.eye(1, self.inputs + 1, self.inputs)
         return state, jnp.concatenate([*rows, last_row], axis=0)

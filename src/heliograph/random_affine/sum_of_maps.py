@@ -123,7 +123,7 @@ class Superposed(AbstractCombination):
         return whole.transpose(*range(1, whole.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and the noise; return the next state, and H of the sum: gains on all of y, and noise."""
+        """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y."""
         keys = jax.random.split(key, len(self.maps) + 1)
         map_keys, noise_key = keys[:-1], keys[-1]
         state, matrices = self._draw_each(state, map_keys)
@@ -198,7 +198,7 @@ class Superposed(AbstractCombination):
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
-        """Return E[Sym^order(H)] of the sum from those of its maps, `parts`: each (corners, rows, columns).
+        """Return E[Sym^order(H)] of the sum from those of its maps in `parts`, each (corners, rows, columns).
 
         A corner of the sum is a combination of corners (extreme laws) of the maps.
         """

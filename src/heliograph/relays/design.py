@@ -84,9 +84,9 @@ def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
 
 
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Return the gains by filter as one block matrix for each step: rows by filter and state, columns all R numbers.
+    """Return the gains by filter as one block matrix for each step.
 
-    The R numbers received are in the order of the filters; each filter's gain stands in the columns of its own ones.
+    Rows are by filter and state. Columns are all R received numbers, by filter. Entries for other filters' are 0.
     """
     if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
@@ -112,7 +112,7 @@ def split_gains(
 
 
 def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDesign:
-    """Return a design of gains and moments as propagated; ValueError unless all moments are finite."""
+    """Return the design with the propagated gains and moments; raise ValueError unless all moments are finite."""
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
@@ -240,8 +240,8 @@ def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int
 def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
 
-    K_f = E[e_f i_f'] E[i_f i_f']^-1, e_f the error of filter f, i_f its innovation. Optimal for one step only: a
-    relay's gain also decides what the receiver can know later (see `receiver_error_design`).
+    K_f = E[e_f i_f'] E[i_f i_f']^-1, with the error e_f of filter f and its innovation i_f. It is optimal for one step
+    only: a relay's gain also decides what the receiver can know later (see `receiver_error_design`).
 
     Args:
         network: relays that filter.
@@ -383,9 +383,10 @@ def make_receiver_view(
 def _list_receiver_views(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]
 ) -> ReceiverViewOfRelays:
-    """Return at each step the system that the receiver sees: of x and the relays' errors (`make_receiver_view`).
+    """Return for each step the system that the receiver sees, with x and the relays' errors as its state.
 
-    `start`: the covariance of x and all filters' errors before the first step; `gains`: of all filters (`join_gains`).
+    `start` is the covariance of x and all filters' errors before the first step. `gains` are those of all filters in
+    block matrices (`join_gains`).
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:

@@ -86,7 +86,7 @@ def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
 def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
     """Return form_k: <form_k, moments before step k> is the sum over the transmitting relays of tr Cov(C s_r).
 
-    <A, B> = tr A' B; s_r is relay r's estimate, C what is sent of it, and `d` the size of the moments.
+    <A, B> = tr A' B. Relay r sends C s_r of its estimate s_r. `d` is the size of the moments.
     """
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
@@ -178,9 +178,9 @@ def _compute_cost_and_slack(
 def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: RelaySteps
 ) -> Float[Array, "time Fn R"]:
-    """Return the gains with their free entries changed by units_k x_k at each step k; x (time, r), r free entries.
+    """Return the gains with their r free entries changed by units_k x_k at each step k; x is (time, r).
 
-    Free are the entries that multiply what the filter itself receives (`gain_mask`); the others are always zero.
+    An entry is free if it multiplies what its filter receives (`gain_mask`). All other entries are always zero.
     """
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
@@ -351,7 +351,7 @@ def _sweep_backward(
 def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step.
 
-    `ahead`: the gradient of the cost by the moments after each step; `gains`: those before, which damp the change.
+    `ahead` is the gradient of the cost by the moments after each step. `gains` are the old ones, which damp the change.
     """
 
     def improve_step(

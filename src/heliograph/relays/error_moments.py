@@ -76,8 +76,8 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
 def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], SentMoments]:
     """Return Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
-    eta = (x, e_1 .. e_F): the state and the errors of F filters, which receive R numbers; eta+ is that after the step.
-    Sizes: d = (1 + F) n, z = d + R.
+    eta = (x, e_1 .. e_F) holds the state and the errors of F filters, which receive R numbers. eta+ is eta after the
+    step. The sizes are d = (1 + F) n and z = d + R.
     """
     maps, mean = make_error_step_maps(step), sent_mean(step)
     # Second moments of what is sent, from the covariance of (x, e_1 .. e_F, w, v).
@@ -95,8 +95,8 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
 def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
     """Return the covariance of eta+ = eta+ before corrections - (0; K) innovations, with K the `gain`.
 
-    eta = (x, e_1 .. e_F), the state and the filters' errors: only these are corrected. `z`: the covariance of (eta+
-    before corrections, innovations).
+    eta = (x, e_1 .. e_F) holds the state and the filters' errors. Only the errors are corrected. `z` is the covariance
+    of (eta+ before corrections, innovations).
     """
     rows, received = gain.shape
     d = z.shape[0] - received

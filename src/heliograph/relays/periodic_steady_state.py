@@ -59,7 +59,8 @@ def periodic_steps(network: RelayNetwork) -> RelaySteps:
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     """Return the steady state of `local_error_design` of a `network`: gains and moments over one period of its slots.
 
-    Each filter then minimises its own next error, in each slot. Found by repeating the period, PERIODS times at most.
+    Each filter minimises its own next error in each slot. The period is repeated until the moments are steady, at most
+    PERIODS times.
 
     Args:
         network: relays that filter, in slots that repeat.
@@ -132,10 +133,11 @@ def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[
 
 
 def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> PropagatedMoments:
-    """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`.
+    """Return the moments over a period that ends with the moments with which it begins.
 
-    Over a period the moments, of size d (x and all filters' errors), are an affine map of those before it: the start is
-    its fixed point. Where the moments diverge there is one too, which is no covariance.
+    The moments, of size d (x and all filters' errors), after a period are an affine map of those before it. The start
+    is the fixed point of this map, and is differentiable in the gains. If the moments diverge, there is a fixed point
+    too, but it is no covariance (`is_covariance`).
     """
     d = gains.shape[1] + steps.transition.shape[-1]
     start = affine_fixed_point(lambda m: propagate_error_moments(steps, m, gains).moments[-1], d)
@@ -143,9 +145,9 @@ def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Prop
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
-    """Decide whether all moments, at a fixed point over a period, are positive semidefinite to rounding (INDEFINITE).
+    """Return whether the moments at a fixed point over a period are positive semidefinite up to rounding (INDEFINITE).
 
-    The moments then converge to this fixed point; else they diverge.
+    If they are, moments converge to this fixed point; if not, they diverge.
     """
     fixed = jax.lax.stop_gradient(moments)  # only decided: nothing is differentiated
     smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
@@ -263,8 +265,8 @@ def periodic_receiver_error_design(
 ) -> RelayDesign:
     """Design gains of relays and receiver that together make the steady sum over the slots of tr P small.
 
-    P: the receiver's error covariance; slots: turns of the senders, which repeat.
-    Descent through the fixed point of the second moments; the result is a local minimum.
+    P is the receiver's error covariance. Slots are turns of the senders, which repeat. The descent goes through the
+    fixed point of the second moments, and ends in a local minimum.
 
     Args:
         network: the network, which varies with its slots only.

@@ -80,7 +80,7 @@ def minimise_over_gains(
 def _descend(cost: Cost, x: Float[np.ndarray, "n"], arguments: tuple[Any, ...]) -> Float[np.ndarray, "n"]:
     """Return the x of least cost, found by descent from x; `arguments` are those that the cost takes after x.
 
-    The cost gives its value, its gradient by x and the power, which only the multipliers of the limit need.
+    The cost returns its value, its gradient by x, and the power, which is not used here.
     """
 
     def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -122,8 +122,9 @@ def _penalise_power(
 ) -> Float[jax.Array, ""]:
     """Return log sum_s trace_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, g = power / limit - 1, c the STIFFNESS.
 
-    By slot s: trace, of the receiver's error covariance; g, the relative excess over the limit of power; lambda, its
-    multiplier in an augmented Lagrangian. Infinite where the moments are not `sound`, so that a search turns back.
+    In slot s, trace_s is that of the receiver's error covariance, g_s the relative excess over the limit of power, and
+    lambda_s its multiplier in an augmented Lagrangian. The value is infinite if the moments are not `sound`, so that a
+    search turns back.
     """
     total = jnp.sum(traces)
     has_cost = sound & (total > 0)

@@ -107,7 +107,7 @@ def event_filter(
 def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:
     """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities.
 
-    A pattern of arrivals says which components arrive. A channel that drifts, without a finite number of modes, is
+    A pattern of arrivals says which components arrive. A channel that drifts has no finite number of modes, and is
     refused.
     """
     drifting = [memory for memory in memories(first(channel)).values() if memory.drifts]
@@ -202,7 +202,7 @@ def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
 def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
     """Return whether what arrives is y itself, all of it.
 
-    p: numbers in y; m: received numbers; mean: E[(G, n)] of z = G y + n, by mode and pattern of arrivals.
+    y has p numbers, and m numbers are received. `channel.mean` is E[(G, n)] of z = G y + n by mode and pattern.
     """
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:

@@ -105,7 +105,7 @@ class Cubature(AbstractTransform):
 def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each.
 
-    m: the mean of x (n,); L_j: column j of its root; p: length of f.
+    x has the mean m (n,) and a root with the columns L_j. f has length p.
     """
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)

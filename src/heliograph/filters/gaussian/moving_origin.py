@@ -215,7 +215,7 @@ def _start_at_zero(base: Any) -> Any:
 def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
     """Return the plant of deviations from a center, whose state starts at zero.
 
-    `level`: what is subtracted from f, the origin after the step; `unit`: eps of the precision.
+    `level` is the origin after the step, which is subtracted from f. `unit` is eps of the precision.
     """
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
@@ -227,7 +227,7 @@ def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float
 def _center_sensor(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
     """Return the sensor of deviations from a center.
 
-    `level`: what is subtracted from h, the signal of the center; `unit`: eps of the precision.
+    `level` is the signal h of the center, which is subtracted from h. `unit` is eps of the precision.
     """
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,

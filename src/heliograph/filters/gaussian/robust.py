@@ -217,7 +217,7 @@ class RobustFilter(AbstractGaussianStateFilter):
         return make_moving_origin_filter(self)
 
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
-        """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""
+        """Return the prediction of z without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         initial_power = second_moments_at_start(self.plant, self)
         signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, initial_power)

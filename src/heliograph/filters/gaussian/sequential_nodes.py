@@ -64,7 +64,7 @@ class SequentialFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with each node's measurement in turn; z: those of all nodes, one behind the other."""
+        """Correct with each node's measurement in turn; z holds the measurements of all nodes, one after another."""
         z = jnp.asarray(z)
         if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)

@@ -363,7 +363,7 @@ def as_current_filter(
         channel: from the sensor to the filter; its delays and memory are ignored.
         update: how uncertain probabilities are bounded; `Polytope()` by default.
 
-    Claim: "nominal" where anything can be late or memory matters; `true_error` computes the error that results, before
+    Claim: "nominal" where anything can be late or memory matters. `true_error` computes the error that results before
     any data.
 
     Raises:

@@ -32,7 +32,7 @@ class PlantMotion(NamedTuple):
 def motion_of_plant(plant: LinearPlant, u: jax.Array, initial_power: jax.Array) -> PlantMotion:
     """Return the plant's motion under the input u; `initial_power` is E[x_i^2] before the first step, (n,).
 
-    x+ = matrix x + shift + w; `covariance`, `noise`: Cov w, and its factors with rounding.
+    It is x+ = matrix x + shift + w. `covariance` is Cov w, and `noise` holds its factors, with rounding added.
     """
     return PlantMotion(
         matrix=plant.transition_matrix(u),
@@ -92,7 +92,7 @@ class MomentsBeforeData(NamedTuple):
     def measure(self, sensor: LinearSensor) -> SignalMoments:
         """Return the moments of the signal y = C x + v: its mean, E[y y'] and the columns of Cov v.
 
-        The law of v may depend on the signal's mean and variances; `state_part`: C Cov(x) C'.
+        The law of v may depend on the signal's mean and variances. `state_part` is C Cov(x) C'.
         """
         matrix, law = jnp.asarray(sensor.matrix), sensor.noise
         mean = matrix @ self.mean + law.mean

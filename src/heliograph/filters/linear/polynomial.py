@@ -236,7 +236,7 @@ def scheduled_polynomial_filter(
         sensor: a linear sensor, m outputs.
         channel: from the sensor to the filter.
         horizon: number of steps.
-        degree: of the polynomial in z_k; 2 by default.
+        degree: degree of the polynomial in z_k; 2 by default.
 
     Claim: as `polynomial_filter`.
 

@@ -129,7 +129,10 @@ class MixtureFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
-        """Return A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
+        """Return the mean A m + B u + E w and the covariance A P A' + Q, and the modes' law after a transition.
+
+        At the first prediction the modes keep their initial law.
+        """
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         predicted = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)

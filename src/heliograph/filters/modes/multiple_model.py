@@ -386,7 +386,7 @@ def gpb2_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small, as for the others. With next to no noise in plant and link squared errors were 17 times
+    many modes it is too small, as for the others. With almost no noise in plant and link squared errors were 17 times
     the claim.
 
     Raises:

@@ -176,7 +176,7 @@ def _compile_in_place(
 
 
 def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs_by_run: tuple[bool, ...]) -> Any:
-    """Return the compiled function(filter, *arguments), to be called with the arguments; None without native code."""
+    """Return compiled code of function(filter, *arguments) that takes the arguments; None without native code."""
     choice = choose_code(function, (filter, *arguments), differs_by_run=[False, *differs_by_run])
     if choice.code is None:
         return None

@@ -277,7 +277,7 @@ class LateFilter(AbstractWrapper):
 
 
 def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
-    """Put a filter behind a link with a constant delay: it filters the past and predicts to the present.
+    """Return a filter behind a link with a constant delay, which filters the past and predicts to the present.
 
     Args:
         filter: a filter made for the link without delay.
