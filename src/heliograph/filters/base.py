@@ -140,7 +140,7 @@ class AbstractFilter(Module):
 
         Args:
             z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
-            u: inputs (steps, inputs), for each row the input that led to it; needed only by a filter with inputs.
+            u: inputs (steps, inputs), for each row the input that led to it; by default a filter without inputs.
             after: this filter's result of the rows before these; none by default.
 
         Raises:

@@ -35,7 +35,7 @@ def smoother_steps(
     Args:
         filter: a filter that can be smoothed.
         measurements: rows (steps, received), or (steps,) of one number; NaN for what did not arrive.
-        inputs: rows (steps, inputs), needed only by a filter with inputs.
+        inputs: rows (steps, inputs); by default there are none, as for a filter without inputs.
         state: state before the first row; the filter's initial state by default.
         first_step: number of the first row's step; 0 by default.
 

@@ -59,7 +59,7 @@ def mean_error_bound(
         filter: a `linear_filter` behind a link that tells gains, readings of gains, or numbers of finitely many values
             or of one gain's law.
         steps: number of steps.
-        inputs: rows (steps, inputs), needed only by a filter with inputs.
+        inputs: rows (steps, inputs); by default there are none, as for a filter without inputs.
 
     Claim: "upper".
 
