@@ -177,7 +177,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> Callable[P, R]:
     """Return the function wrapped in `jax.jit`, so that a surrounding trace traces it once for the same shapes.
 
-    `structure` (of the arguments) and `settings` (of JAX, on which a trace depends) are only keys of this cache.
+    `structure` (of the arguments) and `settings` (on which a trace depends) are only keys of this cache.
     JAX keeps a trace as long as its function lives. The cache holds COMPILED wrapped functions, and when it drops one,
     the traces of that structure and these settings are freed with it.
     """
