@@ -86,7 +86,7 @@ def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
     """Return the gains by filter as one block matrix for each step.
 
-    Rows are by filter and state. Columns are all R received numbers, by filter. Entries for other filters' are 0.
+    Rows are by filter and state. Columns are the R received numbers, by filter. All else is 0.
     """
     if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))

@@ -383,7 +383,7 @@ def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return the channel as if nothing were late: the present signal is in every place of its delay line."""
     check_maps("channel", [channel])
     if isinstance(channel, RelayedLinks):
-        # Each stage is treated by itself.
+        # Each stage has a delay line of its own.
         return Series([_deliver_at_once(stage) for stage in channel.stages])
     repeat = known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1)))
     return Series([repeat, place_on_delay_line(channel)])
