@@ -58,7 +58,7 @@ class EngineChoice(NamedTuple):
 
 
 def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
-    """Return in words which engine computes a function of one run over runs of these arguments, and why.
+    """Return in words which engine computes a function of one run for several runs, and why.
 
     Args:
         function: a function of the arrays of one run.
@@ -77,9 +77,9 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
-    """Return why native code does not take a function of these arguments, those of one run; "" if it does.
+    """Return why native code refuses a function with these arguments of one run, or "" if it takes the function.
 
-    "" too where the environment forces XLA: then nothing is asked of native code.
+    The answer is also "" where the environment forces XLA, since native code is not asked then.
     """
     if read_forced_engine() == "xla":
         return ""
@@ -125,7 +125,7 @@ def compute_once(
 
     Args:
         function: a function of trees of arrays.
-        by_xla: the same function compiled by XLA, which computes it elsewhere.
+        by_xla: the same function compiled by XLA. It computes where native code does not.
         arguments: its arguments.
         most: operations above which XLA computes; no limit by default, so that XLA has only what native code refuses.
     """
@@ -153,9 +153,10 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        """Compute the function: of known arguments by native code, if it has no more than SHORT operations.
+        """Compute the function by native code, or by XLA where native code does not apply.
 
-        `by_xla`, the same function compiled by XLA, takes all else; within a trace the function is traced once.
+        Native code takes known arguments and a function of at most SHORT operations. Where all arguments are traced,
+        the function is traced too, once for each structure. `by_xla`, the function compiled by XLA, takes all else.
         """
         leaves, structure = jax.tree.flatten(args)
         are_all_traced = bool(leaves) and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
@@ -174,11 +175,11 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 
 @lru_cache(COMPILED)
 def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> Callable[P, R]:
-    """Return the function as a call within a trace, traced once for the same shapes; its operations keep their lines.
+    """Return the function wrapped in `jax.jit`, so that a surrounding trace traces it once for the same shapes.
 
-    There is one such call for each structure of its arguments, so that a trace is forgotten with it (JAX keeps a trace
-    as long as the function), and for each state of the settings that what is traced depends on. So `structure` and
-    `settings` are only keys of the cache, which holds COMPILED calls.
+    `structure` (of the arguments) and `settings` (on which a trace depends) are only keys of this cache.
+    JAX keeps a trace as long as its function lives. The cache holds COMPILED wrapped functions, and when it drops one,
+    the traces of that structure and these settings are freed with it.
     """
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -189,7 +190,7 @@ def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> C
 
 
 def read_forced_engine() -> str:
-    """Return the engine that the environment variable SETTING forces, one of ENGINES; "" if it is not set."""
+    """Return the engine of ENGINES that the environment variable SETTING forces, or "" if it is not set."""
     engine = os.environ.get(SETTING, "")
     if engine not in ("", *ENGINES):
         raise fail(SETTING, " or ".join(ENGINES), engine)
@@ -197,7 +198,9 @@ def read_forced_engine() -> str:
 
 
 def make_native_or_none(make: Callable[[], Code]) -> Code | None:
-    """Return the native code that `make` makes; None if XLA has to compute, forced or since `make` raises Unsupported.
+    """Return the native code that `make` makes, or None if XLA has to compute.
+
+    XLA has to compute where the environment forces it, and where `make` raises Unsupported.
 
     Raises:
         ValueError: native code is forced and does not take the program.
@@ -274,9 +277,9 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
     arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
 
     def call(*values: Any) -> PyTree:
-        """Return the result of the function in the tree, with these values where `leaves` has an array's placeholder.
+        """Call the function with these values in the places of the placeholders among `leaves`, and return its result.
 
-        The tree (`structure`) is (function, *arguments): also the function may hold arrays.
+        `leaves` and `structure` are those of the tree (function, *arguments), since the function may hold arrays too.
         """
         next_value = iter(values)
         with_values = [next(next_value) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]

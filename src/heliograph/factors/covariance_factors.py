@@ -62,7 +62,7 @@ def join_columns(*parts: WeightedColumns) -> WeightedColumns:
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
-    """Return sum_i w_i P_i, w_i the `weights`: the columns of all P_i, (i, n, columns) in `parts`, side by side."""
+    """Return the columns of sum_i w_i P_i: those of all P_i (i, n, columns) in `parts`, with the `weights` w_i."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     scaled_weights = (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1)
@@ -85,7 +85,7 @@ def unit_lower(entries: Array) -> Any:
 
 @cache_arrays
 def _place_unit_lower(count: int) -> np.ndarray:
-    """Return which entry below the diagonal each number of L (n, n) is, by index; `count`: a 0, `count` + 1: a 1."""
+    """Return for each number of L (n, n) its index in the list of `count` entries below the diagonal, a 0 and a 1."""
     n = (1 + int(np.sqrt(1 + 8 * count))) // 2  # of count = n (n - 1) / 2
     index = np.full((n, n), count)
     index[np.tril_indices(n, -1)] = np.arange(count)
@@ -178,7 +178,7 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        """Rotate one column (c, w) into the factors (entries of L, d): of L diag(d) L' + w c c', from the first row."""
+        """Return the factors of L diag(d) L' + w c c': row j takes its part of c, and c_i - c_j L_ij is left below."""
         (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
@@ -199,7 +199,7 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
 def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
 
-    Rounding may leave less than nothing of a pivot d_j, so each is raised to at least `least` times |P_jj|.
+    Rounding may make a pivot d_j negative, so each pivot is raised to at least `least` times |P_jj|.
     """
     least_pivots = least * lax.abs(diagonal(covariance))
     factor = _eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column
@@ -232,9 +232,9 @@ def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
 
 
 def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """Return W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of the deviations.
+    """Return a root W (n, rank) of a known covariance P = W W', by Cholesky's method with pivots.
 
-    The largest variance left comes first, until none is above RANK, a share of its own: less is rounding.
+    Components are in units of their deviations. The largest variance left comes next, until none is above RANK.
 
     Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
     """
@@ -255,7 +255,7 @@ def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
 def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return L's entries below the diagonal and d of a known P = L diag(d) L', by orthogonal rows of its root.
 
-    From the first row down: d_j is the square of what is left of row j.
+    Row j loses its parts along the rows above it. d_j is the squared length of what is left.
     """
     rows = find_covariance_root(covariance)
     n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
@@ -267,7 +267,7 @@ def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def columns_of(covariance: Array) -> WeightedColumns:
-    """Return columns W and weights w of P = W diag(w) W'; as many as the rank of a known P (NumPy's), else n."""
+    """Return W and w of P = W diag(w) W', with as many columns as the rank of a known P (NumPy's), or n of another."""
     if isinstance(covariance, np.ndarray):
         root = find_covariance_root(covariance)
         return WeightedColumns(root, np.ones(root.shape[1]))
@@ -277,8 +277,8 @@ def columns_of(covariance: Array) -> WeightedColumns:
 def factor_covariances(covariances: Array) -> WeightedColumns:
     """Return the columns W (count, n, n) and weights w (count, n) of covariances P = W diag(w) W' (count, n, n).
 
-    Of known covariances (NumPy's) they are roots of weight 1, padded by zeros where the rank is below n; of others they
-    come by elimination.
+    NumPy covariances are known: their columns are roots of weight 1, with columns of zeros where the rank is below n.
+    All others are factored by elimination.
     """
     if not isinstance(covariances, np.ndarray):
         eliminated: WeightedColumns = jax.vmap(eliminate)(covariances)
@@ -296,11 +296,11 @@ def factor_covariances(covariances: Array) -> WeightedColumns:
 def rounding_of(second_moments: Array) -> WeightedColumns:
     """Return the covariance (n, n) of the rounding of numbers s_i: diagonal, (ROUNDING_UNITS eps)^2 E[s_i^2].
 
-    It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
-    variance it would be lost.
+    Models take the rounding of the state beside Q, and that of a measurement beside R. It is kept in columns of its
+    own, since it is so small that a sum with a variance would lose it.
 
     Args:
-        second_moments: E[s_i^2] (n,); of very large ones the variance is LARGEST, so that it stays finite.
+        second_moments: E[s_i^2] (n,). No variance is above LARGEST, so that all stay finite.
     """
     variances = (ROUNDING_UNITS * unit_of(second_moments)) ** 2 * second_moments
     return WeightedColumns(np.eye(len(second_moments)), library(second_moments).minimum(variances, LARGEST))
@@ -344,7 +344,7 @@ def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
 
 
 def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> WeightedColumns:
-    """Put L and d together from L's columns below the diagonal, which are 0 on and above it, and the entries of d."""
+    """Return L and d from the columns of L - I, which are 0 on and above the diagonal, and the entries of d."""
     n = len(variances)
     if not n:
         return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
@@ -363,7 +363,7 @@ def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
     n = len(rows)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take row j off the rows below it, orthogonal in the columns' `weights`; put column j into L, d_j into d."""
+        """Make the rows below row j orthogonal to it, in the columns' `weights`; put column j into L and d_j into d."""
         rows, lower, variances = carry
         weighted = weights * rows[j]
         d = rows[j] @ weighted

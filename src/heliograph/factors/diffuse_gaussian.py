@@ -61,9 +61,10 @@ def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
 
 
 def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the covariance of H x (m, m) by the known directions of x, and which components depend on unknown ones.
+    """Return the covariance of H x (m, m) from the known directions of x, and a flag (m,) for each component.
 
-    An unknown direction has infinite variance: such a component (of m) has an infinite variance too.
+    The flag is True where the component depends on an unknown direction of x. Such a direction has infinite variance,
+    and so has the component.
     """
     slopes = _find_slopes(matrix, x)
     depends_on_unknown = jnp.any((slopes != 0) & (x.infinite > 0), axis=1)
@@ -120,7 +121,7 @@ def triangularise_both_levels(
 
 
 def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) -> Diffuse:
-    """Return the law of a state of which some components are unknown: of infinite variance.
+    """Return the law of a state with some unknown components, whose variance is infinite.
 
     Args:
         mean: of the state (n,).
@@ -140,7 +141,7 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
     """Predict x over x+ = F x + b + w: F is `matrix`, b the `shift`, `noise` columns of Cov w.
 
-    Of the covariance both levels are carried on, the finite and the infinite one.
+    The covariance has two levels, a finite one and an infinite one. Both are predicted.
     """
     rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
     lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
@@ -152,8 +153,8 @@ def _append_noise_columns(
 ) -> tuple[jax.Array, FiniteAndInfiniteWeights]:
     """Return the rows [slopes | N] of x+ = m+ + slopes xi + N omega, with the weights of their columns.
 
-    xi are the uncorrelated errors of x, with its variances as weights, finite or infinite ones; omega are those of the
-    noise, of finite weights. N diag(weights) N' is the noise's covariance.
+    xi are the uncorrelated errors of x. Their weights are the variances of x, finite or infinite. omega are the
+    uncorrelated parts of the noise, with finite weights. N diag(weights) N' is the noise's covariance.
     """
     rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
     noise_weights = jnp.asarray(noise.weights)
@@ -253,8 +254,8 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
 def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
     """Return the regression of x on the next state x+ = F x + b + w, where x may have unknown directions.
 
-    These have an infinite variance, beside the finite ones of the others: two levels. What of x stays unknown given
-    x+ gets the variance NaN, and so do the estimates that rest on it.
+    The covariance has two levels: unknown directions have infinite variances, all others finite ones. A direction of x
+    that stays unknown given x+ gets the variance NaN, and so do the estimates that use it.
 
     Args:
         x: the state before the step.

@@ -69,7 +69,7 @@ class Gaussian(NamedTuple):
 
     @property
     def covariance(self) -> Any:
-        """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are; the upper triangle mirrored: symmetric."""
+        """The covariance L diag(d) L' (..., n, n), exactly symmetric since its upper triangle is mirrored."""
         xp = library(self)
         root, variances = (xp.asarray(factor) for factor in (self.root, self.variances))
         product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
@@ -98,9 +98,9 @@ def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Ga
 
 
 def from_covariance(mean: Array, covariance: Array) -> Gaussian:
-    """Return the Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself.
+    """Return the Gaussian of a covariance matrix that a user gave, with each variance exact to n eps of itself.
 
-    One in NumPy is known, and factored at once; another by elimination in JAX.
+    A NumPy matrix is known, and is factored at once by NumPy. Any other is factored by elimination in JAX.
     """
     if isinstance(covariance, np.ndarray):
         factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_known_covariance(covariance))
@@ -112,7 +112,7 @@ def from_covariance(mean: Array, covariance: Array) -> Gaussian:
 def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumns) -> Gaussian:
     """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w.
 
-    x has the mean m and covariance L diag(d) L'; F is `matrix`, b the `shift`, `noise` columns of Cov w.
+    x has the mean m and covariance L diag(d) L'. F is `matrix`, b is `shift`, and `noise` holds columns of Cov w.
     """
     of_state = WeightedColumns(matrix @ x.root, x.variances)
     return from_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(of_state, noise))
@@ -174,9 +174,9 @@ def sum_unexplained(image: Image, noise: WeightedColumns) -> WeightedColumns:
 def add_noise_to_image(image: Image, noise: WeightedColumns) -> Gaussian:
     """Return the Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
 
-    `image` has the mean, the slopes' columns (`explained`) and those of what f's curvature adds; `noise` holds factors
-    of Cov w, L unit lower. Columns are made orthogonal, not summed to a matrix: x may be so correlated that the sum
-    would round away what a precise measurement has to tell apart.
+    `image` has the mean, the columns of the slopes (`explained`) and the columns that f's curvature adds. `noise` holds
+    factors of Cov w, with L unit lower. Columns are made orthogonal and never summed to a matrix: where x is strongly
+    correlated, the sum would round away the differences that a precise measurement can see.
     """
     if writes_short_programs():
         factors = add_columns_to_factors(noise, image.columns)
@@ -202,10 +202,9 @@ class Innovations(NamedTuple):
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
         """Return log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
 
-        e (`value`) are the innovations and s (`variance`) their variances, each given those before it; `present` (m,)
-        says what arrived. A component that those before it determine, s_j = 0 to rounding, adds nothing where it
-        agrees with them and -inf where it does not; `size` (m,) is the size of the terms whose difference is the
-        innovation.
+        e (`value`) are the innovations and s (`variance`) their variances, each given those before it. `present` (m,)
+        says what arrived. If those before j determine component j, s_j is 0 up to rounding. It then adds 0 if it agrees
+        with them, and -inf if not. `size` (m,) is the size of the terms whose difference is the innovation.
         """
         determined = self.determined
         variance = jnp.where(determined, 1.0, self.variance)
@@ -270,22 +269,21 @@ def correct_by_gain(
 ) -> Gaussian:
     """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
 
-    e is the innovation. Joseph's form, a sum of squares; with Kalman's gain it is `condition_on_observation`.
+    e is the innovation. The covariance is a sum of squares (Joseph's form), and right for any gain K.
     """
     error = WeightedColumns(x.root - gain @ slopes, x.variances)
     return from_columns(x.mean + gain @ innovation, join_columns(error, noise.through(gain)))
 
 
 def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-    """Change the mean and variance of t = E t + row xi, a combination of x = m + L xi, and with them x, of rank one.
+    """Give t = E t + row xi, a combination of x = m + L xi, another mean and variance, and correct x by it.
 
-    The law of x given t stays.
+    The mean of t moves by `shift`. Its variance V = row diag(d) row' becomes `ratio` times V. The law of x given t
+    stays, so x gets the mean m + K shift and the covariance P - (1 - ratio) K V K', with K = Cov(x, t) / V.
 
-    The mean of t moves by `shift`, its variance V = row diag(d) row' becomes `ratio` times V, as by a likelihood of t
-    of any shape: mean + K shift and P - (1 - ratio) K V K', K = Cov(x, t) / V. With f = row and
-    s_j = ratio sum_{k < j} f_k^2 d_k + sum_{k >= j} f_k^2 d_k: d_j+ = d_j s_{j+1} / s_j and
-    L_j+ = L_j - (1 - ratio) (f_j / s_{j+1}) sum_{k > j} d_k f_k L_k. Ratios of sums of positive terms, whether the
-    ratio is below 1 or above. Where V is 0, x stays as it is.
+    The factors follow from s_j = ratio sum_{k < j} f_k^2 d_k + sum_{k >= j} f_k^2 d_k, with f = row:
+    d_j+ = d_j s_{j+1} / s_j and L_j+ = L_j - (1 - ratio) (f_j / s_{j+1}) sum_{k > j} d_k f_k L_k. All s_j are sums of
+    positive terms, for a ratio below 1 and above. Where V is 0, x stays as it is.
 
     Shapes: row (n,), shift and ratio () and ratio >= 0.
 
@@ -305,7 +303,7 @@ def moments_of_mixture(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
 
-    Means are taken about the first one: of equal means, however large, the differences are exactly 0.
+    Differences are taken from the first mean, so that equal means, however large, have differences of exactly 0.
     """
     about_first = means - means[0]
     shift = weights @ about_first

@@ -13,11 +13,11 @@ from heliograph.numerics.manifold import Manifold
 
 
 def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
-    """Return x as it is where no state is an attitude; else the law of center plus d, from that of center + d.
+    """Return the law of (center plus d) from the law of the plain sum x = center + d.
 
-    d is the change from `center`, to which a filter adds as to a plain vector; `plus` turns an attitude by d. So the
-    mean becomes m' = center plus E d, and an error about it is J (d - E d) to first order, J the derivative of the
-    change from m' at E d: errors are turned to the axes of m'.
+    `plus` turns an attitude by d. Where no state is an attitude, both sums are equal and x is returned. Else the mean
+    becomes m' = center plus E d. To first order its error is J (d - E d), with J the derivative by d, at E d, of the
+    change that leads from m' to center plus d. So J (`reset`) turns errors to the axes of m'.
 
     Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), section 6.3 (the reset).
     """
@@ -29,10 +29,10 @@ def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
 
 
 def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
-    """Return x as it is where no state is an attitude; else the law of center + d, from that of x = center plus d.
+    """Return the law of the plain sum center + d from the law of x = (center plus d), as the inverse of `settle`.
 
-    d is the change from `center`: `plus` turns an attitude by it, + adds it as to a plain vector, as filters need it.
-    The inverse of `settle`: its matrix J of errors is inverted.
+    `plus` turns an attitude by d, and + adds d to a plain vector, as filters need it. Where no state is an attitude,
+    both sums are equal and x is returned. Else errors are multiplied by J^-1, J the matrix of `settle`.
     """
     if not manifold.rotations:
         return x

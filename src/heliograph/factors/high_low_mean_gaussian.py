@@ -35,9 +35,9 @@ def center_gaussian(center: jax.Array, x: Gaussian) -> SplitMeanGaussian:
 
 
 def center_known(x: Gaussian) -> SplitMeanGaussian:
-    """Return a law of known numbers with its mean split in two: as single precision has it, and the rest.
+    """Return the law with its known mean split in two parts: the mean in single precision, and the rest.
 
-    So single precision can compute with a mean of double precision; the covariance is unchanged.
+    So single precision can compute with a mean of double precision. The covariance does not change.
     """
     mean = np.asarray(x.mean, np.float64)
     high = mean.astype(np.float32).astype(np.float64)

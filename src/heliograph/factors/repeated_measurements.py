@@ -28,9 +28,9 @@ from straightline import operation
 def triangularise_noise(noise: WeightedColumns) -> WeightedColumns:
     """Return L and d with L diag(d) L' = W diag(w) W', the covariance of m components' noises, by orthogonal rows.
 
-    A component that repeats others must keep no rounding of theirs as a noise of its own. With w_i = W_i - sum_j L_ij
-    w_j, what is left of row i: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is put to zero, in rows that
-    have others before and behind them, so not of fewer than 3.
+    A component may repeat others, and their rounding must not become a noise of its own. What is left of row i is
+    w_i = W_i - sum_j L_ij w_j. An entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is rounding, and is set to zero.
+    This concerns only rows between others, so that with fewer than 3 rows there is nothing to set.
     """
     if len(noise.matrix) < 3:
         return triangularise(noise)
@@ -48,9 +48,9 @@ def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
 def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     """Return the variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding.
 
-    s_i are the components as measured, w_i with uncorrelated noises; L is `lower`, the noises' unit triangle.
-    `whole` holds the variances (m,) of the rows s_i. It is ROUNDING_UNITS n eps of each s_i, from which measuring takes
-    what was known, and RANK of what is subtracted: a correlation of noises is not known to more.
+    s_i are the components as measured, w_i those with uncorrelated noises. L is `lower`, the noises' unit triangle.
+    `whole` holds the variances (m,) of the rows s_i. The rounding is ROUNDING_UNITS n eps of s_i itself, and `share` of
+    each subtracted L_ik w_k. The share is at least RANK, since correlations of noises are not known better.
     """
     share = max(ROUNDING_UNITS * n * unit_of(whole), RANK)
     below = jnp.tril(lower, -1)
@@ -100,9 +100,9 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
     m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
 
     def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take row j, its rounding set to 0, off the rows below it; put column j into L and its variance into d.
+        """Set the rounding of row j to 0, make the rows below orthogonal to it, and fill in column j of L and d_j.
 
-        L diag(d) L' = A diag(weights) A'. Carried are what is left of the m rows of A, the `size` of each entry (its
+        L diag(d) L' = A diag(weights) A'. `carry` holds what is left of the m rows of A, the `size` of each entry (its
         absolute value plus all that was taken off it), L and d. An entry up to `share` of its size is rounding.
         """
         rows, size, lower, variances = carry

@@ -21,8 +21,8 @@ def update_by_scalar(
     x = m + V xi, with uncorrelated xi of variances d (n,).
     With Var v = r, s = f' diag(d) f + r is the variance of the innovation, and K = V diag(d) f / s.
 
-    With s_j = r + sum_{k >= j} f_k^2 d_k and w_j = sum_{k >= j} d_k f_k V_k, columns V_j of V:
-    d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. Ratios of sums of positive terms.
+    With s_j = r + sum_{k >= j} f_k^2 d_k, w_j = sum_{k >= j} d_k f_k V_k and the columns V_j of V,
+    d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. All s_j are sums of positive terms.
 
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, its order reversed
     since L is lower.
@@ -34,7 +34,7 @@ def update_by_scalar(
 def update_by_scalar_given_products(
     root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v of x = V xi, given `products`: d_j f_j and f_j^2 d_j, which are 0 of a slope that is rounding.
+    """Measure f' xi + v of x = V xi, given the `products` d_j f_j and f_j^2 d_j, which are 0 for mere rounding.
 
     Returns the rows V and variances d given the measurement, its gain K = V diag(d) f / s, and the variance s of its
     innovation. `noise` is Var v.
@@ -92,7 +92,7 @@ def update_by_parts(
         def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
             """Measure part i of a vector of n, and put its gain into column i of the gains.
 
-            `least` is the variance up to which a part's slopes are rounding; row `first_part` of the root is part 0's.
+            `least` (n,) are the variances up to which a part's slopes are rounding. Row `first_part` is that of part 0.
             """
             root, d, least, gains = carry
             root, d, gain = measure_part(i, root, d, least[i])
@@ -122,8 +122,8 @@ def update_by_row(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Measure f' xi + v of x = V xi, Cov xi = diag(d); return V, d, the gain and the variance of the innovation.
 
-    Slopes f whose variance f' diag(d) f is at most `least` are rounding and must say nothing: such a measurement is
-    taken with a noise so large that it changes no digit. None: there are none to judge. `noise` is Var v.
+    `noise` is Var v. Slopes f with a variance f' diag(d) f of at most `least` are rounding, and must not change x: then
+    the noise is made so large that the measurement changes no digit. If `least` is None, the slopes are not judged.
     """
     product = d * f
     power = f * product
@@ -140,15 +140,15 @@ Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 def update_by_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array) -> Measured:
-    """Measure the rows below the n of a state, one by one; return what each has changed.
+    """Measure the m rows of `root` below the n rows of the state, one after another.
 
-    These are rows (n + m, n) and variances (n,) given the measurements, `news`, the m innovations, each given those
-    before it, and their variances.
+    Returns the rows (n + m, n) and variances (n,) given all measurements, `news` after them, the m innovations, each
+    given those before it, and the variances of the innovations.
 
     Args:
         root: rows (n + m, n) of L, and of the m components' slopes below.
         d: variances (n,) of the columns.
-        news: the mean, and below it the innovations times -1, since a gain moves both by the same sum (n + m,).
+        news: the mean (n,) and below it the innovations times -1 (m,), since a gain adds the same to both.
         variance: of the components' noises (m,).
         least: variance (m,) up to which slopes are rounding.
     """
@@ -161,8 +161,8 @@ def _update_by_rows_one_by_one(
 ) -> Measured:
     """Write `update_by_rows` out, row after row: the m rows of `root` below the n of the state are measured.
 
-    `news` is the mean and, below it, the innovations times -1; `least` the variance up to which a row's slopes count as
-    rounding, which none does of the first, whose slopes nothing was taken off.
+    `news` is the mean and, below it, the innovations times -1. `least` is the variance up to which a row's slopes count
+    as rounding. The first row is not judged, since nothing was subtracted from its slopes.
     """
     n, innovations, variances = len(d), list[jax.Array](), list[jax.Array]()
     for i in range(len(variance)):
@@ -188,12 +188,12 @@ def _update_by_rows_in_loop(
         """Measure row n of the root, behind the state's n rows; return what is next, and (innovation, its variance).
 
         Then row n is moved behind all others, so that the next row to measure takes its place. `news` holds the mean
-        and the innovations times -1, `least` the variance up to which slopes are rounding.
+        and the innovations times -1. `least` holds the variances up to which slopes are rounding, -1 for the first row.
         """
         root, d, news, least = carry
         rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, least[0])
         innovation = -news[n]
-        # Of the first row, marked by -1, the rounding is that of its own products.
+        # The first row has no rounding from rows before it, only that of its own products.
         rounding = jnp.where(least[0] < 0, rounding_of_products(n, variance_of_row), least[0])
         least = propagate_slope_rounding(least, gain[n:], rounding)
         news = news + gain * innovation

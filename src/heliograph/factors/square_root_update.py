@@ -29,8 +29,8 @@ def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarra
 def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "*items n n"]:
     """Return W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
 
-    So units do not matter. Where rounding made an eigenvalue negative, it counts as zero; a component of variance zero
-    (`is_known` is False in its row and column) has a row of zeros.
+    Correlations do not depend on units. An eigenvalue that rounding made negative counts as zero. A component of
+    variance zero has a row of zeros in W; `is_known` is False in its row and column of P.
     """
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     unit = np.where(deviation > 0, deviation, 1.0)
@@ -87,8 +87,8 @@ def observe_root(
 def _solve_for_gain(v: np.ndarray, k_v: np.ndarray, independent: np.ndarray) -> np.ndarray:
     """Return K (..., n, m) from the lower triangular V (..., m, m) and K V, with zeros for dependent components.
 
-    A dependent one repeats others, so that its pivot V_jj is rounding; `independent` (..., m) says which are not.
-    By substitution from the last column on: K_j = (K V_j - sum_i>j K_i V_ij) / V_jj.
+    A dependent component repeats others, so that its pivot V_jj is only rounding. `independent` (..., m) is False for
+    it. Columns are found from the last to the first: K_j = ((K V)_j - sum_{i > j} K_i V_ij) / V_jj.
     """
     pivots = np.diagonal(v, axis1=-2, axis2=-1)
     inverse = np.where(independent, 1 / np.where(independent, pivots, 1.0), 0.0)
@@ -104,8 +104,8 @@ def observe_information(
 ) -> ObservedRoot:
     """Condition x of covariance W W' on measurements of information J = C' Cov(v)^-1 C: P+ = (P^-1 + J)^-1.
 
-    P = W W' may be singular, so it is not inverted: with J = U U', z = U' x + v with Cov v = I says as much. Returns
-    the gain of that z, and a root of P+.
+    P = W W' may be singular, so it is not inverted. With J = U U', the measurement z = U' x + v with Cov v = I has the
+    same information. Returns the gain of this z, and a root of P+.
     """
     rows = roots_of(information).swapaxes(-1, -2)
     return observe_root(root, rows, np.eye(rows.shape[-1]))
@@ -114,8 +114,8 @@ def observe_information(
 def _find_independent_rows(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
     """Find which rows are independent of the independent rows before them, by Gram-Schmidt.
 
-    These are the rows (..., m, c) of whose squared length more than the share RANK is left, when their part along those
-    before is taken off.
+    Each row (..., m, c) loses its parts along the independent rows before it. It is independent if more than the share
+    RANK of its squared length is left.
     """
     remainder, is_independent = rows, np.zeros(rows.shape[:-1], bool)
     for j in range(rows.shape[-2]):

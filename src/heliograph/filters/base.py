@@ -133,15 +133,15 @@ class AbstractFilter(Module):
     ) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
 
-        Rows too many to be held are run in blocks, each `after` the result of that before, as if they were one run.
-        Every number is used as it is; `hg.run` leaves out those that are implausible, and warns. A linear filter takes
-        from 32,768 rows on in chunks side by side where it forgets its start within 512 rows (of 131,072 rows within
-        2,048), equal to the pass row by row to 1e-10 of a deviation; every other filter goes row by row.
+        Rows that do not fit into memory may be run in blocks: give each call the result of the block before it as
+        `after`. Every number is used as it is; `hg.run` leaves out implausible numbers, and warns. From 32,768 rows on
+        a linear filter takes chunks of rows side by side if it forgets its start within 512 rows; from 131,072 rows
+        on, within 2,048 rows. The results equal those row by row to 1e-10 of a deviation.
 
         Args:
             z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
-            u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
-            after: result of the rows before these, of this filter; none by default.
+            u: inputs (steps, inputs), for each row the input that led to it; by default a filter without inputs.
+            after: this filter's result of the rows before these; none by default.
 
         Raises:
             ValueError: data of another size than the filter's, infinite values, more steps than the filter covers;
@@ -155,12 +155,12 @@ class AbstractFilter(Module):
         u: Float[Array, "steps inputs"],
         output: Callable[[PyTree, Innovation, jax.Array], PyTree],
     ) -> PyTree:
-        """Run over rows within a compiled computation: stack output(state, innovation, k) of each, unchecked.
+        """Run over rows inside a compiled computation, unchecked, and stack output(state, innovation, k) of all rows.
 
         Args:
             z: measurements, NaN for what did not arrive.
-            u: inputs, the one that led to each row.
-            output: arrays of the state after a row, its innovation and its number.
+            u: inputs, for each row the input that led to it.
+            output: returns arrays from the state after a row, the row's innovation and its number.
         """
         return scan_inside_jit(self, z, u, output)
 
@@ -169,7 +169,7 @@ class AbstractFilter(Module):
     ) -> tuple[PyTree, Estimate, Judgement, Innovation]:
         """Step like `step`, judge whether z and u are plausible, and return the innovation too.
 
-        A state with which something is implausible should be discarded.
+        If the judgement finds something implausible, the returned state should be discarded.
 
         Raises:
             ValueError: what `step` refuses.
@@ -180,7 +180,7 @@ class AbstractFilter(Module):
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
     ) -> tuple[PyTree, SmootherStep]:
-        """Step like `step`; in place of the estimate return what a backward pass over the data needs of the step.
+        """Step like `step`, and return the state and what a backward pass over the data needs of the step.
 
         Raises:
             ValueError: what `step` refuses; a filter that cannot be smoothed.
@@ -333,7 +333,7 @@ def step_with_judgement(
 def _step_with_smoother(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, SmootherStep]:
-    """Predict and correct, compiled; return the state, and what a backward pass needs of this step."""
+    """Predict and correct over one step; return the state, and what a backward pass needs of this step."""
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     return after, make_smoother_step(filter, StepTrace(state, prior, after, innovation, z, u, k))
@@ -358,10 +358,10 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
-    """Return the method, made to compute in double precision and to refuse what is no state of its filter.
+    """Return a filter's method that computes in double precision and refuses a state of another form.
 
     Args:
-        estimate: the method of a filter.
+        estimate: the method, a function of the filter and its state.
     """
     run = cast(Callable[..., R], in_float64(estimate))
 
@@ -377,7 +377,7 @@ def _compile_with_checks(
     check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]],
     call_checked: Callable[..., R],
 ) -> Callable[P, R]:
-    """Return a filter's method, compiled, that first checks its data and step number, and names a wrong state."""
+    """Return a filter's compiled method, which checks its data, its step number and the form of its state."""
     run = cast(Callable[..., R], compile_on_call(function))
 
     @wraps(function)
@@ -388,7 +388,7 @@ def _compile_with_checks(
 
 
 def check_step_number(filter: AbstractFilter, k: Step) -> Step:
-    """Return k as the number of a step that the filter covers."""
+    """Return k if it is the number of a step that the filter covers; raise ValueError if not."""
     if isinstance(k, jax.core.Tracer):
         return k  # inside a compiled computation it has no value to check
     is_scalar = isinstance(k, int | np.integer | np.ndarray | jax.Array) and not np.shape(k)

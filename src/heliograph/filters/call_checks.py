@@ -17,7 +17,7 @@ R = TypeVar("R")
 
 
 def call_with_state(filter: Any, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
-    """Call `function(filter, state, *data)`; where it fails with no state of the filter, say so.
+    """Call `function(filter, state, *data)`; if it fails since `state` is no state of the filter, say so.
 
     Raises:
         ValueError: a state of another form than the filter's.
@@ -34,11 +34,12 @@ def call_with_state(filter: Any, state: PyTree, function: Callable[..., R], *dat
 def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
     """Call `function(filter, state, *data)`, whose last data are u and k, and raise if the plant cannot take u.
 
-    Whether u spoils the plant's functions is computed in the same compiled call. Inside a trace nothing is judged:
-    whoever traces does that.
+    u is tested in the same compiled call. Inside a trace u has no value, and is not tested: the caller that traces must
+    test it.
 
     Raises:
-        ValueError: a state of another form than the filter's; a covariance of the noise, or a matrix, that is none.
+        ValueError: a state of another form than the filter's; an input u for which a noise covariance is no covariance
+            or a matrix is not finite.
     """
     if not filter.inputs or is_traced(filter, state, *data):
         return call_with_state(filter, state, function, *data)
@@ -51,10 +52,10 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
 
 @cache
 def _wrap_with_input_test(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
-    """Return the function that also says whether the inputs spoil a step.
+    """Return a compiled function that returns the function's result and whether the inputs spoil the step.
 
-    Inputs spoil a step if the plant's functions of them are no finite numbers, or no covariance. The result is kept by
-    function.
+    Inputs spoil a step if the plant's functions of them are not finite, or give no covariance. There is one compiled
+    function for each `function`, which the cache keeps.
     """
 
     @compile_on_call

@@ -93,14 +93,14 @@ def is_long(total: int) -> bool:
 def filter_in_chunks(
     filter: Any, z: Array, u: Array, output: Callable[..., PyTree], state: PyTree | None = None, begin: int = 0
 ) -> ScanResult | None:
-    """Filter rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
+    """Filter rows in chunks side by side; None if rows are few, or the filter is not linear or forgets too slowly.
 
     Args:
         filter: the filter.
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
         output: what is kept of a row, a function of the filter, its state, the innovation and the row's number.
-        state: before the first row; that before any unless given.
+        state: the filter's state before the first row; by default that before any data.
         begin: number of the first row.
     """
     # `start`: the filter's state before any data; None where the filter is not linear.
@@ -112,7 +112,7 @@ def filter_in_chunks(
 
 
 def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> PyTree | None:
-    """Filter rows as `filter_in_chunks` does; return sums over all rows of what is kept of each, or None."""
+    """Filter rows as `filter_in_chunks` does, and return the sums of outputs over all rows; None where that does."""
     start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
@@ -121,15 +121,15 @@ def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[...
 
 
 def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResult | None:
-    """Step a recursion over rows in chunks side by side; None where rows are few, or it forgets too late.
+    """Step a recursion over rows in chunks side by side; return the last state and the outputs of all rows, or None.
 
-    Return the last state and what is kept of each row. `start`: the state before the first row.
+    None stands for few rows, or a recursion that forgets too slowly. `start` is the state before the first row.
     """
     with jax.enable_x64(True):
         by_chunk = _scan_all_chunks(recursion, start, rows, OF_ROWS)
     if by_chunk is None:
         return None
-    # Chunks (chunks, rows, ...) one after the other, without the rows that fill up the last one.
+    # Outputs (chunks, rows, ...) are put in one row of chunks, without the rows that fill up the last chunk.
     total = len(jax.tree.leaves(rows)[0])
     joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], by_chunk.outputs)
     return ScanResult(by_chunk.last, joined)
@@ -228,9 +228,9 @@ class WarmUpRun(NamedTuple):
         return results
 
     def _filter_windows(self, states: PyTree, windows: PyTree, first: Int[np.ndarray, " n"]) -> PyTree | None:
-        """Return the states (n, ...) after windows of rows (n, ahead, ...), from those before them.
+        """Return the states (n, ...) after n windows of rows (n, ahead, ...), from the states before them.
 
-        `first`: number of each window's first row. None without native code.
+        `first` holds the number of each window's first row. Returns None without native code.
         """
         arguments = self.recursion, states, windows, first
         choice = choose_code(state_after_rows, arguments, differs_by_run=[False, True, True, True])
@@ -238,14 +238,14 @@ class WarmUpRun(NamedTuple):
 
 
 def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
-    """Return the state with which each chunk begins (chunks, ...); None if the filter forgets its start too late.
+    """Return the states with which chunks begin (chunks, ...), or None if the filter forgets its start too slowly.
 
-    Each is computed from any start some rows before, forgotten by then. Moments before any data may never be forgotten:
-    they are then computed of all rows. `first`: first rows of all chunks but the first.
+    Each is computed from any start `ahead` rows earlier, which is forgotten by then. Parts that depend on no data may
+    never be forgotten, and are computed over all rows. `first` holds the first rows of all chunks but the first.
     """
     starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
     forgets = _start_is_forgotten(warm_up, starts, first)
-    # Not forgotten, the state has a part that depends on no data, and no settled state was found: compute that part.
+    # The start may not be forgotten because of a part that depends on no data: compute that part over all rows.
     if forgets is False and jax.tree.leaves(beside_gaussians(start)) and warm_up.settled is None:
         starts = _replace_data_free_parts(warm_up.recursion, start, warm_up.rows, warm_up.ahead)
         forgets = starts is not None and _start_is_forgotten(warm_up, starts, first)
@@ -256,11 +256,11 @@ def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray,
 
 
 def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
-    """Return whether a wrong start is forgotten `ahead` rows later; None without native code.
+    """Return whether a wrong start is forgotten `ahead` rows later, or None without native code.
 
-    This is tried before at most PROBES chunks, and must hold for more than half of them. It is forgotten where the
-    state computed from a start `ahead` rows before agrees with that from a start 2 `ahead` rows before. `starts`: one
-    for every `ahead` rows; `first`: first rows of chunks.
+    A start is forgotten before a chunk if two states agree: one computed from a start `ahead` rows before the chunk,
+    the other from a start 2 `ahead` rows before. At most PROBES chunks are tried, and more than half must agree.
+    `starts` has a start for every `ahead` rows, and `first` the first rows of chunks.
     """
     probes = first[:: -(-len(first) // PROBES)]  # the stride is rounded up
     from_nearer = warm_up.states_before(probes, starts)
@@ -324,7 +324,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     def scan(states: PyTree, which: Which) -> PyTree:
         """Return the results of the chunks `which`, filtered in full by `programs.full` from the states `states`.
 
-        Closed over: `recursion` steps the filter; `total` rows of data; chunks of `length` rows begin at `begun.first`.
+        `recursion` steps the filter over `total` rows, and chunks of `length` rows begin at the rows `begun.first`.
         """
         calls = [
             (recursion, take(states, batch), windows, first, total)
@@ -333,7 +333,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
         return run_and_join(programs.full, calls, differs_by_run=[False, True, True, True, False])
 
     def scan_means(settled: SettledState) -> PyTree:
-        """Return the results of all chunks by covariances and gains of `settled`: only means differ. Else as `scan`."""
+        """Return the results of all chunks with the covariances and gains of `settled`; None without native code."""
         means = means_of(begun.states)
         calls = [
             (recursion, settled, take(means, batch), windows, first, total)
@@ -353,16 +353,16 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
 def scan_means_where_settled(
     begun: ChunkStarts, scan_in_full: Callable[[PyTree, Which], PyTree], scan_means: Callable[[SettledState], PyTree]
 ) -> PyTree:
-    """Scan all chunks: of settled ones the means alone, the others in full; None without native code.
+    """Scan all chunks, and compute only the means of the settled ones; return None without native code.
 
-    A chunk is settled if its covariances and gains stay as they are from its first row on, so that only means change.
+    A chunk is settled if its covariances and gains do not change from its first row on, so that only means change.
 
     Args:
-        begun: how the chunks begin.
-        scan_in_full: results of some chunks from the states with which these begin.
-        scan_means: results of all chunks, as if they were settled; None where these do not settle.
+        begun: how the chunks begin: `begun.states` (chunks, ...), and in `begun.covered` whether each chunk is settled.
+        scan_in_full: returns the results of some chunks from the states with which they begin.
+        scan_means: returns the results of all chunks as if all were settled; None without native code.
     """
-    # `covered`: which chunks are settled. The means of all are scanned, which does not pay where few are settled.
+    # The means of all chunks are scanned, which does not pay if less than half of the chunks are settled.
     settled = None if np.mean(begun.covered) < 0.5 else begun.settled
     if settled is None or (results := scan_means(settled)) is None:
         return scan_in_full(begun.states, slice(None))
@@ -374,13 +374,13 @@ def scan_means_where_settled(
 def rescan_wrong_starts(
     scan: Callable[[PyTree, slice], PyTree], begun: PyTree, ends_of: Callable[[PyTree], PyTree], results: PyTree
 ) -> None:
-    """Scan each chunk again, in order, that began otherwise than the one before it ends; change `results` in place.
+    """Scan each chunk again that began with another state than the chunk before it ends with; change `results`.
 
     Args:
-        scan: results of some chunks, from the states with which these begin.
+        scan: returns the results of some chunks from the states with which they begin.
         begun: states with which the chunks began, (chunks, ...).
-        ends_of: the states in which chunks end, of their results.
-        results: of all chunks, (chunks, ...).
+        ends_of: returns from results the states in which the chunks end.
+        results: results of all chunks, (chunks, ...).
     """
     ends = ends_of(results)
     wrong = ~find_equal_states(take(ends, slice(None, -1)), take(begun, slice(1, None)), among=begun)
@@ -389,7 +389,7 @@ def rescan_wrong_starts(
             continue
         chunk = slice(c, c + 1)
         replace_chunk(results, chunk, scan(take(ends, slice(c - 1, c)), chunk))
-        # The chunk ends otherwise now, so that the next one may have begun wrongly, or rightly after all.
+        # The chunk ends in another state now, so whether the next one began wrongly is decided anew.
         if c < len(wrong):
             wrong[c] = not find_equal_states(take(ends, chunk), take(begun, slice(c + 1, c + 2)), among=begun)[0]
 

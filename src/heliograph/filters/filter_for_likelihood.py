@@ -16,13 +16,16 @@ from heliograph.random_affine.memories_of_channels import memories
 
 
 def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: bool) -> AbstractFilter:
-    """Return the filter by whose innovations a likelihood is computed, chosen by what plant and channel are.
+    """Return the filter whose innovations give the likelihood.
+
+    It is `imm_filter` if plant or sensor has modes, and `kalman_filter` if the start is unknown. Else `linear` decides.
 
     Args:
-        plant: the plant; of several modes by `imm_filter`, of an unknown start by `kalman_filter`.
+        plant: the plant.
         sensor: its sensor.
         channel: from the sensor to the filter.
-        linear: by the state's unconditional moments, `linear_filter`; else by those given data, `cubature_filter`.
+        linear: True for `linear_filter`, which uses the state's moments before any data; False for `cubature_filter`,
+            which uses its moments given the data.
 
     Raises:
         ValueError: parts that do not fit; a channel beside an unknown start.

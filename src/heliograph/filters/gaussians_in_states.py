@@ -61,9 +61,9 @@ def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_largest_slopes(states: PyTree) -> Iterator[float]:
-    """Yield for each derivative of a Gaussian in the states (n, ...) its largest entry, in deviations of the Gaussian.
+    """Yield the largest entry of each derivative of a Gaussian in the states (n, ...), in the Gaussian's deviations.
 
-    What data change in a state are Gaussians, each followed by the derivatives of its mean and covariance.
+    The parts of a state that data change are Gaussians. Each is followed by the derivatives of its mean and covariance.
     """
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):
@@ -79,11 +79,8 @@ def _find_largest_slopes(states: PyTree) -> Iterator[float]:
 
 
 def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarray, "..."]:
-    """Return which entries differ by no more than is allowed, or are both NaN.
-
-    `within`: what is allowed, beside ROUNDING, 16 eps of the number itself.
-    """
-    with np.errstate(invalid="ignore"):  # of numbers that overflowed
+    """Return which entries of a and b are both NaN, or differ by at most `within` plus ROUNDING |b| (16 eps |b|)."""
+    with np.errstate(invalid="ignore"):  # infinite entries of both give NaN, which is not near
         near: np.ndarray = np.abs(a - b) <= within + ROUNDING * np.abs(b)
     near |= np.isnan(a) & np.isnan(b)
     return near
@@ -105,7 +102,7 @@ def means_of(state: PyTree) -> list[Any]:
 
 
 def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
-    """Return a state whose Gaussians, and their derivatives, have other means."""
+    """Return the state with the means of its Gaussians, and of their derivatives, replaced by `means` in order."""
     next_mean = iter(means)
 
     def replace_mean(part: PyTree) -> PyTree:
@@ -121,9 +118,9 @@ def beside_gaussians(state: PyTree) -> PyTree:
 
 
 def with_gaussians(beside: PyTree, state: PyTree) -> PyTree:
-    """Return `state` with its Gaussians and their derivatives as they are, and `beside` in place of all other parts.
+    """Return `state` with its Gaussians and their derivatives, and with all other parts replaced by those of `beside`.
 
-    `beside` is what `beside_gaussians` returns of a state.
+    `beside` is a result of `beside_gaussians`, which leaves out Gaussians.
     """
     other_parts = iter(_leaves_beside(beside))
     return jax.tree.map(lambda part: part if _is_moving(part) else next(other_parts), state, is_leaf=_is_moving)

@@ -17,7 +17,9 @@ from heliograph.numerics.types import Array, Float
 def gaussian_innovation(
     z: "Float[Array, ' m']", expected: "Float[Array, ' m']", covariance: "Float[Array, 'm m']"
 ) -> "Innovation":
-    """Return z - expected and its Gaussian log-likelihood; NaN where a component did not arrive.
+    """Return the innovation z - expected with its covariance and Gaussian log-likelihood.
+
+    Value and covariance are NaN where a component did not arrive, and the likelihood is that of the others.
 
     Args:
         z: measurement (m,), NaN for a component that did not arrive.
@@ -26,7 +28,7 @@ def gaussian_innovation(
     """
     present = ~jnp.isnan(z)
     value, both_present = jnp.asarray(z - expected), present[:, None] & present
-    size = jnp.abs(z) + jnp.abs(expected)  # of both terms of the difference, for its rounding
+    size = jnp.abs(z) + jnp.abs(expected)  # the difference is rounded relative to the size of both terms
     log_likelihood = log_density(value, jnp.asarray(covariance), size)
     return Innovation(value, jnp.where(both_present, covariance, jnp.nan), log_likelihood)
 
@@ -42,7 +44,7 @@ def mixed_innovation(
     total: "Float[Array, 'parts m m']",
     density: "Float[Array, '']",
 ) -> "Innovation":
-    """Return the mean and covariance of the innovation of a mixture: within its components, and between their means.
+    """Return the innovation of a mixture: its covariance is the mean covariance within plus that of the means.
 
     Args:
         weight: prior probability (parts,) of each component.
@@ -61,7 +63,7 @@ def innovation_of_mean_covariance(
 ) -> "Innovation":
     """Return the innovation of a mixture, by the mean covariance within its components.
 
-    The covariance is the mean within plus that of the means between.
+    The covariance is the mean covariance within the components plus the covariance of their means.
 
     Args:
         weight: prior probability (parts,) of each component.
@@ -69,7 +71,7 @@ def innovation_of_mean_covariance(
         within: mean over the components of their innovation covariances (m, m).
         density: log-likelihood of z under the mixture.
     """
-    # About the first one, so that equal values, however large, leave no rounding to be squared.
+    # Differences from the first value are taken, so that equal values, however large, leave no rounding.
     difference = value - value[0]
     mean_difference = weight @ difference
     mean, deviation = value[0] + mean_difference, difference - mean_difference
@@ -81,12 +83,12 @@ def innovation_of_mean_covariance(
 def posterior_weights(
     weight: "Float[Array, ' parts']", likelihood: "Float[Array, ' parts']"
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return posterior weights p_a N(z; ...) of a mixture, log-likelihood of z, and whether all components exclude z.
+    """Return posterior weights of a mixture's components, the log-likelihood of z, and whether all exclude z.
 
-    `weight`: prior probabilities p_a of the components; `likelihood`: log N(z; ...) of each, -inf where it excludes
-    z. Where all do, the weights stay as they are.
+    `weight` are the prior probabilities p_a. `likelihood` holds log N_a(z), which is -inf if component a excludes z.
+    The posterior weights are p_a N_a(z) over their sum. If all components exclude z, the weights stay as they are.
     """
-    # log p_a N(z; ...), and -inf of a component that is impossible, whatever it says.
+    # log p_a N_a(z), and -inf if p_a is 0, whatever the likelihood is.
     is_possible = jnp.asarray(weight) > 0
     log_prior = jnp.where(is_possible, jnp.log(jnp.where(is_possible, weight, 1.0)), -jnp.inf)
     log_posterior = jnp.where(is_possible, likelihood, 0.0) + log_prior
@@ -107,12 +109,13 @@ class Weighed(NamedTuple):
     weight: Array
 
     def summarise(self) -> "tuple[InnovationSummary, ...]":
-        """Return a summary over time for each output, one after the other: shares and medians with 95 % intervals.
+        """Return a summary over time for each output, with shares and medians and their 95 % intervals.
 
-        N values correlated over time count as N (1 - a) / (1 + a) independent ones, a the correlation of neighbours.
-        For the share of down-weighted values (Wilson's interval) a is that of being down-weighted, since outliers
-        come in runs; for the median (quantiles 1/2 -+ 1.96 / (2 sqrt N)) that of the innovations' ranks, which
-        outliers do not hide.
+        N values that are correlated over time count as N (1 - a) / (1 + a) independent ones, with a the correlation of
+        neighbours. The share of down-weighted values has Wilson's interval. There a is the correlation of being
+        down-weighted, since outliers come in runs. The median has the interval of the quantiles
+        1/2 -+ 1.96 / (2 sqrt N). There a is the correlation of the innovations' ranks, on which outliers have little
+        effect.
         """
         fields_by_output = [np.asarray(field).T for field in self]
         return tuple(_summarise_output(*of_output) for of_output in zip(*fields_by_output, strict=True))
@@ -161,15 +164,15 @@ class InnovationSummary(NamedTuple):
         if not self.received:
             return f"received 0 of {self.expected}"
         share = f"({100 * self.share.low:.2g} % to {100 * self.share.high:.2g} %)"
-        # Of the 95 % interval; numbers are rounded to as many digits as the standard error, half_width / 1.96, has.
+        # Numbers are rounded to as many digits as their standard error, half the 95 % interval over 1.96, has.
         half_width = (self.bias_high - self.bias_low) / 2
         shown_bias, shown_half_width = (round_to(number, half_width / NORMAL) for number in (self.bias, half_width))
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {shown_bias} +- {shown_half_width}"
 
     def describe_left_out(self, filter: str, output: str) -> list[str]:
-        """Return a line of warning where a filter left out most values of an output, which outliers are not.
+        """Return a line of warning if a filter left out most values of an output, else an empty list.
 
-        MOST: one half. The lower limit of the share's interval must be above it.
+        Outliers are never the most. The lower limit of the share's interval must be above MOST, one half.
         """
         if not self.share.low > MOST:
             return []
@@ -180,15 +183,14 @@ class InnovationSummary(NamedTuple):
 
     @staticmethod
     def find_outlying(summaries: "Sequence[InnovationSummary]") -> list[int]:
-        """Return the numbers of outputs of which more values are down-weighted than of the others together.
+        """Return the numbers of outputs with a larger share of down-weighted values than all others together.
 
-        Shares p with Wilson's 95 % intervals (l, u), of one output (1) and of the others together (2): p_1 - p_2 is
-        above 0 by more than sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
-
-        `independent`: how many independent values would have the same interval.
+        Let p_1 be the share of one output and p_2 that of the others together, with Wilson's 95 % intervals (l, u). The
+        output is named if p_1 - p_2 > sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike, some 3 of 100
+        are named. `summary.independent` is the number of independent values that would give the same interval.
 
         Args:
-            summaries: one of each output.
+            summaries: a summary of each output.
 
         Source: Newcombe, Interval estimation for the difference between independent proportions (1998), method 10.
         """

@@ -34,10 +34,10 @@ class FilterRecursion(Recursion):
     begin: Array = eqx.field(default_factory=lambda: np.asarray(0))
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, PyTree]:
-        """Predict and correct with the data of row k; return the state after it, and what is kept of it.
+        """Predict and correct with the data of row k; return the state after it, and its output.
 
-        `begin`: number of the recording's first row; `output`: what is kept, a function of filter, state, innovation
-        and row number.
+        `self.begin` is the number of the recording's first row. `self.output` computes a row's output from filter,
+        state, innovation and row number.
         """
         z, u = row
         number = self.begin + k
@@ -53,13 +53,13 @@ def initial_state_if_linear(filter: Any) -> PyTree | None:
 
 
 def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
-    """Scan rows from number `first` on; from row `count` on, behind the end of the data, the state stays.
+    """Step a recursion over rows; return the last state and the output of each row.
 
-    Return the last state and what is kept of each row.
+    `first` is the number of the first row. The data end before row `count`: from there on the state does not change.
     """
 
     def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
-        """Step over one row; from row `count` on, behind the end of the data, the state stays."""
+        """Step over one row (data, number); from row `count` on, after the end of the data, the state stays."""
         data, k = row
         after, output = recursion.step(state, data, k)
         return select_state(k < count, after, state), output
@@ -68,10 +68,10 @@ def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, 
 
 
 def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
-    """Scan rows as `scan_chunk` does, and return the sums over rows of what is kept of each."""
+    """Step over rows as `scan_chunk` does; return the last state and the sums of the outputs over rows."""
 
     def step(state: PyTree, data: PyTree, k: Array) -> tuple[PyTree, PyTree]:
-        """Step over row k; return the state after it and what is kept of it."""
+        """Step over row k; return the state after it and its output."""
         return recursion.step(state, data, k)
 
     return sum_rows(step, jax.tree.map(jnp.asarray, state), rows, first, count)
@@ -88,7 +88,7 @@ def sum_rows(
     def body(before: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
         """Step over one row and add its output to the sums; from row `count` on nothing changes.
 
-        `before`: the state and the sums of outputs; `step`: returns state and output of a row.
+        `before` holds the state and the sums of outputs. `step` returns the state after a row, and the row's output.
         """
         state, sums = before
         data, k = row
@@ -103,10 +103,10 @@ def sum_rows(
 
 
 def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
-    """Return the state after some rows, of which the first has the number `first`, and nothing of the rows."""
+    """Return only the state after some rows; `first` is the number of the first one."""
 
     def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
-        """Return the state after one row (data, number), and nothing that is kept of it."""
+        """Return the state after one row (data, number), and None as its output."""
         after, _ = recursion.step(state, *row)
         return after, None
 

@@ -115,10 +115,10 @@ class Judgement(NamedTuple):
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
         z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
     ) -> "Judgement":  # fmt: skip
-        """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
+        """Judge a correction alone, from states and estimates before and after it; `judge_step` says all arguments."""
         prior, after = states
         expected, corrected = estimates
-        # A correction has no prediction: the state before it counts as before and after one.
+        # `judge_step` needs states before and after a prediction: the state before the correction stands for both.
         three = expected, expected, corrected
         return judge_step(claim, (prior, prior, after), three, innovation, z, of_atoms, angles)
 
@@ -132,7 +132,7 @@ class Judgement(NamedTuple):
     def find_unreadable(innovation: Innovation, z: Float[Array, " m"], angles: Angles, eps: float) -> jax.Array:
         """Return which angles among z have so many turns that their rounding hides where they point.
 
-        eps |z_j| is more than READABLE deviations sqrt(S_jj), and more than half of a turn's digits.
+        It does if eps |z_j| is above READABLE sqrt(S_jj), S the innovation's covariance, and above sqrt(eps) turns.
 
         Args:
             innovation: of z.
@@ -149,11 +149,11 @@ class Judgement(NamedTuple):
     def find_culprit(
         candidates: "Sequence[Candidate]", size: "Callable[[Candidate], float]", excuses: "Callable[[Candidate], bool]"
     ) -> "Candidate":
-        """Return the first value, from the largest on, without which a row is plausible; the largest if there is none.
+        """Return the largest value without which a row is plausible, or the largest of all if there is none.
 
         Args:
             candidates: values of several nodes that one filter judged together, and found implausible.
-            size: of a value, by which they are ordered.
+            size: returns the size of a value, by which values are ordered.
             excuses: whether the row is plausible without a value.
         """
         largest_first = sorted(candidates, key=size, reverse=True)
@@ -170,8 +170,8 @@ class Judgement(NamedTuple):
     def describe(reason: float, squared_distance: float) -> str:
         """Describe in words why something is implausible, with the bound of the precision that the distance has.
 
-        `reason`: number of a `Reason`; `squared_distance`: in deviations; LIMIT: the bound in double precision, 1e6;
-        WORDS: texts of the other reasons.
+        `reason` is the number of a `Reason`, and WORDS has the texts of all but FAR. `squared_distance` is in squared
+        deviations. LIMIT is the bound of the distance in double precision, 1e6.
         """
         if Reason(int(reason)) != Reason.FAR:
             return WORDS[Reason(int(reason))]
@@ -182,12 +182,12 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def why_values(judgements: Float[np.ndarray, "filters 4"]) -> str | None:
-        """Return why a measurement is implausible, None unless some filter judges it so and none that can disagrees.
+        """Return why a measurement is implausible, or None if some filter finds it plausible or none implausible.
 
-        A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it
-        alone skips them. A filter that claims no covariance judges nothing but its state.
+        So a filter that has diverged, and judges all values implausible, does not exclude them for the others. A filter
+        that claims no covariance judges only its own state.
 
-        `judgements`: one row for each filter: squared distance (NaN: cannot judge), numbers arrived, reason (0:
+        `judgements` has a row for each filter: squared distance (NaN if it cannot judge), numbers arrived, reason (0 if
         plausible), judgement of inputs.
         """
         squared_distance, _, reason, _ = judgements.T
@@ -199,10 +199,10 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def why_inputs(judgements: Float[np.ndarray, "filters 4"]) -> str | None:
-        """Return why inputs are implausible, None unless some filter judges them so and none that can disagrees.
+        """Return why inputs are implausible, or None if some filter finds them plausible or none implausible.
 
-        `judgements`: one row for each filter: squared distance, numbers arrived, reason, judgement of inputs (1:
-        implausible, NaN: cannot judge). INPUT: the text for inputs that cost the mean its digits.
+        `judgements` has a row for each filter: squared distance, numbers arrived, reason, judgement of inputs (1 if
+        implausible, NaN if it cannot judge). INPUT is the text for inputs by which the mean loses its digits.
         """
         _, _, reason, of_inputs = judgements.T
         by_prediction = reason == Reason.PREDICTION
@@ -213,9 +213,9 @@ class Judgement(NamedTuple):
 
 
 def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
-    """Return e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did.
+    """Return e' S^-1 e of the components that arrived, and their number; it is infinite where S excludes e.
 
-    e: innovation, S: its covariance. What did not arrive gets variance 1 and innovation 0, and adds nothing.
+    e is the innovation and S its covariance. What did not arrive gets variance 1 and innovation 0, and adds nothing.
     """
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     present = ~jnp.isnan(value)
@@ -330,10 +330,10 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, 
 def _squared_distance_terms_in_turn(
     value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return e_j^2 / s_j of each component in use given those before it, and which of them the others determine.
+    """Return e_j^2 / s_j of each used component, given those before it, and which components those before determine.
 
-    e_j: innovation given the components before, s_j: its variance. `used`: which components count; `size`: of the
-    numbers subtracted, for rounding. A determined one has no variance but rounding.
+    e_j is the innovation given the components before j, and s_j its variance. A determined component has only rounding
+    as variance. `used` says which components count. `size` is that of the subtracted numbers, for their rounding.
     """
     covariance_of_used = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
     squares, determined = squared_distance_terms(
@@ -349,26 +349,26 @@ def _are_finite(estimates: Estimate, claim: Claim) -> jax.Array:
 
 
 def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
-    """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before.
+    """Return whether all is finite, and no variance is below zero by more than the rounding of the variance before.
 
-    NEGATIVE_TOLERANCE: how much below zero, as a share, is rounding. Without a claim ("none") there is no covariance to
-    judge.
+    The share NEGATIVE_TOLERANCE of the variance before counts as rounding. A filter with the claim "none" has no
+    covariance to judge.
     """
     if claim == "none":
         return _are_finite(estimates, claim)
     variances_after = jnp.diagonal(jnp.asarray(estimates.covariance))
     variances_before = jnp.diagonal(jnp.asarray(before.covariance))
-    # The rounding of a difference is as large as what it was taken from.
+    # A correction subtracts from the variance before, and its rounding has that size.
     size = jnp.where(jnp.isfinite(variances_before), jnp.abs(variances_before), 0.0)
     rounded = rounding(NEGATIVE_TOLERANCE, variances_after) * size
     return _are_finite(estimates, claim) & ~jnp.any(variances_after < -rounded)
 
 
 def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
-    """Return whether all is finite and no variance negative, to the rounding of the largest, which may enter it.
+    """Return whether all is finite, and no variance is below zero by more than the rounding of the largest variance.
 
-    NEGATIVE_TOLERANCE: how much below zero, as a share, is rounding. Without a claim ("none") there is no covariance to
-    judge.
+    The share NEGATIVE_TOLERANCE of the largest variance counts as rounding, since it may enter every other one. A
+    filter with the claim "none" has no covariance to judge.
     """
     if claim == "none":
         return _are_finite(prior, claim)
@@ -378,7 +378,7 @@ def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
-    """Return whether some real number of a state became infinite: it is after the step, and was not before."""
+    """Return whether some real number of a state is infinite after the step, but was not before it."""
     has_overflowed = jnp.asarray(False)
     for number_before, number_after in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         if _is_real_array(number_after):
@@ -392,7 +392,7 @@ def _is_real_array(leaf: Array) -> bool:
 
 
 def _mask_rounded_away(estimates: Estimate) -> jax.Array:
-    """Return the mask of the states whose deviation is positive but below the rounding of their mean."""
+    """Return the mask (n,) of the states with a deviation that is positive, but smaller than their mean's rounding."""
     mean = jnp.asarray(estimates.mean)
     variance = jnp.diagonal(jnp.asarray(estimates.covariance))
     unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)  # of rounding

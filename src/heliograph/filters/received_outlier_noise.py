@@ -218,9 +218,8 @@ def _check_weighable(covariance: Array, independent: bool) -> None:
 def _pair_branches(sensed: GaussianBranches, last_hop: GaussianBranches) -> tuple[Array, ...]:
     """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
 
-    Log probabilities, means and variances of the sensor's, means and variances of the last hop's.
-
-    A branch is one Gaussian of a mixture; its probability is the product of both.
+    A branch is one Gaussian of a mixture. The results are the log probabilities of the pairs (sums of both branches'
+    logs), the means and variances of the sensor's branches, and those of the last hop's.
     """
     xp = library(sensed, last_hop)
     shape = (len(sensed.mean), sensed.mean.shape[1], last_hop.mean.shape[1])
@@ -236,9 +235,9 @@ def _pair_branches(sensed: GaussianBranches, last_hop: GaussianBranches) -> tupl
 
 
 def _find_least_degrees(sensed: AbstractNoise, last_hop: AbstractNoise | None, source: np.ndarray) -> Vector:
-    """Return the least degrees of freedom of Student's noises in each received number (m,), infinite where none is.
+    """Return the least degrees of freedom of Student's noises in each received number (m,); infinity without any.
 
-    `last_hop`: noise of the last hop, None if there is none; `source`: output whose noise each number brings.
+    `last_hop` is the noise of the last hop, or None. `source` (m,) is the output whose noise each number carries.
     """
     laws = [_student_degrees(sensed, None)[source], *([] if last_hop is None else [_student_degrees(last_hop, None)])]
     xp = library(laws)
@@ -250,7 +249,7 @@ def _find_least_degrees(sensed: AbstractNoise, last_hop: AbstractNoise | None, s
 def _student_degrees(sensed: AbstractNoise, last_hop: AbstractNoise | None) -> Vector:
     """Return the degrees of freedom of each output's Student noise; NaN where the noise has another law.
 
-    `last_hop`: noise of the last hop, None if there is none; a sum of two is no Student noise.
+    `last_hop` is the noise of the last hop, or None. The sum of both noises would not have Student's law.
     """
     independent_noises = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [

@@ -21,9 +21,9 @@ class WindowBatch(NamedTuple):
 
 
 def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> Iterator[WindowBatch]:
-    """Yield windows as `take_windows` returns them: first those that are views, then the others.
+    """Yield windows as `take_windows` returns them, in two parts: views of the rows, and then copies.
 
-    `begin`: first rows of the windows; the first ones follow one another within the data, and need no copy.
+    `begin` holds the first rows of the windows. Windows at the start that follow one another need no copy.
     """
     total = len(jax.tree.leaves(rows)[0])
     begin_if_adjacent = np.arange(len(begin)) * length
@@ -34,9 +34,9 @@ def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: in
 
 
 def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:
-    """Return windows of rows (n, length, ...), the last row repeated behind the end of the data.
+    """Return windows of rows (n, length, ...); after the end of the data the last row is repeated.
 
-    They are views where they follow one another from the first row on and end within the data.
+    They are views, not copies, if they follow one another from the first row on and end within the data.
 
     Args:
         rows: arrays (rows, ...).
@@ -48,7 +48,7 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     are_first_blocks = are_blocks and np.array_equal(begin, np.arange(len(begin)) * length)
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
-        """Return the windows of one array of rows: views where these may be, else copies."""
+        """Return the windows of one array of rows, as views if possible, else as copies."""
         if are_first_blocks:
             return _split_into_blocks(leaf, length)[: len(begin)]
         return _split_into_blocks(leaf, length)[begin // length] if are_blocks else _copy_windows(leaf, begin, length)
@@ -63,9 +63,9 @@ def _split_into_blocks(leaf: np.ndarray, length: int) -> np.ndarray:
 
 
 def _copy_windows(leaf: np.ndarray, begin: Int[np.ndarray, " n"], length: int) -> np.ndarray:
-    """Return a copy of each window of an array of rows (n, length, ...), the last row repeated behind the data's end.
+    """Return a copy of each window of rows (n, length, ...); after the end of the data the last row is repeated.
 
-    `begin`: number of the first row of each window.
+    `begin` is the number of each window's first row.
     """
     windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
     for window, first_row in zip(windows, begin, strict=True):
@@ -78,10 +78,10 @@ def _copy_windows(leaf: np.ndarray, begin: Int[np.ndarray, " n"], length: int) -
 def run_and_join(
     function: Callable[..., PyTree], calls: Sequence[tuple[Any, ...]], differs_by_run: Sequence[bool]
 ) -> PyTree:
-    """Return the results of several calls, each of several runs, in the same arrays; None without native code.
+    """Return the results of several calls, each of several runs, joined in the same arrays; None without native code.
 
-    `calls`: arguments of each; they differ in the number of runs, and the same compiled code computes all.
-    `differs_by_run`: which arguments each run has its own of.
+    `calls` holds the arguments of each call. Calls differ in the number of runs, and one compiled code computes all.
+    `differs_by_run` says which arguments have an entry for each run.
     """
     choices = [choose_code(function, arguments, differs_by_run=differs_by_run) for arguments in calls]
     codes = [choice.code for choice in choices]

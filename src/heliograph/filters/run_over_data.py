@@ -113,7 +113,7 @@ def scan_inside_jit(
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
-    """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of each, stacked."""
+    """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of all rows."""
     _, outputs = scan_with_last_state(filter, z, u, output)
     return outputs
 
@@ -144,7 +144,7 @@ def scan_with_last_state(
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Predict and correct over one row (number, measurement, input); return the state after it, and its output.
 
-        In a derivative the step is computed again, and only what carries a name in KEPT is held in memory.
+        For a derivative the step is computed again, and only values with a name in KEPT are kept in memory.
         """
         k, z_k, u_k = row
         prior = filter.predict(state, u_k, k)
@@ -226,9 +226,9 @@ def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, d
 
 
 def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) -> None:
-    """Warn where means (rows, n) are no finite numbers, from which row on; `begin` rows were before.
+    """Warn if means (rows, n) are not finite, and say from which row on; `begin` rows were before these.
 
-    hg.run judges each value; this call does not.
+    `hg.run` judges each value and leaves out what is implausible, but `filter.run` does not.
     """
     is_invalid = find_not_finite(mean, axes=1)
     if is_invalid.any():
@@ -238,7 +238,7 @@ def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) 
 
 
 def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Origin:
-    """Return where an earlier result of this filter ended; raise ValueError unless it is one, with its last state."""
+    """Return where an earlier result of this filter ended; raise ValueError if it is another filter's."""
     expected = "what `run` of this filter returned for the rows before"
     origin = instance("after", after, Filtered, expected).origin
     if origin is None:
@@ -255,9 +255,9 @@ def _check_dates_increase(before: Origin, dates: np.ndarray) -> None:
 
 
 def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:
-    """Warn of rows that no particle explains, and of effective numbers below FEW (steps,); `begin` rows were before.
+    """Warn of rows that no particle explains, and of rows with an effective number of particles below FEW, 10.
 
-    FEW: the least effective number of particles, 10. A row that none explains has log-likelihood -inf.
+    A row that no particle explains has the log-likelihood -inf. `begin` rows were before these rows.
     """
     unused_rows = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
     rows_of_few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
@@ -274,9 +274,9 @@ def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) ->
 def _compute_filtered(
     filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
 ) -> PyTree:
-    """Filter all rows and return the results stacked: compiled body of `run_over_data`.
+    """Filter all rows and return the results of all, in a program that `run_over_data` compiles.
 
-    `begin`: number of the first row; `state`: before it.
+    `begin` is the number of the first row, and `state` the state before it (None: that before any data).
     """
     return scan_with_last_state(filter, z, u, partial(_collect_row_results, filter), state, begin)
 
@@ -295,13 +295,13 @@ def check_data(
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
     """Return measurements and inputs of a filter as arrays of rows; without inputs the filter must take none.
 
-    Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
-    `begin` rows were before them.
+    If the rows of a table have dates, these must be in order, be the same in both tables, and have equal steps unless
+    there is an input dt. `begin` rows were before these rows.
     """
     read_row_dates(filter.inputs, _name_tables(measurements, inputs))
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
-    # Without inputs a filter of none has rows of length 0; of any other filter `check_rows` refuses None.
+    # A filter without inputs gets rows of length 0. For any other filter `check_rows` refuses None.
     rows_of_inputs = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
     u = check_rows("inputs", rows_of_inputs, len(z), len(filter.inputs), missing=False, names=filter.inputs)
     check_inputs(filter.inputs, u, filter)

@@ -43,9 +43,10 @@ class SettledState(NamedTuple):
         return with_means(repeat_state(self.state, len(means[0])), means)
 
     def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
-        """Return what is kept of rows (chunks, rows, ...), from the leaves that vary with data; the others are common.
+        """Return the outputs of rows (chunks, rows, ...) from their leaves that vary with data.
 
-        `self.varies`: of each leaf, whether it depends on data; `self.outputs`: what a settled row keeps.
+        `self.varies` says of each leaf whether it depends on data. All others are those of `self.outputs`, the output
+        of a settled row, and are repeated for each row.
         """
         chunks, rows = varying[0].shape[:2]
         leaves, structure = jax.tree.flatten(self.outputs)
@@ -58,9 +59,10 @@ class SettledState(NamedTuple):
         return self._replace(outputs=jax.tree.unflatten(structure, filled)).fill_row(varying)
 
     def fill_row(self, varying: list[Any]) -> PyTree:
-        """Return what is kept of a row, from those of its leaves that vary with data; the others are common to all.
+        """Return the output of a row from its leaves that vary with data.
 
-        `self.varies`: of each leaf, whether it depends on data; `self.outputs`: what a settled row keeps.
+        `self.varies` says of each leaf whether it depends on data. All others are those of `self.outputs`, the output
+        of a settled row.
         """
         next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
         joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
@@ -71,11 +73,11 @@ class SettledState(NamedTuple):
         return [leaf for leaf, v in zip(jax.tree.leaves(output), self.varies, strict=True) if v]
 
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
-        """Test which states (n, ...) are this one but for the means."""
+        """Return which of the states (n, ...) equal this one in all but the means."""
         means = means_of(states)
-        no_means = [()] * len(means)  # in place of the means: leaves of nothing
+        no_means = [()] * len(means)  # an empty tuple has no leaves, so that means are not compared
         other_leaves, own_leaves = (jax.tree.leaves(with_means(x, no_means)) for x in (states, self.state))
-        # Most have the same numbers. The others may have others for the same covariance, which are compared by it.
+        # Most states have the same numbers. Other factors may have the same covariance, so these are compared by it.
         are_same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(other_leaves, own_leaves, strict=True)]
         covered: np.ndarray = np.all(are_same, axis=0)
         unsure = np.flatnonzero(~covered)
@@ -87,13 +89,14 @@ class SettledState(NamedTuple):
 
 
 def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> SettledState | None:
-    """Find the state that complete rows lead to; None where there is none, or no native code.
+    """Find the state to which complete rows lead; None if there is no such state or no native code.
 
-    TURNS (4) times `ahead` rows are passed, as two windows; settled is a state that the second leaves as it was.
+    TURNS (4) times `ahead` rows are passed, in two windows. The state is settled if the second window changes only
+    its means.
 
     Args:
-        recursion: filters over rows.
-        start: their state before any row.
+        recursion: steps the filter over rows.
+        start: the filter's state before any row.
         rows: measurements and inputs (rows, ...).
         ahead: length of a window of rows.
     """
@@ -107,12 +110,12 @@ def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead:
 
 
 def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree) -> SettledState | None:
-    """Return the state after two windows of rows if it is, but for means, the one after the first; None if not.
+    """Return the settled state after the second window of rows, or None if the second window changed more than means.
 
     Args:
         varies: which leaves of `outputs` depend on data.
-        after_windows: states of one run after the first and the second of two windows of rows (1, 2, ...).
-        outputs: what is kept of the last row of either (1, 2, ...).
+        after_windows: states after each window, with the axes (run, window, ...) of length 1 and 2.
+        outputs: outputs of the last row of each window (1, 2, ...).
     """
     after_first = jax.tree.map(lambda leaf: leaf[:, 0], after_windows)
     after_second = jax.tree.map(lambda leaf: leaf[:, 1], after_windows)
@@ -121,7 +124,7 @@ def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, output
     first_without_mean, second_without_mean = (with_means(state, zero_means) for state in (after_first, after_second))
     if not find_equal_states(second_without_mean, first_without_mean, ROUNDING)[0]:
         return None
-    # Of the axes (run, window) one run, and the second window.
+    # The state of the only run, and its outputs in the second window.
     state = jax.tree.map(lambda leaf: leaf[0, ...], after_second)
     last_outputs = jax.tree.map(lambda leaf: leaf[0, 1, ...], outputs)
     return SettledState(state, last_outputs, varies)
@@ -150,10 +153,10 @@ def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, n
 
 
 def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
-    """Return which leaves of what is kept of a complete row depend on data.
+    """Return for each leaf of a complete row's output whether it depends on data.
 
-    None if more than the means of the state depends on data, or without native code. `choice.code.common`: of each
-    result, whether runs with different data share it.
+    Returns None if more of the state than its means depends on data, or without native code. `choice.code.common` says
+    of each result whether runs with different data share it.
     """
     rows = jax.tree.map(lambda leaf: leaf[None], row)
     means = [np.asarray(mean)[None] for mean in means_of(start)]
@@ -162,6 +165,7 @@ def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree)
     if choice.code is None:
         return None
     after, outputs = jax.tree.unflatten(choice.code.tree, choice.code.common)
+    # The means may depend on data: True stands for them.
     all_but_means = with_means(after, [True] * len(means_of(after)))
     if not all(jax.tree.leaves(all_but_means)):
         return None
@@ -171,9 +175,9 @@ def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree)
 def step_settled(
     recursion: Recursion, state: PyTree, means: Sequence[Array], row: PyTree, k: Array
 ) -> tuple[PyTree, PyTree]:
-    """Step over a complete row from a state with other means; return the state and what is kept of the row.
+    """Step over a complete row from `state` with the given means; return the state after it and the row's output.
 
-    `present` marks numbers as surely there, so that nothing depends on whether they are.
+    `present` marks all numbers as arrived, so that no result depends on whether they are NaN.
     """
     z, u = row
     return recursion.step(with_means(state, means), (jax.tree.map(present, z), u), k)
@@ -190,9 +194,9 @@ def scan_settled_rows(
     """
 
     def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Step over one row; return the next means, and of what is kept the leaves that depend on data.
+        """Step over one row (data, number); return the next means, and the leaves of the output that depend on data.
 
-        `settled`: the state whose covariances stay; `count`: number of the row at which the data end.
+        The state is `settled.state` with these means. From row `count` on, after the end of the data, means stay.
         """
         data, k = row
         after, outputs = step_settled(recursion, settled.state, means, data, k)
@@ -204,13 +208,13 @@ def scan_settled_rows(
 def sum_settled_rows(
     recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array, count: Array
 ) -> tuple[list[jax.Array], PyTree]:
-    """Scan complete rows as `scan_settled_rows` does; return the last means, and sums of all that is kept of a row.
+    """Scan complete rows as `scan_settled_rows` does; return the last means, and the sums of outputs over rows.
 
-    Settled: covariances and gains stay as they are. From row `count` on, behind the end of the data, nothing changes.
+    Covariances and gains are those of `settled`. From row `count` on, after the end of the data, nothing changes.
     """
 
     def step(means: list[jax.Array], data: PyTree, k: Array) -> tuple[list[jax.Array], PyTree]:
-        """Step over the complete row k from the settled state with these means; return the next means, and output."""
+        """Step over complete row k from the settled state with these means; return the next means and the output."""
         after, outputs = step_settled(recursion, settled.state, means, data, k)
         return means_of(after), outputs
 
@@ -220,13 +224,13 @@ def sum_settled_rows(
 def means_after_settled_rows(
     recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array
 ) -> list[jax.Array]:
-    """Return the means after some complete rows, of which the first has the number `first`, and nothing of the rows.
+    """Return only the means after some complete rows; `first` is the number of the first row.
 
-    Settled: covariances and gains stay as they are, and only means change.
+    Covariances and gains are those of `settled`, and do not change.
     """
 
     def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], None]:
-        """Step over one complete row from the settled state with these means; return the next means."""
+        """Step over one complete row (data, number) from the settled state with these means; return the next means."""
         data, k = row
         after, _ = step_settled(recursion, settled.state, means, data, k)
         return means_of(after), None
@@ -249,14 +253,14 @@ class CompleteBlocks(NamedTuple):
 
 
 def find_complete_blocks(z: PyTree, size: int) -> CompleteBlocks:
-    """Return which blocks of `size` rows of measurements (rows, ...) lack no number.
+    """Return which blocks of `size` rows of measurements (rows, ...) are complete, without a missing number.
 
-    They are held as the size, and how many of the first 0, 1, 2, ... blocks are complete.
+    The result holds the size, and how many of the first 0, 1, 2, ... blocks are complete.
     """
     total = len(jax.tree.leaves(z)[0])
     begin = np.arange(0, total, size)
     is_complete = np.ones(len(begin), bool)
-    with np.errstate(over="ignore", invalid="ignore"):  # a sum of huge numbers is taken for one that lacks some
+    with np.errstate(over="ignore", invalid="ignore"):  # a block of huge numbers counts as incomplete
         for leaf in jax.tree.leaves(z):
             if leaf.size:
                 # A sum over a block is finite only if all of its numbers are.

@@ -115,18 +115,18 @@ class SmootherStep(Module):
     def mean_back(self, later: jax.Array) -> jax.Array:
         """Return the mean of the state before the step from that of the state after it, as `back` does.
 
-        `before.ahead`, `before.left.mean`: means after and before the step, about which the manifold takes attitudes as
-        small turns.
+        `before.ahead` and `before.left.mean` are the means after and before the step. The manifold takes attitudes as
+        small turns about them.
         """
         before = self.before
         mean = before.mean_given(self.manifold.unsettle(before.ahead, later))
         return jnp.asarray(self.manifold.settle(before.left.mean, mean))
 
     def start(self) -> EarlierState:
-        """Return the state after this step as an earlier state that is yet to be carried ahead.
+        """Return the state after this step as an earlier state, to be carried on to later steps.
 
-        An earlier state is mean + link L^-1 (x - E x) + noise: here it is x itself, link and L are I and there is no
-        noise.
+        An earlier state is mean + link L^-1 (x - E x) + noise, with x the present state. Here it is x itself: link and
+        L are I, and there is no noise.
         """
         n = len(self.after.mean)
         return EarlierState(
@@ -231,11 +231,10 @@ def smoother_step_of(
 
 
 def make_smoother_step(filter: Any, trace: StepTrace) -> SmootherStep:
-    """Return a filter's smoother step with the NIS of its innovation, under no stronger claim than the filter's own.
+    """Return a filter's smoother step, with the NIS of its innovation and with no stronger claim than the filter's.
 
-    A filter around another may hand on the smoother step of the filter within, and that filter's claim with it.
-
-    NIS: squared innovation over its covariance; `count`: how many numbers arrived.
+    A filter may return the smoother step of a filter inside it, with that filter's claim. The NIS is the squared
+    innovation over its covariance, and `count` the number of components that arrived.
     """
     step: SmootherStep = filter.smoother_step(trace)
     nis, count = innovation_distance(trace.innovation)

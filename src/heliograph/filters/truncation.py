@@ -41,10 +41,10 @@ def truncate_gaussians(
 
 
 def hold_mean_within_limits(x: Gaussian, limits: PlacedLimits) -> Gaussian:
-    """Move the mean to the most likely point within the limits, one after the other; the covariance stays.
+    """Move the mean to the most likely point within each limit, one limit after another; the covariance stays.
 
-    The point of x_i = c that is most likely is m + P e_i (c - m_i) / P_ii. A component without variance stays. A
-    limit: the component's index i, low and high end.
+    A limit has the component's index i, its low and its high end. The most likely point with x_i = c is
+    m + P e_i (c - m_i) / P_ii. If P_ii is 0, the mean does not change.
 
     Source: Simon, Kalman filtering with state constraints (2010), Section 2.4, with P^-1 as weight.
     """
@@ -62,16 +62,15 @@ def hold_mean_within_limits(x: Gaussian, limits: PlacedLimits) -> Gaussian:
 def truncate_to_limits(x: Gaussian, limits: PlacedLimits) -> tuple[jax.Array, Gaussian]:
     """Condition Gaussians (K, n) on limits of their components; return log P(within) (K,) and the conditional moments.
 
-    Exact moments for one limited component; of several one after the other, each of the Gaussian of the moments after
-    those before it: nominal where limited components are correlated.
-
-    A limit: the component's index, low and high end, either of which may be infinite.
+    A limit has the component's index, its low and its high end, one of which may be infinite. For one limited component
+    the moments are exact. Several are imposed one after another, each on the Gaussian after those before it. The result
+    is approximate if limited components are correlated.
 
     Source: Simon and Simon, Constrained Kalman filtering via density function truncation (2010).
     """
     log_probability = jnp.zeros(len(x.mean))
     for i, low, high in limits:
-        # A limit from above alone is one from below of -x, as `truncate_gaussians` needs it.
+        # `truncate_gaussians` needs a low end: x <= high is -x >= -high.
         sign = 1.0 if np.isfinite(low) else -1.0
         mean, slopes = sign * x.mean[:, i], sign * x.root[:, i]
         ends = sorted(sign * end for end in (low, high) if np.isfinite(end))

@@ -43,7 +43,7 @@ class HInfinityCertificate(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Guarantee, and the growth constants that it rests on, in one line."""
+        """One line that says whether the level is certified, and why not, or which growth constants are assumed."""
         if not self.certified:
             return f"level {self.level:g} is not certified: {'; '.join(self.reasons)}"
         all_proved = "growth constants proved in their boxes, or zero"
@@ -128,7 +128,8 @@ def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFind
 def _list_objections(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """Return reasons against a certificate: refuted constants, and findings about constants above the system's.
 
-    `growth`: constants a of |f(x)| <= a |x| and of differences; `findings`: what checks of these constants found.
+    `growth` holds the constants a of |f(x)| <= a |x| and of |f(x) - f(y)| <= a |x - y|. `findings` are the results of
+    checks of such constants.
     """
     reasons, constants = [], _list_positive(growth.state) + _list_positive(growth.error)
     for finding in findings:
@@ -154,10 +155,9 @@ def _list_positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
 def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """List a function's constants that no finding proves.
 
-    A bound of the slopes in a box bounds differences in it, and with f(0) = 0 and 0 in the box the function itself.
-
-    `growth.state`, `growth.error`: the constants of f itself and of its differences; `around_zero`: 0 is in the
-    finding's box.
+    A finding bounds the slopes in a box, and so the differences of the function in it. If 0 is in the box
+    (`finding.around_zero`) and f(0) = 0, it bounds the function itself too. `growth.state` and `growth.error` hold the
+    constants of f itself and of its differences.
     """
     around_zero = [finding for finding in findings if finding.around_zero]
     of_function, of_differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
@@ -178,7 +178,7 @@ def _list_wrong_signs(
 ) -> list[str]:
     """Return in words which weights P_k are not positive definite, and which steps have a negative multiplier.
 
-    ROUNDING: 1e-12, up to which an eigenvalue has no sign.
+    An eigenvalue up to ROUNDING, 1e-12, counts as zero.
     """
     smallest = np.array([smallest_eigenvalue(p) for p in weights])
     indefinite = np.flatnonzero(~(smallest > ROUNDING))
@@ -225,8 +225,8 @@ def make_theorem_matrix(
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
         """Return rows over eta, q long, that multiply its parts by these blocks, given by the letter of the part.
 
-        eta: vector of all that a step depends on; `at`: first place of each part in it, by letter. The other parts
-        have zeros.
+        eta is the vector of all that a step depends on. `at` gives the first place of each part by its letter. Parts
+        without a block get zeros.
         """
         matrix = np.zeros((height, q))
         for name, block in blocks.items():
@@ -292,9 +292,9 @@ def _drop_absent_functions(
 ) -> Float[np.ndarray, "kept kept"]:
     """Return Phi without the rows and columns of f and f~, or of h and h~, where the function is zero throughout.
 
-    Phi is the quadratic form of a step in eta = (x, e, f, f~, h, h~, v, rho): f is the plant's nonlinear part, f~ its
-    difference between x and its estimate, h and h~ (`y` long) the sensor's. `at`: the first row of each part of eta,
-    by letter.
+    Phi is the quadratic form of a step in eta = (x, e, f, f~, h, h~, v, rho). f is the plant's nonlinear part, and f~
+    its difference between the state and the estimate. h and h~ are those of the sensor, with `y` numbers each. `at`
+    gives the first row of each part of eta by its letter.
     """
     kept_rows = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
@@ -306,7 +306,7 @@ def _drop_absent_functions(
 def _complete_multipliers(multipliers: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
     """Return the multipliers of f, f~, h, h~ from 2 or 4 for each step.
 
-    2: one for (f, f~) and one for (h, h~), each of which counts for both.
+    Where there are 2, the first counts for f and f~, and the second for h and h~.
     """
     if multipliers.shape[1] not in (2, 4):
         raise fail("multipliers", "2 or 4 for each step", multipliers.shape[1])
@@ -327,9 +327,9 @@ def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
 
 
 def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
-    """Return the largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative.
+    """Return the largest eigenvalue of Phi after scaling its diagonal to -1; infinity if the diagonal is not negative.
 
-    Its sign is that of Phi's own, and it does not depend on units.
+    It has the same sign as the largest eigenvalue of Phi itself, and does not depend on units.
     """
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):

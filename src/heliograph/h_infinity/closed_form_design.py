@@ -18,15 +18,15 @@ def known_channel_design(
 ) -> HInfinityDesign:
     """Design gains at a given level for a channel whose gains are certain: a Riccati recursion.
 
-    With Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and the weighted input S = diag(Q, lambda_f~, lambda_h~,
-    level^2)^-1 of (e, f~, h~, v, rho), e+ = E eta - K U eta has K* = E S U' (U S U')^-1 and
-    P2+^-1 = E S E' - K* U S E', the smallest over all gains.
+    The error e+ = E eta - K U eta depends on eta = (e, f~, h~, v, rho) and the gain K. Let
+    Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and S = diag(Q, lambda_f~, lambda_h~, level^2)^-1. The best gain is
+    K* = E S U' (U S U')^-1. It makes P2+^-1 = E S E' - K* U S E' the smallest over all gains.
 
     Args:
         system: the system, from `growth_system`, whose channel has no random gain.
         level: gamma, a positive ratio of norms.
-        multipliers: those of f~ and h~ (steps, 2), positive where the function is not zero; zeros by default, which a
-            system that is all linear needs: then this is the H-infinity filter of textbooks.
+        multipliers: those of f~ and h~ (steps, 2), positive where the function is not zero. By default they are zeros,
+            as a linear system needs them; the design is then the H-infinity filter of textbooks.
 
     Raises:
         ValueError: a channel with random gains, multipliers of the wrong shape, a level not in (0, 1e100].
@@ -124,10 +124,9 @@ def _compute_best_gain(
 def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
     """Return the next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
 
-    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do, and
-    d = SPARE leaves a part of it for the multipliers.
-
-    a, b: growth constants of f and h, |f(x)| <= a |x|; `state`: the present weight; f = 0 has any multiplier.
+    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2, so any weight that is small enough will do.
+    d = SPARE leaves a part of it for the multipliers. a and b are growth constants of f and h: |f(x)| <= a |x|.
+    `state` is the present weight. Where a = 0, f is zero and its multiplier does not matter.
     """
     norm_of_a = np.linalg.norm(system.transition[k], 2)
     a, b = system.growth.state[k], system.output_growth.state[k]

@@ -192,10 +192,10 @@ def horizon_design(
 def _find_first_failing(
     steps: Sequence[StepMatrices], solved: Sequence[Unknowns], weights: Sequence[np.ndarray], square: float
 ) -> int | None:
-    """Return the number of the first step whose inequality a solution does not satisfy; None where all hold.
+    """Return the number of the first step whose inequality a solution does not satisfy; None if all hold.
 
-    `solved`: each step's unknowns; `weights`: P before each step, in scaled coordinates; `square`: the level squared,
-    of which SCREEN is the share that must be left. `fixed`: the part of the inequality without unknowns.
+    `solved` holds each step's unknowns, `weights` the weight P before each step, in scaled coordinates. `square` is the
+    level squared. An inequality must hold by the share SCREEN of it. `fixed` is its part without unknowns.
     """
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
@@ -256,8 +256,8 @@ class _RecursiveDesigner:
     def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         """Return the problem of step k, the one compiled before where its matrices and sizes are the same.
 
-        A weight P of (x, e), `start`, that couples x and e makes a problem of its own. `sizes`: scales of x and e
-        before the next step.
+        `start` is the weight P of (x, e) before the step. If it couples x and e, the step gets a problem of its own.
+        `sizes` are the scales of x and e before the next step.
         """
         step, sizes = self.steps[k], self.coordinates.relative_scales(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
@@ -285,8 +285,8 @@ def _inequality_holds(
 ) -> bool:
     """Decide whether one step is feasible: P1, P2 > 0, and Phi with Z = K'P2 K itself strictly negative.
 
-    P1, P2 (`state`, `error`): next weights; K: gain; Phi: the matrix of the step's inequality in eta; `fixed`: its
-    part without unknowns, S - diag(P, 0).
+    P1 and P2 are the next weights (`state` and `error` of the unknowns), and K is the gain. Phi is the matrix of the
+    step's inequality in eta, and `fixed` is its part without unknowns, S - diag(P, 0).
     """
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)
@@ -307,9 +307,9 @@ def _weigh_state_and_error(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
 
 
 def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
-    """Return a design that is not feasible, whose arrays are NaN, with the solver's status.
+    """Return a design that is not feasible: all its arrays are NaN, and it has the solver's status.
 
-    `separate`: one multiplier for each of four functions, else one for each two.
+    With `separate` each of the four functions f, f~, h, h~ has a multiplier. Else (f, f~) share one, and (h, h~) too.
     """
     n, steps = system.states, system.steps
     return HInfinityDesign(

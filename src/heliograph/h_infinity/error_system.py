@@ -175,7 +175,7 @@ def _compute_link_moments(steps: int, channel: Channel) -> tuple[DisturbedGain, 
 def _check_growth(steps: int, name: str, value: Constants) -> Growth:
     """Return the growth constants at every step from a number, or from a pair (of the function, of its differences).
 
-    A constant a says |f(x)| <= a |x|, or |f(x) - f(y)| <= a |x - y|; one number stands for both.
+    The first constant a means |f(x)| <= a |x|, and the second |f(x) - f(y)| <= a |x - y|. One number stands for both.
     """
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
@@ -190,12 +190,12 @@ def _check_growth(steps: int, name: str, value: Constants) -> Growth:
 def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     """Return the initial weight (2n, 2n) from a number or a positive definite matrix.
 
-    It is the weight of (x, e), the first state and error of n components each; a number stands for that times I.
+    It is the weight of (x, e), the first state and error of n components each. A number a stands for the matrix a I.
     """
     name, size = "initial weight", 2 * n
     is_number = rank(name, value) == 0
     matrix: np.ndarray = scalar(name, value) * np.eye(size) if is_number else array(name, value, (size, size))
-    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
+    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # eigenvalues of the largest doubles would overflow
     symmetric = symmetric_weight("initial weight", matrix / unit)
     if smallest_eigenvalue(symmetric) <= 0:
         smallest = smallest_eigenvalue(symmetric) * unit
@@ -204,9 +204,10 @@ def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
-    """Return a matrix made exactly symmetric; ValueError unless it is nearly so, with entries of at most LARGEST.
+    """Return the matrix made exactly symmetric; raise ValueError if it is not nearly so, or has too large entries.
 
-    SYMMETRY_TOLERANCE: largest difference across the diagonal, in units of each component; LARGEST: 1e100.
+    Entries across the diagonal may differ by SYMMETRY_TOLERANCE in units of each component. None may be above LARGEST,
+    1e100.
     """
     largest = float(np.max(np.abs(matrix), initial=0.0))
     if largest > LARGEST:

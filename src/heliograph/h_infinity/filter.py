@@ -65,13 +65,13 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PendingCorrection, z: ArrayLike, k: Step = 0) -> tuple[PendingCorrection, Innovation]:
-        """Compute the correction of the next estimate from z; the current one stays.
+        """Compute the correction of the next estimate from z; the current estimate does not change.
 
-        The correction is the gain of step k times z - mean gain h(x); a number that did not arrive adds nothing.
+        The correction is the gain of step k times (z - mean gain h(x)). A number that did not arrive adds nothing.
         """
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
-        # Without a covariance there is no likelihood; that of a step in which nothing arrives is 0 in logarithm.
+        # The filter has no covariance, so the likelihood is unknown (NaN). If nothing arrives, its logarithm is 0.
         log_likelihood = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
         no_covariance = jnp.full((len(value), len(value)), jnp.nan)
         return PendingCorrection(state.mean, correction), Innovation(value, no_covariance, log_likelihood)
@@ -131,7 +131,7 @@ def h_infinity_filter(
 def _check_sizes(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, design: HInfinityDesign) -> None:
     """Raise ValueError unless plant, sensor, system and design fit each other, without attitudes and angles.
 
-    WITHOUT_ATTITUDE: the words that say what is expected, a plant without attitudes.
+    WITHOUT_ATTITUDE are the words of the error message for a plant with attitudes.
     """
     plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
     if plant_0.attitude:

@@ -133,9 +133,9 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
 
 
 def _check_decided(interval: Interval, continuous: bool) -> Interval:
-    """Return the interval of a decision, refused where it is open and the function has to be continuous.
+    """Return the interval of a decision; raise NoIntervalError if it is open and the function must be continuous.
 
-    Equal ends are a decision that is the same in the whole region; False and True are an open one.
+    A decision with equal ends is the same in the whole region. One with the ends False and True is open.
     """
     if continuous and not np.array_equal(interval.low, interval.high):
         raise NoIntervalError("a decision that depends on where in the region x is")
@@ -143,11 +143,10 @@ def _check_decided(interval: Interval, continuous: bool) -> Interval:
 
 
 def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
-    """Return the intervals of numbers that an operation only moves: of low ends, and of high ends.
+    """Return the intervals after an operation that only moves numbers, by applying it to low ends and to high ends.
 
-    Whole numbers among its arguments are places, which have to be certain.
-
-    `equation`: the operation of a traced program, such as a reshape or a look-up.
+    `equation` is the operation of a traced program, such as a reshape or a look-up. Whole numbers among its arguments
+    are indices, and must be certain.
     """
     if any(interval.low.dtype.kind in "iu" and not np.array_equal(interval.low, interval.high) for interval in x):
         raise NoIntervalError("a place that depends on x")
@@ -180,9 +179,8 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
 def _select_case(x: list[Interval]) -> Interval:
     """Return the interval of cases[which], x = [which, *cases].
 
-    Where `case_number` is open, from the lowest of the possible cases to the highest.
-
-    `case_number`: interval of a whole number; open where its ends differ.
+    `which` is the interval of a whole number, the case number. If its ends differ, several cases are possible, and the
+    interval goes from the lowest end of all these cases to the highest.
     """
     case_number, cases = x[0], x[1:]
     lows = np.broadcast_arrays(*[case.low for case in cases])
@@ -200,15 +198,15 @@ def _select_case(x: list[Interval]) -> Interval:
 def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
     """Return the least and the largest product of ends, not rounded outward."""
     ends = [x * y for x in a for y in b]
-    # 0 times an infinite end is 0 for every finite number near it; the other ends say the rest.
+    # An infinite end stands for finite numbers, and 0 times each of them is 0.
     ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
     return np.minimum.reduce(ends), np.maximum.reduce(ends)
 
 
 def _bound_quotient(a: Interval, b: Interval) -> Interval:
-    """Return an interval of x / y; all numbers where y may be 0."""
+    """Return an interval that holds x / y for x in a and y in b: all numbers, if y may be 0."""
     holds_zero = (b.low <= 0) & (b.high >= 0)
-    # A divisor of 1 where 0 is possible: what is computed there is not used.
+    # Where y may be 0 the divisor is set to 1, and the quotient is not used.
     divisor = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
     ends = [x / y for x in a for y in divisor]
     low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
@@ -216,7 +214,10 @@ def _bound_quotient(a: Interval, b: Interval) -> Interval:
 
 
 def _bound_square(a: Interval) -> Interval:
-    """Return the interval of x^2, from 0 where x may be 0; as x * x it would begin at low * high."""
+    """Return the interval of x^2, which begins at 0 if x may be 0.
+
+    The product rule for x * x would take both factors for different numbers, and begin at low * high.
+    """
     squares_of_ends = a.low**2, a.high**2
     low, high = np.minimum(*squares_of_ends), np.maximum(*squares_of_ends)
     holds_zero = (a.low <= 0) & (a.high >= 0)
@@ -227,7 +228,7 @@ def _bound_square(a: Interval) -> Interval:
 def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
     """Return an interval of x^k for a whole number k.
 
-    ULPS: units in the last place by which a power may be off. Even powers depend on |x| alone.
+    Even powers depend on |x| alone. A power may be off by ULPS units in the last place.
     """
     if exponent < 0:
         unit_interval = point_interval(np.ones_like(a.low))
@@ -245,7 +246,7 @@ def _bound_absolute(a: Interval) -> Interval:
 def _make_monotone_bound(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Return the interval version of a function that never falls, whose values stay between `low` and `high`."""
+    """Return the interval version of a nondecreasing function, whose values lie between `low` and `high`."""
 
     def call(a: Interval) -> Interval:
         """Return the interval of the function's values on an interval of its argument."""
@@ -294,8 +295,8 @@ def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Int
     def lay_out(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:
         """Return x with axes (batch, `before` ones, free, `after` ones, contracted), so that both factors broadcast.
 
-        Batch axes are common to both factors, free ones of one alone, contracted ones are summed over; ones: of length
-        1.
+        Both factors share the batch axes. Free axes belong to one factor alone. Contracted axes are summed over. The
+        `before` and `after` axes have length 1, and stand for the other factor's free axes.
         """
         free = [i for i in range(x.ndim) if i not in contracted and i not in batch]
         batch_sizes, free_sizes, contracted_sizes = ([x.shape[i] for i in axes] for axes in (batch, free, contracted))

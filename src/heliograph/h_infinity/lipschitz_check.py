@@ -90,7 +90,7 @@ class GrowthFinding(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Verdict and evidence in one line."""
+        """One line that says whether the constant is proved, assumed or false in the box, and why."""
         region = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
         if self.proved:
             return f"{self.name}: constant {self.constant:g} is proved {region} (no slope above {self.bound:.6g})"
@@ -185,13 +185,13 @@ class _LipschitzMeter:
     """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
 
     def __init__(self, function: Function, width: float):
-        """Compile the function and its Jacobian; `width`: of the region, against which points are near each other."""
+        """Compile the function and its Jacobian; `width` is that of the region, by which distances are judged."""
         self.width, self.function = width, function
         self.jacobian = _compile_by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
         self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def measure_slopes(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
-        """Return the norm of the Jacobian at each point; infinite where it is no number."""
+        """Return the norm of the Jacobian at each point, and infinity where the Jacobian is not finite."""
         values = np.asarray(self.jacobian(points))
         is_finite = np.isfinite(values).all(axis=(-2, -1))
         finite_values = np.where(is_finite[:, None, None], values, 0.0)
@@ -202,7 +202,7 @@ class _LipschitzMeter:
         return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
     def measure_ratios(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
-        """Return the ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
+        """Return the ratio |f(x) - f(y)| / |x - y| of each pair, 0 if x and y are so close that it is rounding."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
         are_apart = distance > NEARBY * self.width / 2  # NEARBY: 1e-4
@@ -244,7 +244,7 @@ def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarr
     compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:
-        """Compute as many points at a time as the program takes, with copies of the last one to fill up."""
+        """Compute the points in parts of `size`; copies of the last point fill up the last part."""
         size = CLIMBERS * TRIALS
         padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
         values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]

@@ -29,12 +29,11 @@ class ScaledCoordinates(NamedTuple):
     nothing_grows: bool
 
     def relative_scales(self, k: int) -> tuple[float, float]:
-        """Return the scales of x and e before step k, over the larger of both.
+        """Return the scales of x and e before step k, each divided by the larger of both.
 
-        (1, 1) where nothing grows: S1 and S2 are matrices then, else multiples of the identity, since growth compares
-        norms of x and e.
-
-        S1, S2: scales of x and e; growth: bounds such as |f(x)| <= a |x|.
+        `self.states` (times, 2n, 2n) holds diag(S1, S2). Where f or h is not zero, its growth bound |f(x)| <= a |x|
+        compares norms, so that S1 and S2 are multiples of I by these scales. Where nothing grows, S1 and S2 are full
+        matrices and (1, 1) is returned.
         """
         if self.nothing_grows:
             return 1.0, 1.0
@@ -117,10 +116,8 @@ def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.nd
 def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> Float[np.ndarray, "w w"]:
     """Return scales diag(S1, S2) of x and e from their covariances.
 
-    Factors of the covariances where nothing grows; else a number for each, since growth is a ratio of norms.
-
-    x: state, e: error. "Growth" are bounds such as |f(x)| <= a |x|, which keep their meaning under multiples of I
-    alone.
+    x is the state and e the error. Where nothing grows, S1 and S2 are factors of the covariances. Else they are
+    multiples of I, since a growth bound such as |f(x)| <= a |x| keeps its meaning under these alone.
     """
     if nothing_grows:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
@@ -129,9 +126,10 @@ def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> F
 
 
 def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the lower factor of a covariance with a little variance added, for a state that is never disturbed.
+    """Return the lower factor of a covariance to which a little variance is added.
 
-    SMALLEST: 1e-6 of each deviation. Units are powers of four, by which scaling has no rounding.
+    A state that is never disturbed has no variance of its own. So SMALLEST, 1e-6, of each unit is added. Units are
+    powers of four, since scaling by them does not round.
     """
     unit = _powers_of_four_near(np.sqrt(np.diagonal(covariance)))
     scaled = covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit))
@@ -189,21 +187,20 @@ def _propagate_covariances(
 
 
 def _keep_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the last step's gain K0 where it loses little against the best K, else K.
+    """Return the last step's gain K0 if it is nearly as good as the best gain K, else K.
 
-    It adds (K - K0) R (K - K0)' to the covariance `after` the correction, R the received covariance.
-
-    CONVERGED: 0.1, the share of each variance that it may add. A gain that stays makes steps alike, compiled once.
+    Steps with the same gain are compiled once. K0 adds (K - K0) R (K - K0)' to the covariance `after` the correction,
+    with R the covariance of what is received. It may add the share CONVERGED, 0.1, of each variance.
     """
     added = (last - best) @ received @ (last - best).T
     return last if np.all(np.diagonal(added) <= CONVERGED * np.diagonal(after)) else best
 
 
 def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
-    """Return the scales T of eta = T times what is of order one, from those of (x, e) before the step.
+    """Return the scales T of eta, so that T^-1 eta is of order one, from the scales `sizes` of (x, e) before the step.
 
-    eta = (x, e, f, f~, h, h~, disturbances); f is as large as its growth constant times x, f~ as that times e;
-    disturbances are of order one.
+    eta = (x, e, f, f~, h, h~, disturbances). f is as large as its growth constant times x, and f~ as large as its
+    constant times e. Disturbances are of order one.
     """
     n, y = system.states, system.output.shape[1]
     blocks = [sizes]

@@ -34,7 +34,7 @@ SCS_ITERATIONS = 100_000
 
 
 def import_cvxpy() -> ModuleType:
-    """Return the module cvxpy, imported; ModuleNotFoundError that says how to get it."""
+    """Import cvxpy and return the module; raise ModuleNotFoundError that says how to install it."""
     try:
         import cvxpy
     except ModuleNotFoundError as error:
@@ -127,10 +127,9 @@ class StepProblem:
     ) -> "list[Constraint]":
         """Return the constraints Phi < 0 of each part of eta that is coupled, multipliers >= 0, and positive matrices.
 
-        Matrices that must be positive definite are linear in the unknowns, such as [[Z, Y'], [Y, P2]].
-
-        Phi: matrix of the step's inequality in eta, q square; Y = P2 K, Z >= K'P2 K; MARGIN: by how much a matrix must
-        be definite; `forms`: the linear maps from unknowns to matrices.
+        Phi (q, q) is the matrix of the step's inequality in eta. `forms` are the linear maps from the unknowns to Phi
+        and to the matrices that must be positive definite, such as [[Z, Y'], [Y, P2]] with Y = P2 K and Z >= K'P2 K.
+        A matrix must be definite by MARGIN.
         """
         q, layout = len(step.energy), self.layout
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
@@ -297,9 +296,10 @@ class HorizonProblem:
     def _require_semidefinite(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
         """Require sum_i blocks_i (unknowns in place i) + constant, a matrix row by row, to be positive semidefinite.
 
-        `places`: where each group of unknowns lies in their vector.
+        `blocks` maps the number of a group of unknowns to its matrix. `self.places` says where each group lies in the
+        vector of all unknowns.
         """
-        # One sparse matrix of all unknowns.
+        # One sparse matrix maps the vector of all unknowns to the sum.
         values, rows, columns = [], [], []
         for index, block in blocks.items():
             block_rows, block_columns = np.nonzero(block)

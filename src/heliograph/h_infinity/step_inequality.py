@@ -52,13 +52,13 @@ class Unknowns(NamedTuple):
 
 
 def list_step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
-    """Return the matrices of every step; a function that is zero throughout, as a linear h, is left out of eta.
+    """Return the matrices of every step.
 
-    `separate`: one multiplier for each of f, f~, h, h~ in place of one for (f, f~) and one for (h, h~).
-
-    eta: vector of all that a step depends on; U_j: matrices of the random part of what is received.
+    They act on eta, the vector of all that a step depends on. A function that is zero at all steps, such as the h of a
+    linear sensor, is left out of eta. With `separate`, each of f, f~, h, h~ has a multiplier; else (f, f~) share one,
+    and (h, h~) too. U_j are the matrices of the random part of what is received.
     """
-    # The U_j of every step, as many at each: zeros where there are fewer.
+    # All steps need the same number of matrices U_j: a step with fewer gets matrices of zeros.
     spreads = [link.spreads() for link in system.channel]
     count = max(len(of_step) for of_step in spreads)
     padded = []
@@ -73,9 +73,8 @@ def complete_multipliers(
 ) -> Float[np.ndarray, "*steps count"]:
     """Return all multipliers, zeros for functions that were left out: (steps, 4) for f, f~, h, h~, or (steps, 2).
 
-    separate: whether there is one for each of the four, or one for (f, f~) and one for (h, h~).
-
-    f~, h~: differences of f and h at the state and its estimate; a function is absent if it is zero throughout.
+    f~ and h~ are the differences of f and h between the state and its estimate. A function is absent if it is zero at
+    all steps. With `separate` each of the four has a multiplier; else (f, f~) share one, and (h, h~) too.
     """
     multipliers_by_function = 2 if separate else 1
     is_present = [
@@ -146,8 +145,8 @@ class _PartsOfEta(NamedTuple):
 def _locate_parts_of_eta(system: GrowthSystem, k: int) -> _PartsOfEta:
     """Return the place of each part of eta at step k.
 
-    They are x, e, f, f~, h, h~, the plant's disturbance and the channel's; a function that is zero throughout has no
-    place.
+    The parts are x, e, f, f~, h, h~, the plant's disturbance and the channel's. A function that is zero at all steps
+    has a place of length 0.
     """
     n, y = system.states, system.output.shape[1]
     size_of_f = 0 if system.growth.absent else n
@@ -183,7 +182,8 @@ def _list_growth_forms(
 def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
     """Return sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta.
 
-    It is not negative where each |value_i| <= a_i |argument_i|; `parts`: places of value and argument in eta, and a_i.
+    The form is not negative if every |value_i| <= a_i |argument_i|. Each of `parts` holds the places of value_i and
+    argument_i in eta, and a_i.
     """
     diagonal = np.zeros(q)
     for value, argument, constant in parts:
@@ -195,7 +195,9 @@ def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[
 def compute_next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
     """Return the quadratic form E[next weight of (x+, e+)] + sum_i lambda_i N_i of eta, linear in the unknowns.
 
-    N_i: growth forms with multipliers lambda_i; X, E, U: x+, e+ and received by eta; P1, P2: next weights; Y = P2 K.
+    X, E and U are the maps from eta to x+, e+ and what is received. P1 and P2 are the next weights, Y = P2 K and
+    Z >= K'P2 K. N_i are the growth forms, with multipliers lambda_i. The form is, over the random matrices U_j,
+    X'P1 X + E'P2 E - E'Y U - U'Y'E + U'Z U + sum_j U_j'(K0 + K)'P2 (K0 + K) U_j + sum_i lambda_i N_i.
     """
     X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
@@ -223,7 +225,7 @@ class UnknownsLayout(NamedTuple):
     def size(self) -> int:
         """Length of the vector of all unknowns.
 
-        Triangles of two weights (n, n), the gain's unknowns unless it is given, and multipliers.
+        It holds the triangles of two weights (n, n), the multipliers, and Y and Z for the gain unless that is given.
         """
         n, m = self.states, self.received
         unknowns_of_gain = n * m + m * (m + 1) // 2 if self.gain is None else 0
@@ -232,9 +234,8 @@ class UnknownsLayout(NamedTuple):
     def unpack(self, vector: Float[np.ndarray, "size"]) -> Unknowns:
         """Return the unknowns: triangles of P1 and P2, then Y and a triangle of Z, then the multipliers.
 
-        With a given gain Y = P2 K and Z = K'P2 K follow, and are not in the vector.
-
-        P1, P2: next weights of state and error, K: gain.
+        P1 and P2 are the next weights of state and error, and K is the gain. If the gain is given, Y = P2 K and
+        Z = K'P2 K are computed from it, and are not in the vector.
         """
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
@@ -251,9 +252,9 @@ class UnknownsLayout(NamedTuple):
 
 
 def _mirror_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
-    """Return the symmetric matrix (n, n) of the entries of its lower triangle.
+    """Return the symmetric matrix (n, n) that has these entries in its lower triangle.
 
-    `entries`: row after row, as `_triangle_places` lists them.
+    The entries are listed row after row, as `_triangle_places` lists them.
     """
     matrix = np.zeros((n, n))
     rows, columns = _triangle_places(n)
@@ -281,8 +282,8 @@ class LinearForms(NamedTuple):
 def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
     """Return the linear forms of a step, whose columns are their values at the unit vectors of the unknowns.
 
-    Forms: Phi's part with unknowns, matrices that must be positive, and the next weight, row by row. `layout.gain`: a
-    gain that is given, None where it is unknown.
+    There are forms for Phi's part with unknowns, for the matrices that must be positive, and for the next weight. Each
+    gives its matrix row by row. `layout.gain` is the given gain, or None if the gain is unknown.
     """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     forward = np.array([compute_next_energy(step, unit).ravel() for unit in units]).T
@@ -309,11 +310,10 @@ def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
 def find_independent_parts(
     step: StepMatrices, forms: LinearForms, start: Float[np.ndarray, "w w"] | None = None
 ) -> list[Int[np.ndarray, "_"]]:
-    """Return the index sets of eta that Phi never couples: a smaller inequality for each says the same.
+    """Return sets of indices of eta between which all entries of Phi are zero, whatever the unknowns are.
 
-    `start`: the weight before the step, where it is not diag(P1, P2).
-
-    Phi: matrix of the step's inequality in eta, q long, which begins with x and e of n components each.
+    So Phi < 0 splits into a smaller inequality for each set. Phi (q, q) is the matrix of the step's inequality in eta,
+    which begins with x and e of n components each. `start` is the weight before the step if it is not diag(P1, P2).
     """
     q = len(step.energy)
     are_coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)

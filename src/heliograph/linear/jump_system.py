@@ -26,7 +26,7 @@ Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a fi
 def mix_moments_of_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
     """Return Y_j = sum_i T_ij X_i, for each next mode j, of moments X_i by mode i and the chain's probabilities T_ij.
 
-    Moments that are not kept by mode have one X, for which a row of T is enough: each next mode's share of it.
+    Moments that are not kept by mode have a single X. Then only the first row of T is used: each next mode's share.
     """
     *axes, modes, n, _ = moments.shape
     sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
@@ -93,9 +93,9 @@ class JumpSystem(NamedTuple):
     def steady(self) -> Any:
         """Return the steady moments X (time, M, n, n) by mode after each of the steps, which repeat for ever.
 
-        The spectral radius of their operator has to be below 1; else there are none.
+        The spectral radius of their operator has to be below 1; else there are no steady moments.
         """
-        # X after a period is a linear map of X before it, and what comes from no X: both are equal where it is steady.
+        # X after a period is L(X) + C, with X the moments before it. Steady moments solve X = L(X) + C.
         without_noise = self._replace(added=0.0 * self.added)
         from_zero = self._propagate_one_period(np.zeros(self.shape))
         start = solve_fixed_point(without_noise._propagate_one_period, from_zero)
@@ -152,7 +152,7 @@ def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Flo
 def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     """Solve X = L(X) + C for a linear map L of symmetric matrices (..., n, n), and a constant C of their shape.
 
-    As linear equations for the entries of the upper triangles, which are all that a symmetric matrix has.
+    The entries of the upper triangles, which determine a symmetric matrix, are the unknowns of linear equations.
     """
     matrix = make_matrix_on_triangle_entries(linear, constant.shape)
     _, triangle_indices, _ = _place_in_upper_triangles(constant.shape)
@@ -169,10 +169,10 @@ def unpack_triangle_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) 
 def _place_in_upper_triangles(
     shape: tuple[int, ...],
 ) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
-    """Return how symmetric matrices of a shape (..., n, n) are made of the entries of their upper triangles.
+    """Return how symmetric matrices of a shape (..., n, n) are built from the list of their upper triangles' entries.
 
-    Three results: for each entry of the matrix its place in the list of these entries; their indices in the matrix; and
-    for each a unit matrix, with this entry and its mirror image at 1 and all else at 0.
+    The results are: for each number of the matrix its place in the list, the indices of the list's entries in the
+    matrix, and for each entry of the list a unit matrix, 1 at the entry and at its mirror image and 0 elsewhere.
     """
     *leading, rows, columns = triangle_indices = np.nonzero(np.triu(np.ones(shape)))
     mirrored_indices = *leading, columns, rows

@@ -44,13 +44,13 @@ class KnownLossSystem(NamedTuple):
     noises: tuple[Float[np.ndarray, "_ _"], ...]
 
     def close_loop(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
-        """Return the recursion of V: V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, true of any gains.
+        """Return the recursion V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, which holds for any gains.
 
-        V_j is the error covariance times the flag of mode j, on average, U its mixture by the chain. `gains` has one K
-        for each kind of mode; Q and R are scaled by `noise`.
+        V_j is the mean of the error covariance times the flag of mode j, and U is V mixed by the chain. `gains` has one
+        K for each kind of mode. Q and R are scaled by `noise`. If each step draws its mode anew, one V is enough.
 
         Raises:
-            ValueError: more than SIZE_LIMIT entries in all V_j; one V serves where each step draws its mode anew.
+            ValueError: more than SIZE_LIMIT entries in all V_j.
         """
         n, modes = len(self.transition), len(self.chain)
         size = n * n * (1 if np.all(self.chain == self.chain[0]) else modes)
@@ -69,9 +69,9 @@ class KnownLossSystem(NamedTuple):
 def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
     """Return the spectral radius of the step from error covariances V to V+ under any gains, wherever they come from.
 
-    Below 1, the mean error covariance E P stays bounded under these gains, hence under the best. That is checked: a map
-    that keeps covariances has a radius below 1 exactly where there is a witness, a V > 0 with V - V+ > 0 without noise.
-    Where the one that is tried, the steady V of unit noises, fails by multiplication, infinity is returned.
+    If it is below 1, the mean error covariance E P stays bounded under these gains, and so under the best ones. This is
+    checked by a witness, a V > 0 with V - V+ > 0 without noise: it exists exactly where the radius is below 1. The
+    steady V of unit noises is tried. If it is not a witness, infinity is returned.
 
     Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
     """
@@ -88,16 +88,16 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
 
 
 def find_gains(system: KnownLossSystem) -> KindGains:
-    """Return a gain for each kind of mode s, that keep the mean error covariance E P bounded and small.
+    """Return a gain for each kind of mode s, so that the mean error covariance E P stays bounded and small.
 
-    K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. The covariance recursion of the
-    best filter, with mean covariances in place of its own, runs until its gains converge or are found to keep E P
-    bounded; policy iteration, which then converges faster, improves them. Where neither keeps E P bounded, the gains
-    A C+ are tried, with which an output that shows all of x leaves no old error.
+    K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. First the best filter's
+    covariance recursion, with mean covariances, runs until its gains converge or keep E P bounded. Then policy
+    iteration, which converges faster, improves the gains. If E P is still not bounded, the gains A C+ are tried too,
+    with which an output that shows all of x leaves no old error.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
-    # A mode that the chain leaves for good sooner or later needs a gain, too: it counts with a small share.
+    # A mode that the chain leaves for good has probability 0 in the end, but needs a gain too: it gets a small share.
     system = system._replace(law=np.where(system.law > WEIGHT, system.law, SEEN))
     gains = _iterate_covariances(system)
     gains = _iterate_policy(system, gains)
@@ -175,9 +175,9 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
 
 
 def _relative_change(before: KindGains, after: KindGains) -> float:
-    """Return the largest change of an entry of the gains of all kinds, relative to the largest entry of those `after`.
+    """Return the largest change of an entry of any gain, divided by the largest entry of the gains `after`.
 
-    0 if these are all zero.
+    It is 0 if all gains `after` are zero.
     """
     largest_entry = max((np.max(np.abs(gain), initial=0.0) for gain in after), default=0.0)
     changes = [new - old for old, new in zip(before, after, strict=True)]
@@ -205,7 +205,7 @@ class UnobservedGrowth(NamedTuple):
 def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
     """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d).
 
-    SAME, relative to the matrix's norm, is the distance up to which eigenvalues are one, and singular values zero.
+    Eigenvalues that differ by at most SAME times the matrix's norm count as equal. Singular values up to it are zero.
     """
     results: list[tuple[complex, np.ndarray]] = []
     tolerance = SAME * max(float(np.linalg.norm(matrix, 2)), 1e-300)
@@ -223,8 +223,9 @@ def find_fastest_unobserved_mode(
 ) -> UnobservedGrowth:
     """Find the largest growth of E P a step, over eigenvalues a and sets of modes that do not observe them.
 
-    It is |a|^2 times the spectral radius of the chain within the set, which says how long the links stay there:
+    The growth is |a|^2 times the spectral radius of the chain within the set, by which the links stay in the set:
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
+    If every mode observes every eigenvector, the growth is 0.
     """
     results = [
         UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
@@ -244,7 +245,7 @@ def _find_unobserving_modes(
         space: a basis of all eigenvectors of one eigenvalue (n, d).
         outputs: the matrix C of each mode.
     """
-    # Subspaces by the largest set of modes that misses them: the whole space, and its cuts with what outputs miss.
+    # Maps the set of modes that miss a subspace to the subspace: the whole space, and its parts that outputs miss.
     subspaces = {frozenset(_list_modes_not_observing(space, outputs)): space}
     for output in outputs:
         for subspace in list(subspaces.values()):
@@ -262,7 +263,8 @@ def _list_modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) 
 def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
     """Return a basis of the part of a subspace that the rows of an output do not observe; `space` is a basis (n, d).
 
-    Rows are divided by their lengths, since units must not matter: a part below UNSEEN of a row is not observed.
+    Rows are divided by their lengths, so that units do not matter. A direction is not observed if its singular value in
+    these rows is at most UNSEEN.
     """
     lengths = np.linalg.norm(output, axis=1)
     is_used = lengths > 0
@@ -275,10 +277,10 @@ def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray
 
 
 def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
-    """Return whether the noise excites every one of these directions within n steps, n the number of states.
+    """Return whether the noise excites each of the directions `vectors` (n, d) within n steps, n the number of states.
 
-    They are columns (n, d) in the controllable subspace, which W, A W, A^2 W, ... span, with A the `matrix` and W the
-    noise's.
+    It does if they lie in the controllable subspace, which is spanned by W, A W, A^2 W, ... with A the `matrix` and W
+    the covariance of the noise.
     """
     basis, columns = np.zeros((len(matrix), 0)), noise
     for _ in range(len(matrix)):

@@ -50,9 +50,9 @@ class CarriedRounding(NamedTuple):
     def after_step(self, system: LinearSystem, k: int, matrices: Steps, gains: Gains) -> "CarriedRounding":
         """Return F X F' + (I - G C) D (I - G C)' + G R G' of the rounding X before, with that of Cov(w) and Cov(v).
 
-        D and R are here the rounding of these (diagonal), G the gain, F = (I - G C) A. An error D in Cov(w) adds as
-        much to the error's covariance; that it changes the gain, too, adds nothing, since the gain minimises. The
-        largest share of a claimed variance so far is noted with its step k.
+        D and R are the roundings of Cov(w) and Cov(v), both diagonal. G is the gain, and F = (I - G C) A. The roundings
+        change the gain too, but that adds nothing to first order, since the gain minimises the covariance. The largest
+        share that X has had of a claimed variance is kept, with its step.
         """
         I_GC = np.eye(len(gains.gain)) - gains.gain @ matrices.output
         rounding = gains.transition @ self.covariance @ gains.transition.T
@@ -75,7 +75,7 @@ def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoo
 def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
     """Return a root W of a noise covariance plus that of rounding, W W' = Cov + rounding: their columns side by side.
 
-    `seconds` are the second moments of the numbers that the noise is added to: their sum is what is rounded.
+    `seconds` are the second moments (n,) of the numbers to which the noise is added. The sums are what is rounded.
     """
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
@@ -153,11 +153,12 @@ def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionSte
 
 
 def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
-    """Return whether a covariance and its rounding are steady, to STILL of each entry's own scale.
+    """Return whether a covariance and its rounding are steady, up to STILL of each entry's own scale.
 
-    `before` are the two as they were SPAN steps ago. An entry's scale is the product of its two deviations.
-    A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
-    and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
+    `before` holds both as they were SPAN steps ago. An entry's scale is the product of its two deviations.
+    A difference D obeys D+ = F D F' with the loop F = (I - G C) A. So SPAN steps shrink it by r = rho(F)^(2 SPAN), and
+    after a change d all later changes sum up to d r / (1 - r). If nothing has changed at all, the recursion is steady
+    for any rho.
     """
     changes = [np.abs(new - old) for new, old in zip(after, before, strict=True)]
     if not any(np.any(change) for change in changes):
@@ -174,10 +175,10 @@ def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) ->
 
 
 def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
-    """Return the claim (what a covariance is worth), lowered to "nominal" where rounding spoils it, with a warning.
+    """Return the claim of a covariance, or warn and lower it to "nominal" if rounding is too large.
 
-    `lost` is the largest share that rounding has of a claimed variance, which may be up to DIGITS_TOLERANCE; `step` is
-    where.
+    `lost` is the largest share that rounding has of a claimed variance, and `step` is the step where it occurs. A share
+    up to DIGITS_TOLERANCE is accepted.
     """
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
     if lost > DIGITS_TOLERANCE:

@@ -81,7 +81,7 @@ def modal_system(
 
 
 def _find_state_size(move: Channel, measure: Channel) -> int:
-    """Return n, the number of states, of a `move` from n to n numbers and a measurement of n numbers, both checked.
+    """Return the number of states n, and check that `move` maps n numbers to n and that `measure` takes n numbers.
 
     Raises:
         ValueError: maps of other sizes, or gains in `move` that drift (Gaussian ones, instead of chains of modes).

@@ -52,9 +52,9 @@ class SteadyMomentTest:
     """
 
     def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
-        """Hold the tolerance of a step's change under A = `matrix`; `varies`: whether A or a law changes over time."""
+        """Set the tolerance for moments under A = `matrix`; if A or a law `varies` over time, they are never steady."""
         rate = 1 - spectral_radius(matrix)
-        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate  # negative: moments never come to rest
+        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate  # negative: moments are never steady
         n, index_of_moment = len(matrix), position(len(matrix) + 1, order)
         self._powers = np.array(list_exponents(n + 1, order))[:, :n]  # exponents of x in each moment
         # Which moments are E[x_i^2]: their exponents are 2 of x_i, and order - 2 of the constant 1.
@@ -62,11 +62,11 @@ class SteadyMomentTest:
         self._last: Moments | None = None
 
     def is_steady(self, moments: Moments) -> bool:
-        """Return whether the moments are those of the call before, to rounding; False if the tolerance is negative."""
+        """Return whether the moments equal those of the previous call up to rounding; False at the first call."""
         before, self._last = self._last, moments
         if before is None or self._tolerance < 0:
             return False
-        # Of each moment the size that its variables' squares give it: prod_i (E x_i^2)^(power_i / 2).
+        # The size of a moment E[prod_i x_i^power_i] is prod_i (E x_i^2)^(power_i / 2).
         deviations = np.sqrt(np.abs(moments[self._squares]))
         scale = np.prod(deviations**self._powers, axis=1)
         return bool(np.all(np.abs(moments - before) <= self._tolerance * scale))
@@ -112,7 +112,7 @@ def lift_modes(
         if steady.is_steady(moments) and np.array_equal(law, last_law) and k > 1:
             break
         last_law = law
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+        with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses what overflows
             moments = np.asarray(push_moments(plant, 2 * degree, moments))
         check_finite_moments(moments, k, 2 * degree)
         next_second = products_of_monomials(moments, n + 1, degree)
@@ -144,7 +144,7 @@ def _compute_noise_and_next_law(
         moved: M B M', the second moments of Y that the plant's mean map makes of those before the step.
         second: B+, those after the step.
     """
-    # What the draw of the next mode adds, sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M'; then the plant's own noise.
+    # The random next mode adds sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M', and the plant its own noise B+ - M B M'.
     not_drawn = np.eye(len(law))[None] - chain[:, None, :]
     drawn = np.einsum("i,ij,ijl->jl", law, chain, not_drawn)
     next_law = law @ chain
@@ -166,7 +166,7 @@ def _average_noise(
 def _keep_if_unchanged(
     law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
 ) -> Float[np.ndarray, " modes"]:
-    """Return the law of the modes after a step; the one before where it differs by rounding only: then it is steady."""
+    """Return the law of the modes after a step, or the law before it if both are equal up to rounding."""
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -225,15 +225,15 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 def _lift_chain(
     routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
 ) -> LinearSystem:
-    """Return the system of monomials times the flag of each mode, of a channel with memory (`lift_modes`).
+    """Return the linear system of a channel with memory, whose state is the monomials times the flag of each mode.
 
-    `moments` are those of x_0 up to twice the degree, `sizes` the numbers of states and of outputs.
+    `moments` are those of x_0 up to twice the degree. `sizes` are the numbers of states and of outputs.
     """
     n, m = sizes
     distinct = {id(r.measurement): r.measurement for r in routes}  # steps share one object where nothing varies
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
     refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
-    # Y ends with the constant 1, of which x has no part.
+    # The state vector Y ends with the constant 1, on which x does not depend: its column is 0.
     projection = np.pad(make_linear_rows(n, degree), ((0, 0), (0, 1)))
     chains = [modes_by_id[id(r.measurement)] for r in routes]
     return lift_modes([r.plant for r in routes], chains, degree, moments, projection)
@@ -296,7 +296,7 @@ class LiftedMap:
     """
 
     def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):
-        """Lift the map z = G y + n; `varies`: whether it changes over time, so that `whole` is not kept."""
+        """Lift the map z = G y + n; `whole`, its matrix of twice the degree, is None if it `varies` or is too large."""
         self.route, self.degree = route, degree
         self.matrix = np.asarray(route.moments(degree).matrix)
         rows, columns = (count_monomials(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
@@ -312,7 +312,7 @@ class LiftedMap:
 
     def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
         """Return E[monomials of z] from E[monomials of y], both up to twice the degree."""
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+        with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses what overflows
             if self.whole is not None:
                 return np.asarray(self.whole @ np.asarray(moments))
             return np.asarray(push_moments(self.route, 2 * self.degree, moments))
@@ -346,7 +346,7 @@ def mean_and_spread(
 ) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
     """Return the mean and covariance of y, given the second moments of (y, 1).
 
-    The diagonal is raised by n + 2 times EPS of the second moments: subtracting must not make a variance negative.
+    The variances are raised by (n + 2) EPS of the second moments, so that rounding makes none of them negative.
     """
     second = np.asarray(second)
     mean = second[:-1, -1]
@@ -363,7 +363,7 @@ def split_homogeneous(
 
 def make_linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
     """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
-    # Of exponents of (variables, 1): variable i itself has the power 1, and the constant the rest of the degree.
+    # Monomials are products of `degree` factors of (variables, 1). Variable i itself is x_i times 1^(degree - 1).
     column_of_monomial = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(column_of_monomial) - 1))
     for i, row in enumerate(rows):
@@ -373,7 +373,7 @@ def make_linear_rows(variables: int, degree: int, expected: int | None = None) -
 
 
 def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
-    """Return E[monomials of (x_0, 1)] of this order, under the plant's law of x_0: Gaussian unless it has another."""
+    """Return E[monomials of (x_0, 1)] of this order under the plant's law of x_0, a Gaussian one unless it is given."""
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     # x_0 = (initial mean - the law's mean) + a draw of the law, as a homogeneous matrix.
     shift = np.eye(len(plant.states) + 1)

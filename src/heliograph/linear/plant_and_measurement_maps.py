@@ -46,7 +46,7 @@ def make_plant_and_measurement_maps(
 ) -> list[PlantAndMeasurementMaps]:
     """Return the plant's and the measurement's random map of each step; steps that do not vary share one object.
 
-    Of noises the moments up to `order` are tabulated, once for steps that share them.
+    The noises' moments are tabulated up to `order`. Steps with the same noise share a table.
     """
     plants = _tabulate_affine_maps(list_checked_steps(plant, horizon), order)
     sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
@@ -62,8 +62,9 @@ def _make_measurement_maps(
 ) -> list[AbstractRandomAffine]:
     """Return the random map from the state to what is received, z, at each step.
 
-    It is the sensor's map followed by the channel's; but where the outputs of a sum of links have independent noises,
-    the sensor is moved into each link (`move_sensor_into_links`), which makes one map of the state itself.
+    It is the sensor's map followed by the channel's. If the channel is a sum of links and the sensor's outputs have
+    independent noises at all steps, the sensor is moved into each link instead (`move_sensor_into_links`). That gives
+    one map of the state itself.
     """
     maps_by_link = list[AbstractRandomAffine]()
     for sensor, channel in zip(sensors, channels, strict=True):
@@ -80,8 +81,8 @@ def _make_measurement_maps(
 def _tabulate_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """Return the map x -> A x + noise of each plant or sensor, with the noise's moments tabulated up to `order`.
 
-    `check_model` has seen that all are linear, with A in `matrix`. A step whose model is the same object as the one
-    before shares its map, and one of an equal noise its table. GainAndNoise has the random gain 1 times A.
+    `check_model` has checked that all models are linear, with A in `matrix`. A step whose model is the same object as
+    at the step before shares its map. A step with an equal noise shares the table. The gain of each map is 1 times A.
     """
     maps: list[GainAndNoise] = []
     before, noise = None, TabulatedNoise(models[0].noise, order)
@@ -97,7 +98,7 @@ def _tabulate_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndN
 
 
 def list_checked_steps(model: T | OverTime, horizon: int) -> list[T]:
-    """Return a plant, sensor or channel at each of `horizon` steps, which one that varies over time must cover."""
+    """Return a plant, sensor or channel at each of `horizon` steps; raise ValueError if it covers fewer steps."""
     check_horizon(horizon)
     check_horizon(horizon, steps_covered(model))
     return list_models_by_step(model, horizon)

@@ -99,7 +99,7 @@ def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "
 def _make_filter_map(g: Gains) -> np.ndarray:
     """Return the homogeneous matrix of (x+, q, z+) -> (x+, F q + K z+ + c, z+), one step of the linear filter.
 
-    q (n,) is its estimate, z+ (m,) the measurement; `g` has F (transition), K (gain) and c (offset).
+    q (n,) is the filter's estimate, and z+ (m,) the measurement. `g` has F (transition), K (gain) and c (offset).
     """
     n, m = g.gain.shape
     of_q, of_z = slice(n, 2 * n), slice(2 * n, None)
@@ -113,16 +113,16 @@ class _MomentCache:
     """Moments of plant and link for the quadratic system, computed again only where the model changes."""
 
     def __init__(self) -> None:
-        """Begin before the first step: of no plant's noise and of no measurement are moments kept yet."""
+        """Start without kept moments: none of a plant's noise, and none of a measurement."""
         self.last_plant_noise: AbstractNoise | None = None
         self.joint_noise: AbstractNoise | None = None
         self.last_measurement: AbstractRandomAffine | None = None
         self.measurement_moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
-        """Return the map (x, q, z) -> (x+, q) of a plant's step, x and q being n numbers and z, which is dropped, m.
+        """Return the map (x, q, z) -> (x+, q) of a plant's step; x and q have n numbers each, and z has m.
 
-        The noise of (x+, q), none of it on q, is kept as long as the plant's is the same object.
+        z is dropped. The noise acts on x+ alone. Its table is kept as long as the plant's noise is the same object.
         """
         n = plant.inputs
         if self.joint_noise is None or plant.noise is not self.last_plant_noise:
@@ -134,9 +134,9 @@ class _MomentCache:
         return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
 
     def make_measurement_moments(self, measurement: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrices by which (x+, q, z+) has its moments of order 2 and 4 from those of (x+, q).
+        """Return the matrices that map the moments of (x+, q) of order 2 and 4 to those of (x+, q, z+).
 
-        `measurement` is the random map from x+, the first n of these 2 n numbers, to z+. The last one's are kept.
+        `measurement` is the random map from x+ (n numbers) to z+. The matrices of the last measurement are kept.
         """
         if measurement is not self.last_measurement:
             take_x = known(np.eye(n, 2 * n))
@@ -150,7 +150,7 @@ class _MomentCache:
 def _make_received_products(n: int, m: int) -> np.ndarray:
     """Return rows, each with one 1, that read z, z z' and z q' off all monomials up to degree 2 of (x, q, z).
 
-    x and q have n numbers, z has m. A product is found by its exponents, of (x, q, z, 1).
+    x and q have n numbers each, and z has m. A monomial is found by its exponents of (x, q, z, 1).
     """
     total = 2 * n + m
     places = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
@@ -276,7 +276,7 @@ def _largest_third_moment(
     """Return the largest |k3(a, b, c)| / (sd a sd b sd c) over c, of numbers with this joint covariance and mean.
 
     k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), the third central moment; sd is a standard deviation.
-    `pair` are the places of the product a b, of a and of b among the N numbers, `linear` those of each c.
+    `pair` holds the places of the product a b, of a and of b among the N numbers, and `linear` those of all c.
     """
     product, a, b = pair
     deviations = np.sqrt(np.diag(joint))

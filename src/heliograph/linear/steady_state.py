@@ -121,8 +121,9 @@ def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lowe
 def plant_matrices(plant: AnyPlant, what: str = "plant") -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
     """Return A (n, n) and Cov(w) (n, n) of a constant linear plant; refuse any other plant, and states that are angles.
 
-    `what` names in the error who needs such a plant.
+    `what` names in the error message what needs such a plant.
     """
+    # A noise that is no AbstractNoise, and a MatrixOfInputs, vary with the plant's inputs.
     if (
         not isinstance(plant, LinearPlant)
         or not isinstance(plant.noise, AbstractNoise)
@@ -138,7 +139,7 @@ def sensor_matrices(
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
     """Return C (m, n) and Cov(v) (m, m) of a constant linear sensor of n states; refuse any other, and angles.
 
-    `what` names in the error who needs such a sensor.
+    `what` names in the error message what needs such a sensor.
     """
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
         raise fail(what, "a LinearSensor that does not vary", _describe_type(sensor))
@@ -148,7 +149,7 @@ def sensor_matrices(
 
 
 def _describe_type(model: AnyPlant | AnySensor) -> str:
-    """Return the type of a model in words for an error message: by what it varies, else its class."""
+    """Return words for a model in an error message: that it varies over time or by inputs, else its class."""
     if isinstance(model, OverTime):
         return "one that varies"
     if isinstance(model, LinearPlant):

@@ -103,8 +103,8 @@ class LinearSystem(Module):
 
     @property
     def steady_from(self) -> int:
-        """The first step from which on all steps are as the last, in matrices and roundings; 0 if none differs."""
-        changes = [0]  # of each field, the last step that differs from the one before
+        """The first step from which on all steps have the same matrices and roundings; 0 if all steps are equal."""
+        changes = [0]  # the last step at which each field differs from the step before
         for field in (*self.steps, self.rounding, self.received_rounding):
             differs = field[1:] != field[:-1]
             step_differs = np.any(differs, axis=tuple(range(1, differs.ndim)))
@@ -133,9 +133,9 @@ class StateMoments(NamedTuple):
 
 
 def state_moments(system: LinearSystem) -> StateMoments:
-    """Return mean and covariance X_k of y before any data, at the start and after each step: X+ = A X A' + Cov(w).
+    """Return the mean and covariance X_k of y without data, at the start and after each step: X+ = A X A' + Cov(w).
 
-    The error covariance P_k of the best filter does not exceed it, P_k <= X_k, since data do not harm it.
+    Data can only lower the error covariance P_k of the best filter, so P_k <= X_k.
 
     Args:
         system: a linear system.
@@ -244,7 +244,7 @@ class Schedule(Module):
 
 
 def _array_or_nan(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a value as an array of the given shape, checked; NaN, where it is not known, is kept."""
+    """Return a value as a checked array of the given shape; NaN stands for unknown numbers, and is kept."""
     unknown = np.isnan(value)
     checked = array(name, np.where(unknown, 0.0, value), shape)
     return np.where(unknown, np.nan, checked)

@@ -86,8 +86,8 @@ class AbstractRandomAffine(Module):
         return any(affine.remembers for affine in inner_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the state before the first draw; () where the map forgets: each draw is independent of the last."""
-        memories_inside = memories(self)  # of links inside, by identity
+        """Draw the state before the first draw; it is () for a map that forgets, whose draws are independent."""
+        memories_inside = memories(self)  # the memories of links inside, by identity
         if not memories_inside:
             return self._init(key)
         # A key for each memory, which is drawn once even where several maps inside share it, and one for the maps.
@@ -104,13 +104,13 @@ class AbstractRandomAffine(Module):
         return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the initial state of a map that contains no memory; by default (), of one that forgets."""
+        """Draw the initial state of a map without memories inside; this default returns () for a map that forgets."""
         if self.remembers:
             raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the next state and H from a map that contains no memory; by default by `sample`, of one that forgets."""
+        """Draw the next state and H of a map without memories inside; this default draws H by `sample`."""
         if self.remembers:
             raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         if type(self).sample is AbstractRandomAffine.sample:
@@ -135,8 +135,8 @@ class AbstractRandomAffine(Module):
         The map must forget. A map of your own may return the matrix alone.
 
         Raises:
-            ValueError: the matrix would need more than the stated memory, or the map remembers: then the moments of one
-                step say nothing of the next.
+            ValueError: a matrix of more than the stated memory; a map that remembers, since the moments of one step
+                then do not determine those of the next.
         """
         check_forgets("moments of a map", self)
         raise unwritten(self, "moments")
@@ -158,8 +158,8 @@ class AbstractRandomAffine(Module):
     def moment_interval(self, order: int) -> Interval:
         """Return the lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
 
-        Up to CORNERS corner (extreme) laws the ends are attained, since every entry is linear in each uncertain law;
-        above, or where they are not counted (None), intervals of the parts are multiplied: sound but not attained.
+        Up to CORNERS corner (extreme) laws the ends are exact, since every entry is linear in each uncertain law. With
+        more corners, or if they are not counted (None), intervals of the parts are multiplied: these may be too wide.
         """
         check_forgets("channel of a bound", self)
         corner_count = count_corners(self)
@@ -196,17 +196,17 @@ class AbstractRandomAffine(Module):
         """Return the indices of outputs that are angles, from those of the inputs.
 
         Raises:
-            ValueError: angles that are no angles behind this map, as behind any gain but 1; by default all.
+            ValueError: angles that are no angles behind this map, as behind a gain but 1; in this default, any angles.
         """
         if sent:
             raise refuse_gain_on_angles(type(self).__name__)
         return ()
 
     def carry_signal(self, signal: SignalMoment) -> SignalMoment:
-        """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does, from those of y.
+        """Return E (z, 1)(z, 1)' of what arrives behind the map and the probability that it does, from those of y.
 
         Raises:
-            ValueError: by default, of a map that erases: it must say itself with which probability.
+            ValueError: a map that erases, in this default, which does not know the probability.
         """
         if self.erases:
             raise fail("transmitter behind a loss", "a chain that erases", type(self).__name__)
@@ -222,16 +222,16 @@ class AbstractRandomAffine(Module):
         """Return the map given that everything arrives, where losses are independent of gains.
 
         Raises:
-            ValueError: losses that are not; by default, of whatever can be lost.
+            ValueError: losses that depend on gains; in this default, any losses.
         """
         if self.erases:
             raise fail("channel", "erasures of channels, not mixtures of them", type(self).__name__)
         return self
 
     def list_outcomes(self) -> list["ArrivalOutcome"]:
-        """Return every set of losses of a map without memory: its probability, the map then, and which outputs arrive.
+        """Return every set of losses of a map without memory: its probability, the map given it, and what arrives.
 
-        Those of probability 0 are left out.
+        Sets of probability 0 are left out.
         """
         check_forgets("channel with erasures", self)
         if not self.erases:
@@ -278,7 +278,7 @@ class AbstractRandomAffine(Module):
         return [self]
 
     def covers(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """Decide whether another map is written like this one, its laws within what this one believes possible.
+        """Return whether another map is built like this one, with laws that this one believes possible.
 
         Args:
             own: the other map.
@@ -309,7 +309,7 @@ class AbstractRandomAffine(Module):
             position: prefix of names, number of hops before, and the signal, which a series sets by `carry_signal`.
 
         Raises:
-            ValueError: a map whose transmitters are not known; by default all.
+            ValueError: a map whose transmitters are not known; in this default, every map.
         """
         expected = "hops in series, stacks, sums, mixtures, modes, losses and delays"
         raise fail("transmitters of a channel", expected, type(self).__name__)
@@ -330,8 +330,8 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 
 
 def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
-    """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
-    leaves, tree = _flatten_to_inner_maps(channel)  # in which an inner map is a leaf
+    """Return the map with these maps in place of its `inner_maps`, or the map itself if they are the same objects."""
+    leaves, tree = _flatten_to_inner_maps(channel)  # each inner map is a leaf
     are_maps, next_map = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
     changed = [next(next_map) if is_map else leaf for is_map, leaf in zip(are_maps, leaves, strict=True)]
     are_unchanged = all(after is before for after, before in zip(changed, leaves, strict=True))
@@ -346,10 +346,10 @@ def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util
 
 @cache_by_object
 def count_corners(channel: AbstractRandomAffine) -> int | None:
-    """Return the number of corner laws (extreme ones of those possible); None where they are too many to be counted."""
+    """Return the number of corner laws, the extreme ones of all possible laws; None if there are too many to count."""
     try:
         return channel.corner_count()
-    except ValueError:  # one law with more uncertain atoms than corners are listed for
+    except ValueError:  # a law has too many uncertain atoms for a list of its corners
         return None
 
 

@@ -76,7 +76,7 @@ class FreshNumbers(AbstractFreshDraw):
         return jnp.asarray(state)
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the first numbers (count,) from their law; raise ValueError where nobody knows it."""
+        """Draw the first numbers (count,) from their law; raise ValueError if there is none."""
         if self.law is None:
             raise fail("simulating what a message tells", "a law of the numbers: told(..., law=...)", "none")
         return jnp.reshape(self.law.sample(key), (self.count,))
@@ -106,7 +106,7 @@ class FreshReading(AbstractFreshDraw):
         return jnp.asarray(state)[1:]
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the gain g and its reading a = g + e, e with the variance `variance`: (2,)."""
+        """Draw (g, a) (2,), a gain g and its reading a = g + e, where the error e has the variance `variance`."""
         gain_key, error_key = jax.random.split(key)
         gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])
@@ -125,7 +125,7 @@ class AbstractToldMap(AbstractModal):
 
     @property
     def reason_for_no_claim(self) -> str:
-        """Why no covariance is claimed from what is told, as said of the numbers ("depends ..."); "" if one is."""
+        """Why no covariance is claimed from the told numbers ("depends on the state"); "" if one is claimed."""
         of_state = [] if self.exogenous else ["depends on the state"]
         of_past = [] if self.fresh else ["leaves open what is not drawn anew with each message"]
         return " and ".join(of_state + of_past)
@@ -223,8 +223,8 @@ class ToldMap(AbstractToldMap):
     def numbers_give_law(self, numbers: Numbers) -> jax.Array:
         """Decide whether the map of these numbers has finite entries only, and noises with valid covariances.
 
-        A variance of zero is valid only where it is zero for typical numbers as well: elsewhere it means that nobody
-        knows. A gain that is told decides no noise.
+        A variance of zero is valid only if it is zero for typical numbers too. Else it means that the variance is not
+        known. A told gain has no effect on the noise.
         """
         if isinstance(self.make, ToldGainHop):
             return super().numbers_give_law(numbers)
@@ -303,7 +303,7 @@ class PilotedHop(AbstractHop, AbstractToldMap):
 
 
 def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
-    """Return the maps in a channel of which a message tells numbers, one for each of the memories that draw them."""
+    """Return the maps in a channel whose numbers are told by messages, one map for each memory that draws numbers."""
     by_identity: dict[str, AbstractToldMap] = {}
     for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map):
         if _is_told_map(leaf):
@@ -312,7 +312,7 @@ def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
 
 
 def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarray, "outputs told"]:
-    """Return which of the numbers that a message tells each output of a channel depends on: those of its own maps."""
+    """Return for each output of a channel on which told numbers it depends: those that its own maps draw."""
     identities = [affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)]
     rows = list[list[bool]]()
     for parallel_map in channel.in_parallel:
@@ -322,16 +322,16 @@ def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarr
 
 
 def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
-    """Return the channel as a receiver knows it that is told these numbers, in the order of `list_told_maps`.
+    """Return the channel as a receiver knows it that was told these numbers.
 
     Args:
         channel: a channel, whose other memories stay.
-        numbers: what is told of all its maps, one after another.
+        numbers: the told numbers of all its maps, in the order of `list_told_maps`.
     """
     numbers_by_memory = _share_numbers_by_map(channel, numbers)
 
     def believe(leaf: object) -> object:
-        """Return a map as its receiver knows it given its numbers, anything else as it is."""
+        """Return a told map as its receiver knows it given its numbers; return anything else unchanged."""
         return leaf.believed(numbers_by_memory[leaf.memory.identity]) if isinstance(leaf, AbstractToldMap) else leaf
 
     conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
@@ -339,18 +339,18 @@ def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
 
 
 def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
-    """Decide whether what is told of each of the channel's maps gives a law: finite numbers, sound covariances.
+    """Return whether the told numbers give a law of each of the channel's maps: finite numbers and valid covariances.
 
     Args:
         channel: a channel.
-        numbers: what is told of all its maps, one after another.
+        numbers: the told numbers of all its maps, in the order of `list_told_maps`.
     """
     by_memory, told_maps = _share_numbers_by_map(channel, numbers), list_told_maps(channel)
     return jnp.all(jnp.stack([affine.numbers_give_law(by_memory[affine.memory.identity]) for affine in told_maps]))
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
-    """Return the numbers told of each map of a channel, which stand one after another, by its memory's identity."""
+    """Split the told numbers by map, and return them by the identity of each map's memory."""
     assert isinstance(channel, AbstractRandomAffine)
     numbers_by_memory, start = dict[str, Numbers](), 0
     for affine in list_told_maps(channel):
@@ -366,7 +366,7 @@ def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.n
 
 
 def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarray) -> jax.Array:
-    """Decide whether a matrix is a covariance to rounding, with variances of 0 only where `typical` has them too."""
+    """Return whether a matrix is a covariance up to rounding, with variances of 0 only where `typical` has 0 too."""
     lower, pivots = eliminate(jnp.asarray(matrix))
     variances = jnp.diagonal(jnp.asarray(matrix))
     are_positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))
@@ -382,7 +382,7 @@ def make_laws_certain(link: T) -> T:
     """
 
     def certain(leaf: object) -> object:
-        """Return a law of finitely many gains, or a map of modes, as one of certain probabilities; else the leaf."""
+        """Return a law of finitely many gains, or a map of modes, with certain probabilities; else the leaf."""
         if isinstance(leaf, Discrete):
             return CertainDiscrete(leaf)
         if isinstance(leaf, AbstractModal) and isinstance(leaf.memory, MarkovChain):

@@ -76,7 +76,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         return self.maps[0].inputs
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return which outputs are angles, if the inputs `sent` are: one of `maps` is in force, so all must agree."""
+        """Return which outputs are angles if the inputs `sent` are; all maps must agree, since any may be in force."""
         results = {affine.carry_angles(sent) for affine in self.maps}
         if len(results) > 1:
             raise refuse_gain_on_angles(type(self).__name__)
@@ -85,8 +85,8 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map with `visit` applied to each hop of each of its maps, and the position behind the longest.
 
-        A hop is a transmitter with its link; the position counts those before it.
-        All maps begin at `position`: hops at equal places are the same transmitters in each of them.
+        A hop is a transmitter with its link, and the position counts the hops before it. All maps begin at `position`:
+        hops at equal places in several maps are the same transmitter.
         """
         visited_maps = [affine.visit_hops(visit, position) for affine in self.maps]
         visited: AbstractRandomAffine = replace_inner_maps(self, [affine for affine, _ in visited_maps])
@@ -94,7 +94,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         return visited, max(positions, key=lambda position: position.hops)
 
     def check_shapes(self, name: str) -> None:
-        """Raise ValueError, with the `name` of what has these maps, where they have several shapes."""
+        """Raise ValueError if the maps differ in shape; `name` says in the message what has these maps."""
         shapes = [(m.outputs, m.inputs) for m in self.maps]
         if len(set(shapes)) != 1:
             raise fail(name, "maps of one shape", shapes)

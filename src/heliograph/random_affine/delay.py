@@ -74,9 +74,8 @@ class DelayLine(AbstractDelayLine):
     steps: int = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, past: int):
-        """Hold the link, a map of the present signal stacked over the `past` ones before it, newest first."""
+        """Hold the link, a map of a line of 1 + `past` signals: the present one and past ones, the newest first."""
         check_maps("link", [link])
-        # The link takes a line of 1 + past signals: the present one and past ones.
         self.link, self.steps = link, check_count("past", past)
         if link.inputs % (1 + past):
             raise fail("link", f"inputs of {1 + past} signals of one length", link.inputs)
@@ -142,9 +141,9 @@ class DelayedLink(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The map from the line of past signals to what arrives: `delay`, which chooses one, then the link.
+        """The map from the line of past signals to what arrives: `delay` selects a signal, and the link transmits it.
 
-        If time stamped, the chosen delay comes as one number more, which goes round the link.
+        With time stamps the delay is one more number, which does not pass through the link.
         """
         if not self.timestamped:
             return Series([self.delay, self.link])
@@ -186,7 +185,7 @@ class DelayedLink(AbstractDelayLine):
 
 
 def _list_delays(delay: Delay) -> tuple[int, ...]:
-    """Return the possible delays in steps; ValueError of what is no delay. A chain's mode is the number of steps."""
+    """Return the possible delays in steps, which are the modes of a chain; raise ValueError for anything else."""
     match delay:
         case Discrete():
             values = [int(d) if d == int(d) else float(d) for d in np.asarray(delay.values)]
@@ -200,9 +199,10 @@ def _list_delays(delay: Delay) -> tuple[int, ...]:
 
 
 def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
-    """Return S_d, which selects the signal of d steps ago from the delay line, the last `longest` + 1 signals in turn.
+    """Return the map S_d, which selects the signal of d steps ago from the delay line.
 
-    If time stamped, the number d stands below the signal. `size`: length of a signal.
+    The line holds the last `longest` + 1 signals, each with `size` numbers, the newest first. With time stamps the
+    number d is appended to the signal.
     """
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
@@ -212,13 +212,13 @@ def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) ->
 
 
 def place_on_delay_line(channel: T) -> T:
-    """Return the channel, or a tree of channels, with each one that delays as a map without delay of the delay line.
+    """Return the channel, or tree of channels, with each channel that delays replaced by a map of the delay line.
 
-    The line is (y_k, y_{k-1}, ...), the present signal and past ones.
+    The line is (y_k, y_{k-1}, ...), the present signal and past ones. The map itself has no delay.
     """
 
     def take_line(leaf: object) -> object:
-        """Return the map of the line of a channel with delays; anything else as it is."""
+        """Return the map of the delay line for a channel with delays; return anything else unchanged."""
         return leaf.line if isinstance(leaf, AbstractDelayLine) else leaf
 
     replaced: T = jax.tree.map(take_line, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractDelayLine))
@@ -231,12 +231,12 @@ def signal_size(channel: AbstractRandomAffine) -> int:
 
 
 def place_channel_of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
-    """Return a channel of y[start:start + size] as one of all of y (total,), and of a delay line of `past` steps.
+    """Return a channel of the part y[start:start + size] as a channel of all of y (total,) with a delay line.
 
-    The line (y_k, y_{k-1}, ...) is at least as long as the channel's own.
+    The line (y_k, y_{k-1}, ...) has `past` past signals, at least as many as the channel's own line.
     """
     longest, size = channel.past, signal_size(channel)
-    # The rows of the line that the channel takes: its part of each signal, present and past.
+    # The channel takes its part of each signal in the line, present and past.
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
     on_line = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
     return DelayLine(on_line, past) if past else on_line
@@ -278,13 +278,13 @@ class RelayStorage(AbstractMapWrapper):
         return self.base.init(key), jnp.zeros((self.steps, self.base.outputs, self.base.inputs + 1))
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the present reception; return the state, and H of it and all stored ones, the newest first.
+        """Draw the present reception; return the state, and H of it and of all stored receptions, the newest first.
 
-        The state: that of `base`, the link, and the `steps` receptions (gain and noise as drawn) that are stored.
+        The state holds the state of the link `base`, and the `steps` stored receptions: gain and noise as drawn.
         """
         base_state, stored = state
         base_state, matrix = self.base.draw(base_state, key)
-        # Each reception takes its own part of the line: that of t steps ago begins t signals later.
+        # The reception of t steps ago takes the part of the line that begins t signals later.
         receptions = jnp.concatenate([matrix[None, :-1], stored])
         blocks = [
             jnp.pad(reception[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
@@ -306,9 +306,9 @@ class RelayedLinks(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """Return the stages in series as a map of the line of past signals, each fed by the storage of the one before.
+        """Return the stages in series as a map of the line of past signals.
 
-        A stage that delays takes past outputs of the one before, which are therefore stored for `past` steps.
+        A stage that delays takes past outputs of the stage before it, which are therefore stored for `past` steps.
         """
         size, line_map = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
@@ -385,9 +385,10 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
 
 
 def _lengthen_delay(link: DelayedLink, added_steps: int) -> Delay:
-    """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps.
+    """Return a link's delay, longer by `added_steps`.
 
-    The link holds a random delay as a choice or as modes of maps; `times` are the possible delays.
+    A random delay is held as a choice among maps, or as modes of maps. `link.times` are the possible delays. A chain of
+    modes is returned as it is, since its mode is the number of steps.
     """
     match link.delay:
         case Mixture():

@@ -32,7 +32,7 @@ class Erasure(AbstractMapWrapper):
         return True
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw whether it arrives, and the map, whose state moves in any case; all of a lost one is NaN."""
+        """Draw the map and whether its output arrives; its state moves in any case, and lost rows [G, n] are NaN."""
         arrival_key, base_key = jax.random.split(key)
         state, matrix = self.base.draw(state, base_key)
         is_lost = ~jax.random.bernoulli(arrival_key, self.arrival)
@@ -43,9 +43,9 @@ class Erasure(AbstractMapWrapper):
         return self.base.condition_on_arrival()
 
     def _outcomes(self) -> list[ArrivalOutcome]:
-        """Return the outcomes: each of the map's own with the probability that it arrives; and that nothing does.
+        """Return the outcomes of the map if its output arrives, and the outcome that nothing arrives.
 
-        An outcome: its probability, the map then, and which outputs arrive.
+        An outcome has its probability, the map given it, and which outputs arrive.
         """
         arrival, none_arrives = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
         outcomes = [
@@ -82,7 +82,7 @@ def second_moments(
 ) -> tuple[Float[np.ndarray, "m p+1"], Float[np.ndarray, "m m p+1 p+1"]]:
     """Return E[(G, n)] of z = G y + n, and the tensor T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1).
 
-    Under the nominal law.
+    Both are those under the nominal law.
     """
     moments = channel.moments(2)
     xp = library(moments.mean, moments.second)

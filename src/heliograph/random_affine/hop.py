@@ -57,7 +57,7 @@ class AbstractHop(AbstractRandomAffine):
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return visit(name, hop, signal) in place of a hop that transmits, and the position behind it."""
+        """Return visit(name, hop, signal) and the position behind it, or both unchanged if it does not transmit."""
         if not self.transmits:
             return self, position
         after = position._replace(hops=position.hops + 1)
@@ -115,9 +115,10 @@ class GainAndNoise(AbstractHop):
 
     @cache_by_object
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
-        """Return B_k, the coefficients of E[g^k] in the moments of this order: by k, monomials of (z, 1) and of (y, 1).
+        """Return all B_k, the coefficients of E[g^k] in E[Sym^order(H)] = sum_k E[g^k] B_k.
 
-        E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)]: B_k has the terms |b| = k.
+        The axes are k, the monomials of (z, 1), and those of (y, 1). B_k has the terms with |b| = k of
+        E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)].
         """
         rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
@@ -137,7 +138,7 @@ class GainAndNoise(AbstractHop):
         return len(self.law.corner_moments(0))
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
-        """Return E[Sym^order(H)] = sum_k E[g^k] B_k at each corner: an extreme law of the gain g that is possible."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k at each corner, an extreme law of the gain g that is possible."""
         gains, coefficients = self.law.corner_moments(order), self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, coefficients).tensordot(gains, coefficients, axes=1)
         return moment_map
@@ -145,7 +146,7 @@ class GainAndNoise(AbstractHop):
     def _interval_of_parts(self, order: int) -> Interval:
         """Return the ends of each entry of sum_k E[g^k] B_k, with the exact range of each E[g^k] over the laws of g.
 
-        B_k, the `gain_coefficients`, are known; where an entry is negative the lower moment gives the higher product.
+        The `gain_coefficients` B_k are known. Where an entry is negative, the lower moment gives the higher product.
         """
         coefficients = self.gain_coefficients(order)
         xp = library(coefficients)
@@ -157,13 +158,13 @@ class GainAndNoise(AbstractHop):
         return sum(lows), sum(highs)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a hop of this matrix and noise whose law of the gain is among those possible here."""
+        """Return whether `own` is a hop with this matrix and noise, and a law of the gain that is possible here."""
         if not isinstance(own, GainAndNoise) or not self.law.covers(own.law):
             return False
         return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return which outputs have a known gain: those that take nothing but `known` inputs, by a constant gain."""
+        """Return which outputs have a known gain: those that use only `known` inputs, by a constant gain."""
         is_used = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
         are_known: KnownGains = (self.law.constant is not None) & ~np.any(is_used & ~known, axis=1)
         return are_known
@@ -217,9 +218,10 @@ class GainAndNoise(AbstractHop):
         return f"{kind} {gain:.3g}" if is_multiple_of_identity and gain != 1 else kind
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the hop without its noise, of which the mean stays, and the noise, if its law has outliers.
+        """Return the hop with only the mean of its noise, and the noise, if the noise's law has outliers.
 
-        Else the hop as it is, and None.
+        The noise's `branches` are about its mean, which is so not counted twice. Without outliers, return the hop
+        unchanged and None.
         """
         if not self.noise.has_outliers:
             return self, None

@@ -106,14 +106,14 @@ class AbstractMemory(Module):
         raise unwritten(self, "next_state_quadrature")
 
     def labelled(self, label: str) -> "AbstractMemory":
-        """Return a copy that no link refers to yet, without a name, identified by `label` alone."""
+        """Return a copy without a name, which only `label` identifies."""
         labelled_copy = copy(self)  # a construction would check numbers that may be stacked over time
         object.__setattr__(labelled_copy, "name", None)  # fields are frozen
         object.__setattr__(labelled_copy, "identity", label)
         return labelled_copy
 
     def named(self, name: str) -> "AbstractMemory":
-        """Return a copy with this name, one memory with all others of the name."""
+        """Return a copy with this name; all memories of one name are the same memory."""
         named_copy = self.labelled(identify_memory(name))
         object.__setattr__(named_copy, "name", name)
         return named_copy
@@ -167,7 +167,7 @@ class MarkovChain(AbstractMemory):
         return bool(np.any(self.radius > 0))
 
     def covers(self, own: "MarkovChain") -> bool:
-        """Decide whether another chain is this memory, and all its possible transitions are among this one's.
+        """Return whether another chain is the same memory, with all its possible transitions possible for this one.
 
         The radius is how far each probability of a transition may be off.
         """
@@ -210,7 +210,7 @@ class CertainChain(MarkovChain):
     """
 
     def __init__(self, chain: MarkovChain):
-        """Take over a chain, whose radius is that of certain transitions, 0."""
+        """Copy a chain; raise ValueError unless its transitions are certain (radius 0)."""
         if chain.is_uncertain:
             raise fail("transitions of a chain", "known ones, beside what a message tells", "uncertain ones")
         self.transition, self.initial, self.radius = chain.transition, chain.initial, chain.radius
@@ -257,12 +257,13 @@ class Autoregression(AbstractMemory):
         return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
 
     def nodes(self, degree: int) -> MemoryStates:
-        """Return Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
+        """Return N = degree + 1 Gauss-Hermite nodes x as states, with their weights w and transitions.
 
-        The state c+ = rho c + sqrt(1 - rho^2) e is standard normal, L_j the Lagrange polynomial that is 1 at x_j only.
-        With N = degree + 1 nodes x and weights w, E[L_j(c+) | c = x_i] = sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, h_m
-        the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
-        this is a chain, x = -1, 1 that switches with probability (1 - rho) / 2.
+        The state c+ = rho c + sqrt(1 - rho^2) e is standard normal. L_j is the Lagrange polynomial that is 1 at x_j and
+        0 at the other nodes, and stands for the indicator of a mode. The transition is E[L_j(c+) | c = x_i] =
+        sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, with the normalised Hermite polynomials h_m. Expectations of
+        polynomials up to degree 2 N - 1 are exact. For degree 1 this is a chain with the states -1 and 1, which
+        switches with probability (1 - rho) / 2.
         """
         x, w, hermite = _hermite_quadrature(check_count("degree", degree, least=0) + 1)
         powers_of_rho = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
@@ -274,9 +275,9 @@ class Autoregression(AbstractMemory):
         return number
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """Return next states and their weights: rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x, from the state c.
+        """Return next states rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x, and their weights; c is the state.
 
-        Without one, at the first use, x itself: the state is standard normal.
+        If `state` is None, at the first use, the next states are x itself, since the state is standard normal.
         """
         x, w, _ = _hermite_quadrature(degree + 1)
         rho = jnp.asarray(self.correlation)
@@ -285,10 +286,10 @@ class Autoregression(AbstractMemory):
         return rho * state + jnp.sqrt(1 - rho**2) * x, w
 
     def chain(self, modes: int) -> MemoryStates:
-        """Return a chain with the same mean, variance and correlation, without negative entries.
+        """Return a chain with the same mean, variance and correlation, whose probabilities are not negative.
 
-        Its states, n + 1 = `modes` of them, are those of a count of n fair coins, centred and scaled to variance 1. At
-        each step every coin stays with probability (1 + rho) / 2 or turns, so E[c+ | c] = rho c.
+        Its n + 1 = `modes` states are the numbers of heads of n fair coins, centred and scaled to variance 1. At each
+        step every coin stays with probability (1 + rho) / 2, and else turns, so that E[c+ | c] = rho c.
 
         Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
         """
@@ -305,12 +306,12 @@ class Autoregression(AbstractMemory):
 
 
 def find_stationary_law(transition: Rows) -> Law:
-    """Return the law p = p Pi of a chain that has only one; ValueError of one that has several."""
+    """Return the stationary law p = p Pi of a chain; raise ValueError if it has several."""
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:
         raise fail("initial law", "one, since the chain has several stationary laws", "none")
-    # p (Pi - I) = 0, of which one row follows from the others; in its place the sum of p is 1.
+    # One equation of p (Pi - I) = 0 follows from the others. It is replaced by sum p = 1.
     balance = xp.concatenate([(transition.T - np.eye(m))[:-1], np.ones((1, m))])
     law = xp.linalg.solve(balance, np.eye(m)[-1])
     law = xp.maximum(law, 0.0)
@@ -319,7 +320,7 @@ def find_stationary_law(transition: Rows) -> Law:
 
 
 def identify_memory(name: str | None) -> str:
-    """Return a text that identifies a memory: its name's, else one of its own, which copies keep; no draw needs it."""
+    """Return a text that identifies a memory: by its name, or else a random text, which copies of it keep."""
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a memory", "a text", repr(name))
     return uuid4().hex if name is None else f"named {name}"
@@ -337,7 +338,7 @@ def _compute_binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Ar
 def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count.
 
-    Of the standard normal law: the weights sum to 1, and E[h_m h_n] is 1 for m = n, else 0.
+    They belong to the standard normal law: the weights sum to 1, and E[h_m h_n] is 1 for m = n, and 0 else.
     """
     x, w = hermegauss(count)
     scale = np.sqrt([float(factorial(m)) for m in range(count)])

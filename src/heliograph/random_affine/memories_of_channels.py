@@ -26,9 +26,9 @@ class AbstractWithMemory(Module):
 
 
 def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T | None:
-    """Return the model of mode `state` out of `models`, one a mode, with its numbers; None if they differ in structure.
+    """Return the model of mode `state` out of `models`, one for each mode, or None if they differ in structure.
 
-    `state` is traced by JAX, so that no object can be chosen by it: each number is chosen among those of all models.
+    `state` is traced by JAX, so that it cannot choose an object. It chooses each number among those of all models.
     """
     leaves, trees = zip(*(jax.tree.flatten(model) for model in models), strict=True)
     if any(not eqx.is_array_like(leaf) for of_mode in leaves for leaf in of_mode):
@@ -59,7 +59,7 @@ def draw_with_shared_memories(
 ) -> tuple[ChannelState, jax.Array]:
     """Draw H by `key` given the memories' states, and move each memory by one of `keys`; return the new state and H.
 
-    The state: those of all memories in a channel, and the `rest_of_channel`, that of the channel given these.
+    The state holds the states of all memories in the channel, and in `rest` the channel's own state given these.
     """
     rest_of_channel, matrix = condition_on_memories(channel, state.memories).draw(state.rest, key)
     triples = zip(memories(channel).values(), state.memories, keys, strict=True)
@@ -79,13 +79,13 @@ def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array |
 
 
 def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.Array | np.ndarray]) -> T:
-    """Return the map, or tree of maps, without memory that it is for these states of its memories.
+    """Return the map, or tree of maps, given the states of its memories; it has no memory then.
 
-    `by_identity`: the state of each memory by its identity; states of other memories may be among them.
+    `by_identity` holds the state of each memory by its identity, and may hold states of other memories too.
     """
 
     def condition(leaf: PyTree) -> PyTree:
-        """Return a map with a memory as that of the memory's state (`by_identity`), anything else as it is."""
+        """Return a map with a memory given the memory's state; return anything else unchanged."""
         return leaf.given(by_identity[leaf.memory.identity]) if is_memory_dependent(leaf) else leaf
 
     memoryless: T = jax.tree.map(condition, channel, is_leaf=is_memory_dependent)
@@ -104,9 +104,9 @@ def drop_names(channel: T) -> T:
 
 
 def number_unnamed_memories(model: T) -> T:
-    """Return the model with its unnamed memories identified by their number, in place of random texts.
+    """Return the model with its unnamed memories identified by numbers instead of random texts.
 
-    So models that differ in these texts alone look alike.
+    So models that differ only in these texts become equal.
     """
     numbered = enumerate(memories(model).items())
     labelled = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in numbered if memory.name is None}
@@ -114,9 +114,9 @@ def number_unnamed_memories(model: T) -> T:
 
 
 def separate_memories(maps: Sequence[T]) -> list[T]:
-    """Return maps that share no unnamed memory: one that stands in several of them becomes one of each.
+    """Return maps that share no unnamed memory: a memory that is in several maps is copied for each.
 
-    Named memories stay shared. The first map keeps its memories; later ones get copies, labelled by their index.
+    Named memories stay shared. The first map keeps its memories. Later maps get copies, labelled by the map's index.
     """
     separated, used_identities = [], set[str]()
     for index, affine in enumerate(maps):
@@ -131,9 +131,10 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
-    """Return the maps of all steps, with unnamed memories identified as the first step's, by order of appearance.
+    """Return the maps of all steps, with unnamed memories that are identified as those of the first step.
 
-    So they go on from step to step. Maps as they are where the first has no memory, or steps have different counts.
+    Memories are matched in order of appearance, so that they go on from step to step. If the first map has no memory,
+    or if steps have different numbers of memories, the maps are returned unchanged.
     """
     memories_by_map = [memories(affine) for affine in maps]
     if not memories_by_map[0] or len({len(memories_of_map) for memories_of_map in memories_by_map}) > 1:
@@ -150,10 +151,10 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 
 
 def replace_memories(channel: T, replacements: Mapping[str, AbstractMemory]) -> T:
-    """Return the map with other memories in place of its own; `replacements`: the other by the identity of its own."""
+    """Return the map with other memories; `replacements` holds them by the identity of those that they replace."""
 
     def replace(leaf: PyTree) -> PyTree:
-        """Return a map with the other memory in place of its own, anything else as it is."""
+        """Return a map with its memory replaced; return anything else unchanged."""
         if not is_memory_dependent(leaf) or leaf.memory.identity not in replacements:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, replacements[leaf.memory.identity])

@@ -46,7 +46,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         self.check_shapes("mixture")
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw every map, and which of them is in force; all states move. Returns the next state and H."""
+        """Draw every map, so that all states move, and choose one map at random; return the next state and its H."""
         choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
         state, matrices = self._draw_each(state, keys)
         chosen = self.choice.sample(choice_key).astype(int)
@@ -62,7 +62,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return JointMoments(mean, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the mixtures of each extreme law of the choice with each combination of the maps' extremes."""
+        """Return one mixture for each extreme law of the choice and each combination of the maps' extremes."""
         extreme_choices = [law for law in self.choice.extremes() if isinstance(law, Discrete)]  # all of them are
         return tuple(
             Mixture(extreme_maps, law.probabilities)
@@ -72,10 +72,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] at each corner: each extreme law of the weights with each combination of the maps'.
+        """Return E[Sym^order(H)] at each corner: an extreme law of the weights with a corner of each map.
 
-        `weights` (corner, map): the extreme laws of the choice. `corner_numbers` (map, combination): one corner of
-        each map.
+        `weights` (corner, map) are the extreme laws of the choice. `corner_numbers` (map, combination) lists all
+        combinations of one corner of each map.
         """
         corners_by_map = [affine.corner_moments(order) for affine in self.maps]
         weights = self.choice.corners()
@@ -84,7 +84,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         combined = stack_parts(
             [corners_of_map[numbers] for corners_of_map, numbers in zip(corners_by_map, corner_numbers, strict=True)]
         )
-        # By corner of the weights, combination, row and column; then by corner of the mixture, row and column.
+        # The axes are corner of the weights, combination, row and column. The first two become the mixture's corners.
         moments = library(weights, combined).tensordot(weights, combined, axes=1)
         by_corner: Matrix = moments.reshape(-1, *moments.shape[2:])
         return by_corner
@@ -108,7 +108,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return mix_gains(parts, np.asarray(self.choice.probabilities), self.inputs)
 
     def in_words(self) -> str:
-        """Return the maps in words, with their shares; a choice of a map or silence is a loss that nobody notices."""
+        """Return the maps in words with their shares; a choice between a map and silence is an unnoticed loss."""
         maps_in_words, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
         if len(maps_in_words) == 2 and maps_in_words[1] == NOTHING_SENT:
             return f"{maps_in_words[0]}, {write_percentage(shares[1])} lost unnoticed"
@@ -116,10 +116,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return f"({' or '.join(choices)})"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of each map as a choice with transmitters of its own; return the new map, and the position.
+        """Visit the hops of each map, which has transmitters of its own; return the new map, and the position.
 
-        Where all maps but one deliver noise alone, as a hop or its loss, they are no such choice: the hop is one
-        transmitter of the chain.
+        If all maps but one deliver only noise, the mixture is a hop or its loss. The hop is then one transmitter of the
+        chain, and is visited as such.
         """
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)
@@ -127,11 +127,11 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return z = E[G] y + n with the mean and covariance of the mixture's noise n, in place of the mixture."""
+        """Return the map z = E[G] y + n, where n is Gaussian with the mean and covariance of the mixture's noise."""
         moments = self.moments(2)
         mean = moments.mean
         noise_products = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
-        second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of 1
+        second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of the monomial 1
         offset = mean[:-1, -1]
         square_of_mean = offset[:, None] * offset
         noise = Gaussian(second_moment - square_of_mean, offset)

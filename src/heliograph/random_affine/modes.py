@@ -61,9 +61,10 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
             check_forgets("map of a mode", m)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map of this mode; of a mode traced by JAX one map with its numbers, or else a choice among all.
+        """Return the map of this mode.
 
-        One map where the modes' maps differ in numbers alone.
+        If JAX traces the mode and the maps differ only in numbers, it is one map with the chosen numbers. If they
+        differ in structure, it is a map that holds all of them and chooses what they return.
         """
         if isinstance(state, int | np.integer):
             return self.maps[state]
@@ -71,7 +72,7 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
         return _MapOfTracedIndex(self.maps, jnp.asarray(state)) if present is None else present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is possible under this map: of modes whose chain and maps are, one by one."""
+        """Return whether `own` is possible under this map: its chain and each of its maps must be possible here."""
         if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
             return False
         pairs = zip(self.maps, own.maps, strict=True)
@@ -147,9 +148,9 @@ class OneStepLate(AbstractMapWrapper):
         return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Return the state and H as drawn at the step before, and draw what the next step receives.
+        """Return the new state, and the H that was drawn at the step before; draw that of the next step.
 
-        State: that of the map `base`, and the rows [G, n] that it drew last.
+        The state holds the state of the map `base`, and the rows [G, n] that it drew last.
         """
         base_state, rows_before = state
         base_state, matrix = self.base.draw(base_state, key)
@@ -289,9 +290,10 @@ def joint_modes(
 
 
 def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
-    """Return a memory as finitely many states: `nodes` of them where a drifting fading is given so many.
+    """Return a memory as finitely many states.
 
-    Else as many as the degree of polynomials in its state, which the channel needs, asks for.
+    A drifting fading (Autoregression) gets `nodes` states, unless `nodes` is None. Any other memory gets as many states
+    as polynomials of this degree in its state need.
     """
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)
@@ -303,9 +305,9 @@ DOUBLINGS = 60  # of the steps after which the law of the modes is that of the l
 
 
 def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel with its modes drawn anew at each step, by their law in the long run: without memory.
+    """Return the channel with its modes drawn anew at each step by their long-run law, so that it has no memory.
 
-    A channel without memory is itself.
+    A channel without memory is returned as it is.
     """
     if not channel.remembers:
         return channel
@@ -319,10 +321,10 @@ def mix_maps_of_modes(modes: JointModes, law: np.ndarray | None = None) -> Abstr
 
 
 def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
-    """Return the mean of the laws of all steps, of a chain that goes in circles too: p ((I + Pi) / 2)^n, n large.
+    """Return the mean of a chain's laws over all steps, p ((I + Pi) / 2)^n with n = 2^DOUBLINGS.
 
-    p: `initial`; Pi: `chain`, the transitions; n = 2^DOUBLINGS. Staying with probability 1/2 ends circles and keeps the
-    mean.
+    p is the `initial` law, and Pi the `chain` of transitions. A periodic chain has no limit of p Pi^n. Staying with
+    probability 1/2 makes it converge, and does not change the mean.
     """
     transition = (np.eye(len(chain)) + chain) / 2
     for _ in range(DOUBLINGS):

@@ -77,9 +77,9 @@ class AbstractNoise(Module):
         return GaussianBranches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
 
     def branches_through(self, matrix: Matrix) -> GaussianBranches:
-        """Return each component of B n as a mixture of Gaussian branches about its mean; one unless the law says more.
+        """Return each component of B n as a mixture of Gaussian branches about its mean; by default it is one branch.
 
-        `matrix`: B (rows, dimension).
+        `matrix` is B (rows, dimension).
         """
         variances = library(matrix, self.covariance).diagonal(matrix @ self.covariance @ matrix.T)[:, None]
         return GaussianBranches(np.zeros((len(matrix), 1)), np.zeros((len(matrix), 1)), variances)
@@ -160,7 +160,7 @@ class Gaussian(AbstractNoise):
         return [NoiseAtom(1.0, self.mean, self.covariance)]
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Return the noise of each group of components, or None where two groups are correlated."""
+        """Return the noise of each group of components, or None if two groups are correlated."""
         group_of_component = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         are_apart = group_of_component[:, None] != group_of_component
         if np.any(np.asarray(self.covariance)[are_apart]):
@@ -178,7 +178,10 @@ class Gaussian(AbstractNoise):
 
         @cache
         def expectation(a: Exponents) -> Number:
-            """Return E[n^a] = E[n_i g(n)] for the first i with a_i > 0: m_i E[g] + sum_j S_ij E[dg/dn_j]."""
+            """Return E[n^a] = E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j], for the first i with a_i > 0.
+
+            This is Stein's identity for Gaussian n of mean m and covariance S.
+            """
             if sum(a) == 0:
                 return 1.0
             i = next(index for index, power in enumerate(a) if power)
@@ -186,7 +189,7 @@ class Gaussian(AbstractNoise):
             total = plain(self.mean[i]) * expectation(exponents_of_g)
             for j, power in enumerate(exponents_of_g):
                 if power and not is_zero(self.covariance[i, j]):
-                    # dg/dn_j is `power` times the monomial of one power of n_j less.
+                    # dg/dn_j is `power` times the monomial with one power of n_j less.
                     lowered = (*exponents_of_g[:j], power - 1, *exponents_of_g[j + 1 :])
                     total += plain(self.covariance[i, j]) * power * expectation(lowered)
             return total
@@ -292,13 +295,13 @@ class Independent(AbstractNoise):
         return stack_branches([component.branches() for component in self.parts])
 
     def branches_through(self, matrix: Matrix) -> GaussianBranches:
-        """Return for each component of B n every branch of each part that it holds with every one of the others."""
+        """Return the branches of each component of B n: all combinations of one branch of each part."""
         ends = np.cumsum([component.dimension for component in self.parts])[:-1]
         blocks = library(matrix).split(matrix, ends, axis=1)
         return stack_branches([self._add_branches([block[[i]] for block in blocks]) for i in range(len(matrix))])
 
     def _add_branches(self, rows: Sequence[Matrix]) -> GaussianBranches:
-        """Return the branches of sum_p rows_p n_p, one number, over the parts n_p whose row (1, size) is not 0."""
+        """Return the branches of the number sum_p rows_p n_p; parts n_p with a row (1, size) of zeros are left out."""
         total = GaussianBranches(*np.zeros((3, 1, 1)))
         for component, row in zip(self.parts, rows, strict=True):
             if not is_zero(row):
@@ -318,8 +321,8 @@ class Independent(AbstractNoise):
         return combine_atoms([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Return the noise of each group of components, of the noises it takes; None where one is of two groups."""
-        # Which noise each component belongs to, and the noises that have a component in each group.
+        """Return the noise of each group of components, or None if a part has components in two groups."""
+        # Which part each component belongs to, and the parts that have a component in each group.
         noise_of_component = np.repeat(np.arange(len(self.parts)), [noise.dimension for noise in self.parts])
         numbers_by_group = [dict.fromkeys(noise_of_component[list(group)].tolist()) for group in groups]
         noises_by_group = [[self.parts[i] for i in numbers] for numbers in numbers_by_group]
@@ -333,13 +336,13 @@ class Independent(AbstractNoise):
         return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
 
     def report(self, y: jax.Array) -> jax.Array:
-        """Return what each noise's own part of a measurement y is reported as, such as rounded values."""
+        """Return the reported values of a measurement y, such as rounded ones; each noise reports its own part of y."""
         ends = np.cumsum([noise.dimension for noise in self.parts])[:-1]
         pairs = zip(self.parts, jnp.split(y, ends), strict=True)
         return jnp.concatenate([noise.report(y_of_noise) for noise, y_of_noise in pairs])
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a], the product of E[n_j^a_j] over the independent noises n_j; `powers`: a, by component."""
+        """Return E[n^a], the product of E[n_j^a_j] over the independent noises n_j; `powers` are the exponents a."""
         product: Number = 1.0
         next_powers = iter(powers)
         for noise in self.parts:
@@ -352,7 +355,7 @@ NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a co
 
 
 def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
-    """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise."""
+    """Return a noise law as it is, and for a covariance or variance the Gaussian noise of mean zero."""
     if isinstance(value, eqx.Module) and not isinstance(value, AbstractNoise):
         expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
         raise fail(name, expected, type(value).__name__)
@@ -364,7 +367,7 @@ def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
 
 
 def count_components(value: NoiseLike) -> int | None:
-    """Count the components of a noise law or covariance; None for a number, a variance of any component."""
+    """Return the number of components of a noise law or covariance; None for a number, which fits any size."""
     if isinstance(value, AbstractNoise):
         return value.dimension
     try:

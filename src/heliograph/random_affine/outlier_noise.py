@@ -75,7 +75,7 @@ class StudentT(AbstractNoise):
     def branches(self) -> GaussianBranches:
         """Return Student's law of each component as a mixture of Gaussian branches, one for each of the PRECISIONS l.
 
-        By component and branch: logarithm of the probability, mean (0) and variance, the scale's divided by l.
+        A branch has the logarithm of its probability, the mean 0, and the variance scale / l. Axes: component, branch.
         """
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
@@ -92,7 +92,7 @@ class StudentT(AbstractNoise):
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw Gaussian noise of the scale divided by sqrt(l), l of the gamma law of mean 1: Student's noise."""
+        """Draw Student's noise: Gaussian noise of the scale, divided by sqrt(l), where l has a gamma law of mean 1."""
         noise_key, precision_key = jax.random.split(key)
         half = jnp.asarray(self.degrees, dtype=float) / 2
         precision = jax.random.gamma(precision_key, half, dtype=float) / half
@@ -101,7 +101,7 @@ class StudentT(AbstractNoise):
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] = E[l^(-k)] times the Gaussian moment, k = |a| / 2 and E[l^(-k)] = prod_i nu / (nu - 2 i).
 
-        The noise is Gaussian noise divided by sqrt(l), l chi-squared of nu degrees divided by nu. Odd moments are 0.
+        The noise is Gaussian noise divided by sqrt(l), where nu l is chi-squared of nu degrees. Odd moments are 0.
 
         Raises:
             ValueError: an order of at least `degrees`, whose moment does not exist.
@@ -194,7 +194,7 @@ class Contaminated(AbstractNoise):
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
         """Return zero-mean noise known by bounds: at most this share of outliers, E[o o'] at most this matrix.
 
-        R: `covariance` of the noise without outliers; G: `outlier_second_moment`; e: `share`. (1 - e) R + e G dominates
+        With R = `covariance` (without outliers), G = `outlier_second_moment` and e = `share`, (1 - e) R + e G is above
         the covariance for every share up to e, since G >= R.
 
         Raises:
@@ -231,7 +231,7 @@ class Contaminated(AbstractNoise):
         return self._list_branches((self.means - self.mean) @ matrix.T, matrix @ self.covariances @ matrix.T)
 
     def _list_branches(self, means: Matrix, covariances: Stack) -> GaussianBranches:
-        """Return the branches of these means (branches, n), about that of the whole, and covariances, by component."""
+        """Return each component's branches from their means (branches, n), about the mean of all, and covariances."""
         xp, n = library(self.shares), means.shape[1]
         log_shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(covariances, axis1=1, axis2=2).T
@@ -242,7 +242,7 @@ class Contaminated(AbstractNoise):
         return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the branch, without or with outliers, by the shares; return the noise of its Gaussian law."""
+        """Draw a branch by the shares, without or with outliers, and return noise from its Gaussian law."""
         branch_key, noise_key = jax.random.split(key)
         branch = draw_index(self.shares, branch_key)
         laws = [Gaussian(covariance, mean) for covariance, mean in zip(self.covariances, self.means, strict=True)]
@@ -256,10 +256,10 @@ class Contaminated(AbstractNoise):
 
 
 def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
-    """Return the share of each of the PRECISIONS, at least LEAST_SHARE, in Student's law as a mixture of Gaussian ones.
+    """Return the shares of the PRECISIONS, at least LEAST_SHARE, by which Gaussian laws make up Student's law.
 
-    The precision l has the gamma law of mean 1, chi-squared of the degrees divided by these. A share is the mass of l
-    between the geometric means of neighbouring PRECISIONS.
+    The precision l has a gamma law of mean 1: a chi-squared variable divided by its degrees of freedom. A share is the
+    mass of l between the geometric means of neighbouring PRECISIONS.
     """
     xp: Any = library(degrees)
     half_degrees = xp.asarray(degrees) / 2
@@ -272,9 +272,9 @@ def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
 
 
 def has_bounded_noise(*parts: PyTree) -> bool:
-    """Return whether some noise in these parts of a network is known by a bound of its covariance alone.
+    """Return whether some noise in these parts of a network is known only by a bound of its covariance.
 
-    Only contaminated noise can be: of at most a share of outliers.
+    Only `Contaminated` noise can be, with a bound of the share of outliers.
     """
 
     def is_law(leaf: object) -> bool:
@@ -303,9 +303,9 @@ def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
 
 
 def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
-    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many.
+    """Return one mean or covariance for each kind of outlier; raise ValueError if their number is wrong.
 
-    `several`: whether a list of kinds was given. Then a number (rank 0) is that of every kind.
+    `several` says whether a list of kinds was given. A number then stands for every kind.
     """
     if not several:
         return [value]
@@ -318,9 +318,10 @@ def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> li
 
 
 def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and variance, in each of `count` slices of equal probability, of the exponential law of mean 1.
+    """Return mean and variance of the exponential law of mean 1 in each of `count` slices of equal probability.
 
-    With the survival S from 1 down to 0 and t = -log S: the integrals of t and t^2 over a slice of S, times count.
+    The survival function S goes from 1 to 0, and t = -log S. The moments are the integrals of t and t^2 over a slice of
+    S, times count.
     """
     survival = 1 - np.arange(count + 1) / count  # at the slices' ends; at 0 the logarithm is multiplied by 0
     time = -np.log(np.where(survival > 0, survival, 1.0))
@@ -330,7 +331,7 @@ def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _log_or_minus_infinity(value: Vector) -> Vector:
-    """Return the logarithms, -inf of zero without a warning, of NumPy or JAX (traced) numbers."""
+    """Return the logarithms of NumPy or JAX (traced) numbers; that of zero is -inf, without a warning."""
     if is_traced(value):
         return jnp.log(value)
     with np.errstate(divide="ignore"):

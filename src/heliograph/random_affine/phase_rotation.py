@@ -47,7 +47,7 @@ class Rotation(AbstractRandomAffine):
         return 2
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw H = [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]] of a random angle phi, normal of this deviation."""
+        """Draw H = [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]] of a random angle phi, normal with `deviation`."""
         phi = self.deviation * jax.random.normal(key, dtype=float)
         c, s = jnp.cos(phi), jnp.sin(phi)
         zero = 0 * c
@@ -57,8 +57,8 @@ class Rotation(AbstractRandomAffine):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^k(H)] = Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), k = `order`.
 
-        C takes (y_1, y_2) to w = y_1 + i y_2 and its conjugate v: w^p v^q turns by (p - q) phi, of which that is the
-        mean factor.
+        C takes (y_1, y_2) to w = y_1 + i y_2 and its conjugate v. A turn by phi multiplies w^p v^q by
+        exp(i (p - q) phi), whose mean is the factor on the diagonal.
         """
         turns = np.array([p - q for p, q, _ in list_exponents(3, order)])
         factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)

@@ -66,7 +66,7 @@ class AbstractCombination(AbstractComposite):
         return max(affine.degree_in(identity) for affine in self.maps)
 
     def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Decide whether another map is of this kind, and each of its maps is possible under that of this one."""
+        """Return whether another map has the same class, and maps that are possible under those in their places."""
         if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
             return False
         pairs = zip(self.maps, own.maps, strict=True)
@@ -75,9 +75,9 @@ class AbstractCombination(AbstractComposite):
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
     ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
-        """Draw each map by its key: return the next state, and H of each.
+        """Draw each map by its key; return the next state, and the drawn H of each map.
 
-        The state is the tuple of the maps' states; () where all of them forget.
+        The state is the tuple of the maps' states, or () if all maps forget.
         """
         states = state if self.remembers else ((),) * len(self.maps)
         draws = [affine.draw(map_state, key) for affine, map_state, key in zip(self.maps, states, keys, strict=True)]
@@ -90,9 +90,9 @@ def _join_outcomes(
     b: list[ArrivalOutcome],
     join: Callable[[ArrivalOutcome, ArrivalOutcome], tuple[AbstractRandomAffine, np.ndarray]],
 ) -> list[ArrivalOutcome]:
-    """Return each set of losses of a with each of b, two independent parts, with the product of their probabilities.
+    """Return all pairs of an outcome of a and one of b, two independent parts; their probabilities are multiplied.
 
-    join(x, y) gives the map of both then, and which of its outputs arrive.
+    An outcome is a set of losses. join(x, y) returns the map of both parts given these, and which outputs arrive.
     """
     if len(a) * len(b) > OUTCOME_LIMIT:
         raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
@@ -109,7 +109,7 @@ class Series(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        """Hold the maps in the order of their application; each takes as many inputs as the last has outputs."""
+        """Hold the maps in the order of their application; each takes the outputs of the map before it as inputs."""
         self.maps = check_maps("series", maps)
         for affine, next_affine in zip(self.maps, self.maps[1:], strict=False):
             if affine.outputs != next_affine.inputs:
@@ -123,7 +123,7 @@ class Series(AbstractCombination):
         return self.maps[-1].outputs
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Return the next state, and H of the series: each map's drawn and multiplied, the first map's rightmost.
+        """Return the next state, and H of the series, the product of all drawn H with that of the first map rightmost.
 
         Rows of lost outputs are NaN.
         """
@@ -196,7 +196,7 @@ class Series(AbstractCombination):
         return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the series without the noise of its last map where its law has outliers, and that noise; else None."""
+        """Return the series without its last map's noise, and that noise, if it has outliers; else itself and None."""
         *earlier_maps, last_map = self.maps
         last_without_noise, noise = last_map.detach_outliers()
         return (self, None) if noise is None else (Series([*earlier_maps, last_without_noise]), noise)
@@ -204,7 +204,7 @@ class Series(AbstractCombination):
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the series with visit(name, hop, signal) in place of each hop, and the position behind it.
 
-        Each map is visited with the signal's second moment behind those before it, where it is known.
+        Each map is visited with the second moment of the signal that reaches it, or None if it is not known.
         """
         visited, signal = list[AbstractRandomAffine](), position.signal
         for i, affine in enumerate(self.maps):
@@ -220,8 +220,8 @@ class Series(AbstractCombination):
 
 
 def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
-    received = known(np.diag(x.arrived.astype(float)))  # zero in place of what x lost
+    """Return the map y after x, and which of its outputs arrive: those that use nothing that x lost."""
+    received = known(np.diag(x.arrived.astype(float)))  # puts zero in place of what x lost
     gain_moments = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
     uses = np.einsum("iiaa->ia", gain_moments) > 0  # E[G_ia^2]
     uses_lost = uses[:, ~x.arrived].any(axis=1)
@@ -229,9 +229,9 @@ def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[Abst
 
 
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
-    """Return the product of two drawn maps, second after first; NaN rows are lost outputs.
+    """Return the product of two drawn maps, second after first, with rows of NaN for lost outputs.
 
-    An output of the second that has a gain on a lost one is lost too.
+    An output of the second map is lost too if it has a gain on a lost output of the first.
     """
     is_lost = jnp.isnan(first).any(axis=1)
     is_lost_after = jnp.any((second != 0) & is_lost, axis=1) | jnp.isnan(second).any(axis=1)
@@ -255,7 +255,7 @@ class Stack(AbstractCombination):
         return sum(m.outputs for m in self.maps)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map; return the next state, and H: their rows [G, n] one above another, and (0, 1) below."""
+        """Draw each map; return the next state, and H with the maps' rows [G, n] one above another, and (0, 1) last."""
         state, matrices = self._draw_each(state, jax.random.split(key, len(self.maps)))
         rows, last_row = [matrix[:-1] for matrix in matrices], np.eye(1, self.inputs + 1, self.inputs)
         return state, jnp.concatenate([*rows, last_row], axis=0)
@@ -281,7 +281,7 @@ class Stack(AbstractCombination):
     def _interval_of_parts(self, order: int) -> Interval:
         """Return the lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
 
-        Row by row it is the product of polynomials in (y, 1), one of each independent map, by intervals.
+        Each row is a product of polynomials in (y, 1), one for each independent map, computed with intervals.
         """
         intervals_by_map = []
         for affine in self.maps:
@@ -305,7 +305,7 @@ class Stack(AbstractCombination):
         return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the indices of outputs that are angles if the inputs `sent` are: the maps', one after another."""
+        """Return the indices of outputs that are angles if the inputs `sent` are; the maps' outputs come in turn."""
         starts = np.cumsum([0, *(affine.outputs for affine in self.maps)])
         items = zip(starts, self.maps, strict=False)
         return tuple(int(start) + i for start, affine in items for i in affine.carry_angles(sent))
@@ -331,9 +331,9 @@ class Stack(AbstractCombination):
         return describe_maps_side_by_side(self.maps)
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the stack without the noises of its maps where their laws have outliers, and these noises as one.
+        """Return the stack without those noises of its maps that have outliers, and these noises joined in one.
 
-        That is zero where a map keeps its noise, and None where all do.
+        The joined noise is zero for a map that keeps its own noise. It is None if all maps keep theirs.
         """
         maps_and_noises = [affine.detach_outliers() for affine in self.maps]
         if all(noise is None for _, noise in maps_and_noises):

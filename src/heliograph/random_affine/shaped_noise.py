@@ -70,7 +70,7 @@ class Shaped(AbstractNoise):
         return jnp.asarray(self.matrix) @ self.source.sample(key)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a] = E[prod_i (sum_j B_ij u_j)^a_i]: of a polynomial in u, the source, term by term."""
+        """Return E[n^a] = E[prod_i (sum_j B_ij u_j)^a_i]: the mean of a polynomial in the source u, term by term."""
         polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
         for i, power in enumerate(powers):
             for _ in range(power):

@@ -94,9 +94,9 @@ class Superposed(AbstractCombination):
 
     @property
     def as_stack(self) -> Series:
-        """The same map as a stack and the sum [I ... I] of its outputs, for what knows only stacks and hops.
+        """The same map as a stack followed by the sum [I ... I] of its outputs, for code that has only stacks and hops.
 
-        Each map of the stack first selects its components of y. The moments of the stack are larger than the sum's.
+        Each map of the stack first selects its components of y. The stack has larger moment matrices than the sum.
         """
         pairs = zip(self.maps, self.places, strict=True)
         maps_of_y = [Series([known(np.eye(self.inputs)[list(taken)]), affine]) for affine, taken in pairs]
@@ -123,11 +123,11 @@ class Superposed(AbstractCombination):
         return whole.transpose(*range(1, whole.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and the noise; return the next state, and H of the sum: gains on all of y, and noise."""
+        """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y."""
         keys = jax.random.split(key, len(self.maps) + 1)
         map_keys, noise_key = keys[:-1], keys[-1]
         state, matrices = self._draw_each(state, map_keys)
-        # The maps' gains side by side, then those on each component of y added up.
+        # The maps' gains are put side by side, and `selection` adds those on the same component of y.
         gains = jnp.concatenate([matrix[:-1, :-1] for matrix in matrices], axis=1) @ self.selection
         offset = sum((matrix[:-1, -1] for matrix in matrices), self.noise.sample(noise_key))
         top = jnp.concatenate([gains, offset[:, None]], axis=1)
@@ -137,7 +137,7 @@ class Superposed(AbstractCombination):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^order(H)] of the sum, from those of the maps and the noise."""
         check_forgets("moments of a map", self)
-        matrices = [affine.moments(order).matrix[None] for affine in self.maps]  # as of one corner, the nominal law
+        matrices = [affine.moments(order).matrix[None] for affine in self.maps]  # the nominal law counts as one corner
         (matrix,) = self._add_moments(matrices, order)
         return JointMoments(matrix, self.outputs, self.inputs, order)
 
@@ -151,15 +151,15 @@ class Superposed(AbstractCombination):
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a sum at the same places, with such a noise, whose maps are possible, one by one."""
+        """Return whether `own` is a sum with the same places and noise, and with maps that are possible here."""
         if not isinstance(own, Superposed) or own.places != self.places or not same_noise(self.noise, own.noise):
             return False
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return for each output whether its gain is known: that of a sum is where it is in every summand.
+        """Return for each output whether its gain is known, which must hold in every summand.
 
-        `known`: the same of each input.
+        `known` says the same of each input.
         """
         pairs = zip(self.maps, self.places, strict=True)
         known_by_map = [affine.carry_known_gains(known[list(taken)]) for affine, taken in pairs]
@@ -179,9 +179,9 @@ class Superposed(AbstractCombination):
         return f"sum of {describe_maps_side_by_side(self.maps)}"
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the sum without its own noise, of which the mean stays, if its law has outliers, and that noise.
+        """Return the sum with only the mean of its own noise, and that noise, if the noise's law has outliers.
 
-        Else the sum as it is, and None.
+        The noise's `branches` are about its mean. Without outliers, return the sum unchanged and None.
         """
         if not self.noise.has_outliers:
             return self, None
@@ -189,16 +189,16 @@ class Superposed(AbstractCombination):
         return Superposed(self.maps, mean_alone, self.places, self.inputs), self.noise
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the sum with its hops visited, each map as a link with the components of y that it takes.
+        """Return the sum with its hops visited; each map is a link with the components of y that it takes.
 
-        The position behind it is that before it: the links side by side are not on the chain.
+        The position does not change, since links side by side are not hops of the chain.
         """
         maps_with_places = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
         visited = [affine.visit_hops(visit, at.select_components(place))[0] for (affine, at), place in maps_with_places]
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
-        """Return E[Sym^order(H)] of the sum from those of its maps, `parts`: each (corners, rows, columns).
+        """Return E[Sym^order(H)] of the sum from those of its maps in `parts`, each (corners, rows, columns).
 
         A corner of the sum is a combination of corners (extreme laws) of the maps.
         """
@@ -208,7 +208,7 @@ class Superposed(AbstractCombination):
             _expand_map_moments(matrix, affine.outputs, taken, order)
             for matrix, affine, taken in zip(parts, self.maps, self.places, strict=True)
         ]
-        # The noise as a map that takes nothing.
+        # The noise is a map without inputs.
         noise_moments = noise_moment_vector(self.noise, order)[None, :, None]
         noise = _expand_map_moments(noise_moments, self.outputs, places=(), order=order)
         moments = _add_independent_moments(_sum_maps_by_halves(terms, self.outputs), noise, self.outputs)
@@ -229,18 +229,18 @@ def _expand_map_moments(matrix: Corners, outputs: int, places: Places, order: in
     """Return the polynomials E[t^a | y] of one map t = H y from its E[Sym^order(H)] at each corner (extreme law).
 
     Args:
-        matrix: of the map, (corners, rows, columns).
+        matrix: E[Sym^order(H)] of the map (corners, rows, columns).
         outputs: number of its outputs.
-        places: of its inputs among all of y, in any order; those of the polynomials are sorted.
-        order: of the moments.
+        places: places of its inputs among all of y, in any order; polynomials have them sorted.
+        order: order of the moments.
     """
     ordered, variables = tuple(sorted(places)), len(places) + 1
-    # The place of each variable of the map, and of the constant 1 behind them, in the sorted order.
+    # The place of each variable of the map in the sorted order; the constant 1 is last.
     sorted_place = np.array([ordered.index(i) for i in places] + [len(places)])
     by_degree = [library(matrix).ones((len(matrix), 1, 1))]
     for degree in range(1, order + 1):
         rows, columns = _find_monomials_of_degree(outputs, degree, order), times_one(variables, degree, order)
-        # The place of each monomial among those of the sorted variables; then, by argsort, which one has each place.
+        # Places of monomials among those of the sorted variables. argsort gives the monomial that has each place.
         place_in_sorted = place_monomials(sorted_place[factor_variables(variables, degree)], variables)
         by_degree.append(matrix[:, rows[:, None], columns[np.argsort(place_in_sorted)]])
     return _SumMoments(ordered, by_degree)
@@ -256,7 +256,7 @@ def _find_monomials_of_degree(outputs: int, degree: int, order: int) -> np.ndarr
 def _sum_maps_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
     """Return the moments E[t^a | y] of a sum t of independent terms, from those of its halves.
 
-    So polynomials of few variables are multiplied first, which takes least.
+    Polynomials of few variables are so multiplied first, which is fastest.
     """
     if len(terms) == 1:
         return terms[0]
@@ -293,7 +293,8 @@ def _add_independent_moments(a: _SumMoments, b: _SumMoments, outputs: int) -> _S
 def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Return terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b) with |c| = degree, for |b| = 0, 1, ..., degree.
 
-    Each: columns of the places of c, b and c - b, each among monomials of its own degree, and of C(c, b).
+    For each |b| there are four columns: the places of c, of b and of c - b, each among monomials of its own degree, and
+    C(c, b).
     """
     exponents = list_exponents(outputs + 1, degree)
     by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
@@ -309,7 +310,8 @@ def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, .
 def _place_products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
     """Return the positions of products of monomials of degree `first` in variables a and of degree `second` in b.
 
-    Among the monomials of degree first + second of all `size` variables: entry (i, j) is that of monomial i times j.
+    Entry (i, j) is the position of monomial i times monomial j among those of degree first + second in all `size`
+    variables.
     """
     variables_a = np.array(a)[factor_variables(len(a), first)]
     variables_b = np.array(b)[factor_variables(len(b), second)]
@@ -343,10 +345,10 @@ def _assemble_moments(powers: _SumMoments, outputs: int, inputs: int, order: int
 def move_sensor_into_links(
     matrix: Matrix, noise: AbstractNoise, channel: AbstractRandomAffine
 ) -> AbstractRandomAffine | None:
-    """Return a sum of links of y = C x + v as a sum of links of x: C_i x + v_i through link i, in fewer numbers.
+    """Return a sum of links of y = C x + v as a sum of links of x, in which link i carries C_i x + v_i.
 
-    C: `matrix`, the sensor's; i: the components of y that link i takes. None where the parts of v that links carry are
-    not independent, or where the channel does not begin with a sum.
+    C is the sensor's `matrix`, and C_i x + v_i are the components of y that link i takes. Return None if the parts v_i
+    of the noise are not independent, or if the channel does not begin with a sum.
     """
     first, *later_maps = channel.in_series
     if not isinstance(first, Superposed) or (noises_of_links := noise.split(first.places)) is None:

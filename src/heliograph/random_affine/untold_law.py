@@ -25,12 +25,12 @@ T = TypeVar("T")
 def believe_untold(channel: T) -> T:
     """Return the channel as a receiver knows it before a message: each told map by the law of its numbers.
 
-    A told map is one of which a message tells numbers, as a gain.
-    Where that law is not known, or `has_untold_law` says that it is not used, a map is that of typical numbers.
+    A told map has numbers that a message tells, such as a gain. If the law of its numbers is not known, or gives no map
+    that can be written, the map of typical numbers is taken.
     """
 
     def believe(leaf: object) -> object:
-        """Return a map by the law of its numbers, or by typical ones; anything but a told map as it is."""
+        """Return a told map by the law of its numbers, or by typical numbers; return anything else unchanged."""
         if not isinstance(leaf, AbstractToldMap):
             return leaf
         map_of_law = _find_untold(leaf)
@@ -41,9 +41,9 @@ def believe_untold(channel: T) -> T:
 
 
 def has_untold_law(channel: AbstractRandomAffine) -> bool:
-    """Return whether `believe_untold` gives the exact law of all that arrives, where no message has told numbers.
+    """Return whether `believe_untold` gives the exact law of all that arrives, before a message tells numbers.
 
-    Not where it has to take typical numbers, nor where the same numbers are told of two maps, which then depend.
+    It does not if it takes typical numbers for a map, or if two maps have the same told numbers and so are dependent.
     """
     maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map) if isinstance(leaf, AbstractToldMap)]
     counts = Counter(affine.memory.identity for affine in maps)
@@ -64,11 +64,11 @@ def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
 
 
 def _find_untold(affine: AbstractToldMap) -> AbstractRandomAffine | None:
-    """Return a map by the law of the numbers that a message would tell; None where that gives no map known here.
+    """Return a map by the law of the numbers that a message would tell, or None if that law gives no known map.
 
-    A gain may have any law; of other numbers there must be finitely many values, each with its map.
+    A gain may have any law. Other numbers must have finitely many values, each of which gives a map of a mixture.
     """
-    if isinstance(affine, PilotedHop):  # known before its reading by the law of its gain
+    if isinstance(affine, PilotedHop):  # before the reading only the law of its gain is known
         return GainAndNoise(affine.memory.law, affine.matrix, affine.noise)
     if not isinstance(affine, ToldMap) or not isinstance(affine.memory, FreshNumbers):
         return None

@@ -67,7 +67,8 @@ class _DenseInverseHessian:
     def times(self, vector: np.ndarray) -> np.ndarray:
         """Return H v, with the inverse Hessian H = `self.matrix` and the gradient v.
 
-        Where v'H v is not positive -H v does not descend: H begins anew, so that -H v is of length FIRST along -v.
+        Where v'H v is not positive, a step -H v would not descend. Then H is replaced by FIRST I / |v|, so that -H v
+        has the length FIRST and goes along -v.
         """
         if (self.matrix @ vector) @ vector <= 0:
             self.matrix = np.eye(len(vector)) * FIRST / np.linalg.norm(vector)
@@ -82,7 +83,7 @@ class _DenseInverseHessian:
         self.is_first_update = False
         if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):
             return
-        if is_first:  # in place of the guess, I at the curvature that this step has shown
+        if is_first:  # the first H was a guess; the step has shown the curvature, so H begins as I s'y / y'y
             self.matrix = np.eye(len(s)) * curvature / float(y @ y)
         factor = np.eye(len(s)) - np.outer(s, y) / curvature  # I - s y'/s'y
         self.matrix = factor @ self.matrix @ factor.T + np.outer(s, s) / curvature
@@ -122,15 +123,17 @@ class _LimitedInverseHessian:
 def _backtrack(
     function: Function, x: np.ndarray, value: float, direction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, float, np.ndarray] | None:
-    """Shorten the step until the value is finite and falls enough (Armijo); None where no step does.
+    """Shorten the step from x along `direction` until the value is finite and falls enough (Armijo's rule).
 
-    Returns the step, and value and gradient at its end; `slope`: direction' gradient at x. Armijo: a step must give at
-    least the share DECREASE of what the slope promises; else its length is multiplied by SHORTEN, down to SHORTEST.
+    The value must fall by at least the share DECREASE of what the slope promises. `slope` is direction' gradient at x.
+    Else the length, 1 at first, is multiplied by SHORTEN. Returns the step, and value and gradient at its end; None if
+    no length from SHORTEST on will do.
     """
     length = 1.0
     while length >= SHORTEST:
         new_value, gradient = function(x + length * direction)
-        if np.isfinite(new_value) and np.all(np.isfinite(gradient)) and new_value <= value + DECREASE * length * slope:
+        is_finite = np.isfinite(new_value) and np.all(np.isfinite(gradient))
+        if is_finite and new_value <= value + DECREASE * length * slope:
             return length * direction, new_value, gradient
         length *= SHORTEN
     return None

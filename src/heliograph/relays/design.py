@@ -84,9 +84,9 @@ def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
 
 
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Return the gains by filter as one block matrix for each step: rows by filter and state, columns all R numbers.
+    """Return the gains by filter as one block matrix for each step.
 
-    The R numbers received are in the order of the filters; each filter's gain stands in the columns of its own ones.
+    Rows are by filter and state. Columns are the R received numbers, by filter. All else is 0.
     """
     if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
@@ -112,7 +112,7 @@ def split_gains(
 
 
 def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDesign:
-    """Return a design of gains and moments as propagated; ValueError unless all moments are finite."""
+    """Return the design with the propagated gains and moments; raise ValueError unless all moments are finite."""
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
@@ -207,11 +207,11 @@ def _make_gains(
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
-    """Raise ValueError for a design whose moments at k = 0 are not the network's own, as those of a periodic one.
+    """Raise ValueError if the design's moments at k = 0 are not those of the network's start.
 
-    A periodic design has one step for each slot, and ends with the moments with which it begins.
+    A periodic design fails this check. It has one step for each slot, and ends with the moments with which it begins.
     """
-    # Equal to the rounding of both; of a periodic design, first and last are equal as far as its iteration went.
+    # The start is compared to rounding. A periodic design was found by iteration, so its ends agree less closely.
     expected, start = initial_error_covariance(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
         ends_as_it_begins = np.allclose(start, design.moments[-1], rtol=1e-6)
@@ -240,8 +240,8 @@ def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int
 def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
 
-    K_f = E[e_f i_f'] E[i_f i_f']^-1, e_f the error of filter f, i_f its innovation. Optimal for one step only: a
-    relay's gain also decides what the receiver can know later (see `receiver_error_design`).
+    K_f = E[e_f i_f'] E[i_f i_f']^-1, with the error e_f of filter f and its innovation i_f. It is optimal for one step
+    only: a relay's gain also decides what the receiver can know later (see `receiver_error_design`).
 
     Args:
         network: relays that filter.
@@ -383,9 +383,10 @@ def make_receiver_view(
 def _list_receiver_views(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]
 ) -> ReceiverViewOfRelays:
-    """Return at each step the system that the receiver sees: of x and the relays' errors (`make_receiver_view`).
+    """Return for each step the system that the receiver sees, with x and the relays' errors as its state.
 
-    `start`: the covariance of x and all filters' errors before the first step; `gains`: of all filters (`join_gains`).
+    `start` is the covariance of x and all filters' errors before the first step. `gains` are those of all filters in
+    block matrices (`join_gains`).
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:

@@ -86,7 +86,7 @@ def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
 def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
     """Return form_k: <form_k, moments before step k> is the sum over the transmitting relays of tr Cov(C s_r).
 
-    <A, B> = tr A' B; s_r is relay r's estimate, C what is sent of it, and `d` the size of the moments.
+    <A, B> = tr A' B. Relay r sends C s_r of its estimate s_r. `d` is the size of the moments.
     """
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
@@ -178,9 +178,9 @@ def _compute_cost_and_slack(
 def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: RelaySteps
 ) -> Float[Array, "time Fn R"]:
-    """Return the gains with their free entries changed by units_k x_k at each step k; x (time, r), r free entries.
+    """Return the gains with their r free entries changed by units_k x_k at each step k; x is (time, r).
 
-    Free are the entries that multiply what the filter itself receives (`gain_mask`); the others are always zero.
+    An entry is free if it multiplies what its filter receives (`gain_mask`). All other entries are always zero.
     """
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
@@ -199,7 +199,7 @@ def _compute_cost_with_barrier(
     def value(x: jax.Array) -> jax.Array:
         """Return cost - barrier sum log(slack) at gains moved by x, `slack` the free share of each power limit.
 
-        `gains`, `units` (of x), `barrier` (a weight) and `problem` stay. Infinite where a limit is passed.
+        The value is infinite where a limit is passed. `gains`, `units`, `barrier` (a weight) and `problem` are fixed.
         """
         cost, slack = _compute_cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
         meets_limits = jnp.all(slack > 0)  # where not, the logarithm is of 1, so that no gradient becomes NaN
@@ -219,7 +219,7 @@ def _evaluate_barrier(
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """Return value and gradient of `_compute_cost_with_barrier`, with the changes of all gains in one vector x.
 
-    So a search for the minimum takes it. `units` (steps, r, r): in columns, what the r variables of a step change.
+    A search for the minimum needs one vector. Column i of units[k] (r, r) is what variable i of step k changes.
     """
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
@@ -244,9 +244,9 @@ def _choose_step_units(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, from that of `later` steps, and the gains' units."""
-        step, gain, moments_before, own = row
-        lam = later + own  # by the moments after the step; own: of the step's own cost
+        """Return the cost's gradient by the moments before a step, and the units in which the step's gains change."""
+        step, gain, moments_before, own = row  # own: the gradient of the step's own cost by the moments after it
+        lam = later + own  # the gradient of the whole cost by the moments after the step
         uncorrected, _ = step_moments(step, moments_before)
         hessian, _ = gain_hessian(uncorrected, lam, step, DAMPING)
         # 1 for a gain on what is transmitted, else 0: such a gain stays.
@@ -336,7 +336,7 @@ def _sweep_backward(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, and Lam, that by the moments after it."""
+        """Return the cost's gradient by the moments before a step, and Lam, its gradient by the moments after it."""
         step, gain, uncorrected, own_cost = row
         lam = later + own_cost  # of later steps' cost, and of the step's own
         best_gain = minimise_cost_ahead(uncorrected, lam, gain, step)
@@ -351,13 +351,13 @@ def _sweep_backward(
 def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step.
 
-    `ahead`: the gradient of the cost by the moments after each step; `gains`: those before, which damp the change.
+    `ahead` is the gradient of the cost by the moments after each step. `gains` are the old ones, which damp the change.
     """
 
     def improve_step(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Return the moments after a step with its best gain; and this gain and these moments."""
+        """Return the moments after a step with its best gain, and the pair (best gain, these moments) to collect."""
         step, old_gain, gradient = row  # the gradient of the cost by the moments after the step
         uncorrected, _ = step_moments(step, moments)
         gain = minimise_cost_ahead(uncorrected, gradient, old_gain, step)

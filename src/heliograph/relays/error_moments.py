@@ -76,8 +76,8 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
 def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], SentMoments]:
     """Return Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
-    eta = (x, e_1 .. e_F): the state and the errors of F filters, which receive R numbers; eta+ is that after the step.
-    Sizes: d = (1 + F) n, z = d + R.
+    eta = (x, e_1 .. e_F) holds the state and the errors of F filters, which receive R numbers. eta+ is eta after the
+    step. The sizes are d = (1 + F) n and z = d + R.
     """
     maps, mean = make_error_step_maps(step), sent_mean(step)
     # Second moments of what is sent, from the covariance of (x, e_1 .. e_F, w, v).
@@ -95,8 +95,8 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
 def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
     """Return the covariance of eta+ = eta+ before corrections - (0; K) innovations, with K the `gain`.
 
-    eta = (x, e_1 .. e_F), the state and the filters' errors: only these are corrected. `z`: the covariance of (eta+
-    before corrections, innovations).
+    eta = (x, e_1 .. e_F) holds the state and the filters' errors. Only the errors are corrected. `z` is the covariance
+    of (eta+ before corrections, innovations).
     """
     rows, received = gain.shape
     d = z.shape[0] - received
@@ -117,8 +117,9 @@ ROUNDING = 64 * float(np.finfo(float).eps)  # of what is sent: an innovation of 
 def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "R"]:
     """Return 1 for each innovation whose variance is above the rounding of what is sent, 0 for the others.
 
-    Of a relay that receives nothing but itself through a known gain the innovation is zero, computed from large ones.
-    `predicted`: the covariance of (x, e_1 .. e_F, innovations); ROUNDING: a few units in the last place.
+    A relay that receives nothing but itself through a known gain has the innovation zero. It is a difference of large
+    numbers, so that only their rounding is left. `predicted` is the covariance of (x, e_1 .. e_F, innovations).
+    ROUNDING is a few units in the last place.
     """
     n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
     # Sizes of what is sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
@@ -180,7 +181,7 @@ def propagate_error_moments(
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """Return the moments after a step, to go on with; and its gains, these moments and the senders' powers.
 
-        Without a given `gain` each filter has the one that is best for itself at this step.
+        Where `gain` is None, each filter gets the gain that minimises its own error at this step.
         """
         step, gain = row
         uncorrected, sent = step_moments(step, moments)
@@ -203,8 +204,9 @@ def gain_hessian(
     """Return half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and what was added.
 
     Z: `predicted` moments (eta+ before corrections, innovations). Lam: `ahead`, the gradient of the cost of later steps
-    by the moments after this one. The entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that
-    receives nothing. `damping` is relative to the mean of the diagonal. Free are the gains on what a filter receives.
+    by the moments after this one. Gains on what a filter receives are free. The entry for the gains ab and cd is
+    Lam_ac Z_bd. A gain on a number that does not arrive in this slot has 1 on the diagonal, and 0 elsewhere.
+    `damping` is relative to the mean of the diagonal.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
@@ -221,9 +223,9 @@ def minimise_cost_ahead(
 ) -> Float[jax.Array, "Fn R"]:
     """Return the gains K of all filters that minimise the cost of later steps, tr Lam [I -(0; K)] Z [I -(0; K)]'.
 
-    Z and Lam as for `gain_hessian`; a little damped towards the gains `old`, which decides what the cost does not.
-    (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains. Indices e
-    stand for the errors, i for the innovations.
+    Z and Lam are those of `gain_hessian`. The free entries ab of K solve (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab, where e
+    stands for the errors and i for the innovations. A little damping towards the gains `old` decides entries on which
+    the cost does not depend.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]

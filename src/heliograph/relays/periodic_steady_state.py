@@ -59,7 +59,8 @@ def periodic_steps(network: RelayNetwork) -> RelaySteps:
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     """Return the steady state of `local_error_design` of a `network`: gains and moments over one period of its slots.
 
-    Each filter then minimises its own next error, in each slot. Found by repeating the period, PERIODS times at most.
+    Each filter minimises its own next error in each slot. The period is repeated until the moments are steady, at most
+    PERIODS times.
 
     Args:
         network: relays that filter, in slots that repeat.
@@ -107,9 +108,9 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
 
 
 def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
-    """Return the steps of one period, one for each slot; raise ValueError where moments do not converge by the gains.
+    """Return the steps of one period, one for each slot; raise ValueError if moments diverge under these gains.
 
-    They do where their linear map over a period has a spectral radius below 1.
+    Moments converge if their linear map over a period has a spectral radius below 1.
     """
     check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
@@ -132,10 +133,11 @@ def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[
 
 
 def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> PropagatedMoments:
-    """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`.
+    """Return the moments over a period that ends with the moments with which it begins.
 
-    Over a period the moments, of size d (x and all filters' errors), are an affine map of those before it: the start is
-    its fixed point. Where the moments diverge there is one too, which is no covariance.
+    The moments, of size d (x and all filters' errors), after a period are an affine map of those before it. The start
+    is the fixed point of this map, and is differentiable in the gains. If the moments diverge, there is a fixed point
+    too, but it is no covariance (`is_covariance`).
     """
     d = gains.shape[1] + steps.transition.shape[-1]
     start = affine_fixed_point(lambda m: propagate_error_moments(steps, m, gains).moments[-1], d)
@@ -143,9 +145,9 @@ def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Prop
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
-    """Decide whether all moments, at a fixed point over a period, are positive semidefinite to rounding (INDEFINITE).
+    """Return whether the moments at a fixed point over a period are positive semidefinite up to rounding (INDEFINITE).
 
-    The moments then converge to this fixed point; else they diverge.
+    If they are, moments converge to this fixed point; if not, they diverge.
     """
     fixed = jax.lax.stop_gradient(moments)  # only decided: nothing is differentiated
     smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
@@ -172,13 +174,16 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
 
     def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
-        """Take a Riccati step by a slot's system `side`: return the covariance of (x, e_relays), and best gain."""
+        """Take one Riccati step: return the covariance of (x, e_relays) after a slot, and the receiver's best gain.
+
+        `side` is the system that the receiver sees in the slot.
+        """
         joint = predict(covariance, side)  # with the measurement, before the correction
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
 
     def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
+        """Take one step with a given gain: return the covariance after a slot twice, to go on with and to collect."""
         side, gain = row  # `side`: the system of (x, e_relays) that the receiver sees in the slot
         corrected = correct_moments(predict(covariance, side), gain)
         return corrected, corrected
@@ -224,7 +229,7 @@ def _iterate_local_design(
 ) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
     """Repeat the period of the local design (gains best for each filter's next error) until its moments are steady.
 
-    They are where they change by less than CONVERGED, relative to the largest.
+    Steady moments change over a period by less than CONVERGED, relative to the largest moment.
     Returns gains, moments and power over the last period, and the last relative change of the moments.
     """
     moments, change = _repeat_until_steady(
@@ -260,8 +265,8 @@ def periodic_receiver_error_design(
 ) -> RelayDesign:
     """Design gains of relays and receiver that together make the steady sum over the slots of tr P small.
 
-    P: the receiver's error covariance; slots: turns of the senders, which repeat.
-    Descent through the fixed point of the second moments; the result is a local minimum.
+    P is the receiver's error covariance. Slots are turns of the senders, which repeat. The descent goes through the
+    fixed point of the second moments, and ends in a local minimum.
 
     Args:
         network: the network, which varies with its slots only.
@@ -314,9 +319,10 @@ def _tune_gains(
     cost: Cost,
     power_limit: ArrayLike | None,
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the gains of least cost near `start`, which are checked to be one block matrix for each slot.
+    """Return the gains of least cost near `start`, which must have one block matrix for each slot.
 
-    `free`: which of the R received numbers have gains that may change; `cost`: of gains, with the penalty of power.
+    `free` is True for the received numbers whose gains may change. `cost` computes the cost of gains, with the penalty
+    of power.
     """
     steps = periodic_steps(network)
     check_gains_of_slots(network, start)
@@ -326,10 +332,10 @@ def _tune_gains(
 def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers.
 
-    P: the receiver's steady error covariance. Sound: positive semidefinite, as moments are that do not diverge.
+    P: the receiver's steady error covariance. Moments are sound if they are positive semidefinite: they then converge.
     """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
-    # The moments begin with those before the first slot. The receiver's error is the last part of what they are of.
+    # The moments begin with those before the first slot. They are of (x, e_1 .. e_F), the receiver's error last.
     receiver = steady.moments[1:, -n:, -n:]
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
     return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), relay_powers
@@ -338,7 +344,7 @@ def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Arr
 def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers.
 
-    P: the steady error covariance. Sound: positive semidefinite, as moments are that do not diverge.
+    P: its steady error covariance. Moments are sound if they are positive semidefinite: they then converge.
     """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     covariance = steady_receiver_covariance(steps, gains)

@@ -80,7 +80,7 @@ def minimise_over_gains(
 def _descend(cost: Cost, x: Float[np.ndarray, "n"], arguments: tuple[Any, ...]) -> Float[np.ndarray, "n"]:
     """Return the x of least cost, found by descent from x; `arguments` are those that the cost takes after x.
 
-    The cost gives its value, its gradient by x and the power, which only the multipliers of the limit need.
+    The cost returns its value, its gradient by x, and the power, which is not used here.
     """
 
     def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -99,9 +99,12 @@ def _are_within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np
 def _find_largest_entries(
     network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the largest magnitude in each filter's gain in each slot, at every entry of it: units of changes."""
+    """Return for every entry of the gains the largest magnitude in its filter's gain in its slot.
+
+    These are the units in which a descent changes the gains.
+    """
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
-    # Of a filter whose gains are small or zero in a slot, a thousandth of the largest of all.
+    # No unit is below a thousandth of the largest one, since gains in a slot may be small or zero.
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
     units = {}
     for (name, value), received in zip(largest.items(), network.received, strict=True):
@@ -119,8 +122,9 @@ def _penalise_power(
 ) -> Float[jax.Array, ""]:
     """Return log sum_s trace_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, g = power / limit - 1, c the STIFFNESS.
 
-    By slot s: trace, of the receiver's error covariance; g, the relative excess over the limit of power; lambda, its
-    multiplier in an augmented Lagrangian. Infinite where the moments are not `sound`, so that a search turns back.
+    In slot s, trace_s is that of the receiver's error covariance, g_s the relative excess over the limit of power, and
+    lambda_s its multiplier in an augmented Lagrangian. The value is infinite if the moments are not `sound`, so that a
+    search turns back.
     """
     total = jnp.sum(traces)
     has_cost = sound & (total > 0)

@@ -41,9 +41,9 @@ class SmoothedRows(NamedTuple):
 
 
 def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
-    """Smooth rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
+    """Smooth rows in chunks side by side; None if rows are few, or the filter is not linear or forgets too slowly.
 
-    A filter forgets how it began: from any two states it comes, over enough rows, to the same one.
+    A filter forgets its start if any two states lead to the same state after enough rows.
 
     Args:
         filter: the filter, which can be smoothed.
@@ -90,7 +90,7 @@ def smooth_chunk(
         return select_state(k < end, step.back(law), law), None
 
     def pass_back_and_estimate(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
-        """Return the smoothed law before a row, from `law` behind it, and the row's smoothed estimate."""
+        """Return the smoothed law before a row from the smoothed `law` after it, and the row's smoothed estimate."""
         step, _k = item
         law_before, _ = pass_back(law, item)
         return law_before, step.estimate_from(law)
@@ -122,9 +122,9 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         """Filter the chunks `which` from their first states, then smooth them; None without native code.
 
-        They pass back from the end of their `windows` (their `own` rows and those ahead; `window_ends`: the row behind
-        each); or, with `later`, from the end of their own rows, where `later` is the smoothed law. Closed over besides:
-        `recursion`, the filter's step; `begun.first`, the first row of each chunk.
+        A window has the `own` rows of a chunk and rows after them, and ends before the row `window_ends`. The pass back
+        begins at the end of the window. If `later` is given, it begins at the end of the chunk's own rows, where
+        `later` is the smoothed law. `recursion` steps the filter, and `begun.first` is each chunk's first row.
         """
         first = begun.first[which]
         is_given = np.full(len(first), later is not None)
@@ -157,12 +157,12 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
 
 def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: SmoothedChunk) -> None:
-    """Smooth again, in place, each chunk whose smoothed law at its end is not that at the beginning of the next one.
+    """Smooth each chunk again whose smoothed law at its end is not that at the beginning of the next chunk.
 
-    Smoothing passes back, so a chunk is entered at its end, by the law `entered`, and left at its beginning, by the law
-    `left`. The last such chunk comes first: smoothed again from the next one's law, it is left by another law itself,
-    with which the chunk before it has to agree. Filtering begins in the state in which the chunk before ends, of the
-    first one in that of `states`.
+    `results` is changed in place. Smoothing passes back: it enters a chunk at its end with the law `entered`, and
+    leaves it at its beginning with the law `left`. Chunks are taken from the last to the first, since a chunk that is
+    smoothed again changes `left`, with which the chunk before it must agree. A chunk is filtered from the state in
+    which the chunk before it ends, and the first chunk from its state in `states`.
     """
     disagrees_with_next = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
     for chunk in range(len(disagrees_with_next) - 1, -1, -1):

@@ -30,10 +30,10 @@ EXCESS = 1.05  # ratio to the expected NIS from which on it is told: less does l
 
 @compile_on_call
 def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
-    """Return sums over the blocks of one run of s, h, s^2, s h and h^2.
+    """Return the sums of s, h, s^2, s h and h^2 over the blocks of rows of one run.
 
-    s is the sum over a block of rows of e' S^-1 e, the squared innovation (NIS), and h the number of components of e
-    that arrived in it. All are 0 of a filter that has no NIS.
+    In a block, s is the sum of the squared innovations e' S^-1 e (NIS), and h is the number of components of e that
+    arrived. All sums are 0 for a filter that has no NIS.
     """
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
@@ -41,10 +41,10 @@ def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
 
 
 def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> Float[Array, "5"]:
-    """Return sum s, sum h, sum s^2, sum s h and sum h^2 over blocks of steps: s sums `nis` in a block, h `received`.
+    """Return the sums of s, h, s^2, s h and h^2 over blocks, where s sums `nis` in a block and h sums `received`.
 
-    `nis` is the square e' S^-1 e of each step's innovation, `received` the number of its components that arrived. The
-    steps are cut into BLOCKS parts, whose scatter will tell the standard error.
+    `nis` is the square e' S^-1 e of each step's innovation, and `received` the number of its components that arrived.
+    The steps are cut into BLOCKS parts. Their scatter gives the standard error.
     """
     xp, time = library(nis), len(nis)
     count = min(BLOCKS, time)
@@ -57,8 +57,9 @@ def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " tim
 def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
     """Return the mean squared innovation e' S^-1 e (NIS) per component, 1 if consistent, and its standard error.
 
-    `sums` are those over blocks of s, h, s^2, s h and h^2: s the sum of NIS in a block, h its number of components.
-    The error is that of a ratio, from the scatter of the blocks: the root of sum (s - ratio h)^2, over sum h.
+    `sums` are those of s, h, s^2, s h and h^2 over blocks, with s the sum of NIS in a block and h its number of
+    components. The mean is the ratio sum s / sum h, and its error is sqrt(sum (s - ratio h)^2) / sum h. Without any
+    component they are 1 and 0.
     """
     s, h, ss, sh, hh = (float(total) for total in sums)
     if not h:
@@ -71,7 +72,7 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:
     """Warn if a filter's squared innovations (NIS) are more than EXCESS times what its model predicts, beyond chance.
 
-    `sums` are those that `nis_test` takes; chance are up to DEVIATIONS standard errors.
+    `sums` are those that `nis_test` takes. Up to DEVIATIONS standard errors may be chance.
     """
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
@@ -90,10 +91,10 @@ class AbstractSmoothing(Module):
     """Choice of the states to be estimated, and of the later data that they are estimated from."""
 
     def estimates(self, steps: SmootherStep) -> Estimate:
-        """Return the estimates along time from smoother steps stacked along time, with the claim (worth) that remains.
+        """Return the estimates along time from smoother steps stacked along time, with the claim that remains.
 
-        Warns where the filter's squared innovations (NIS) say that it is not consistent: later data then make estimates
-        worse.
+        Warns if the filter's squared innovations (NIS) show that it is not consistent. Later data may then make the
+        estimates worse.
         """
         warn_if_inconsistent("smoothing", np.asarray(nis_sums(steps)))
         return _sweep_compiled(self, steps)

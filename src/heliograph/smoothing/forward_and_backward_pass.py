@@ -35,7 +35,7 @@ def smoother_steps(
     Args:
         filter: a filter that can be smoothed.
         measurements: rows (steps, received), or (steps,) of one number; NaN for what did not arrive.
-        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+        inputs: rows (steps, inputs); by default there are none, as for a filter without inputs.
         state: state before the first row; the filter's initial state by default.
         first_step: number of the first row's step; 0 by default.
 
@@ -53,10 +53,10 @@ def smoother_steps(
 def filter_rows_with_smoother_steps(
     filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
 ) -> tuple[PyTree, SmootherStep]:
-    """Run a filter over rows of data; return its state after them, and the smoother step of each row, compiled.
+    """Run a filter over rows of data; return its state after them, and the smoother steps stacked along time.
 
-    A smoother step is what a backward pass needs of a row; they are stacked along time. As `smoother_steps`, of arrays
-    that are checked: measurements z and inputs u, from `state` before the first row, the row of step `first`.
+    A smoother step is what a backward pass needs of a row. The measurements z and the inputs u must be checked arrays.
+    `state` is the state before the first row, and `first` the number of its step.
     """
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
@@ -67,10 +67,10 @@ def filter_rows_with_smoother_steps(
 
 
 def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
-    """Return the filter planned for these inputs and complete data, with its smoother steps but for their means.
+    """Return the filter planned for these inputs and complete data, with its smoother steps except their means.
 
-    Planned: with covariances and gains computed ahead, since they depend on no data. A filter of which they do is
-    returned as it is.
+    A planned filter has covariances and gains that are computed ahead. If they depend on data, the filter is returned
+    as it is.
     """
     planned = filter.planned(inputs)
     if planned is filter:
@@ -81,8 +81,8 @@ def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractF
 def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
     """Return the smoother steps for z = 0, of a filter whose covariances and gains depend on no data.
 
-    Their covariances and gains are those of any data; their means stand in for those that data will give. `inputs` has
-    a row for each step.
+    Their covariances and gains are those for any data. Their means will be replaced by those that the data give.
+    `inputs` has a row for each step.
     """
     zeros = jnp.zeros((len(inputs), filter.received))
     steps: SmootherStep
@@ -96,7 +96,7 @@ def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
         """Smooth the state between two steps: return its law, to go on with, and the estimate of the plant's state.
 
-        `later` is the smoothed law after both.
+        `later` is the smoothed law after both steps.
         """
         previous, step = pair
         law = step.back(later)
@@ -112,9 +112,9 @@ def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
     """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
-        """Smooth the mean between two steps: return the filter's, to go on with, and its part that is the plant's.
+        """Smooth the mean between two steps: return the filter's mean, to go on with, and the plant's part of it.
 
-        `later` is the smoothed one after both.
+        `later` is the smoothed mean after both steps.
         """
         previous, step = pair
         mean = step.mean_back(later)
@@ -134,14 +134,14 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
     def pass_one_step_back(done: jax.Array, later: Gaussian) -> Gaussian:
         """Pass, for each step k of `times`, from the state after step k + lag - done to the one before it.
 
-        `done` counts the passes; of a step beyond `last`, where the data end, there is none, and the law stays.
+        `done` counts the passes made. Beyond the step `last`, where the data end, nothing is passed and the law stays.
         """
         ahead = times + lag - done
         before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
         is_step = ahead <= last
 
         def choose(passed: jax.Array, unchanged: jax.Array) -> jax.Array:
-            """Return, for each step of `times`, the first array where there was a pass, else the second."""
+            """Return for each step of `times` the entry of `passed` if it has a pass, else of `unchanged`."""
             return jnp.where(is_step.reshape(-1, *[1] * (passed.ndim - 1)), passed, unchanged)
 
         chosen: Gaussian = jax.tree.map(choose, before, later)
@@ -155,14 +155,14 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
 
 
 def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
-    """Estimate the state after one step, by number `step`, given the data up to it, and up to each later one.
+    """Estimate the state after the step number `step`, given the data up to it, and given those up to each later step.
 
-    Returns one estimate for each of these ends of the data, stacked.
+    Returns the stacked estimates, one for each of these ends of the data.
     """
     start = take_step(steps, step)
 
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
-        """Carry the state after `step` over a later one, and estimate it given the data up to there."""
+        """Carry the law of the state after `step` over a later step, and estimate it given the data up to there."""
         after = later_step.ahead(point)
         return after, start.estimate_from(start.settle(later_step.find_law_of_earlier(after)))
 

@@ -67,9 +67,12 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
     """Draw one path (steps, n) back from the last step."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Draw the filter's state between two steps, given `later`, drawn after both; keep the plant's part of it."""
+        """Draw the filter's state between two steps, given the drawn state `later` after both steps.
+
+        Return it to go on with, and the plant's part of it.
+        """
         previous, step, key = pair
-        # The law of the state given the next one, which was drawn; means of attitudes are settled on their group.
+        # The law of the state given the next state. Means of attitudes are settled on their group.
         state_before, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
         x = manifold.settle(state_before.mean, _draw_gaussian(state_before._replace(mean=mean), key))

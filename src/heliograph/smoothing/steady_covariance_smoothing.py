@@ -36,9 +36,9 @@ class SmootherStepRecursion(Recursion):
     own: int = eqx.field(static=True)
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, SmootherStep]:
-        """Predict and correct by a row (z, u) of step k; return the state after, and the smoother step.
+        """Predict and correct by the row (z, u) of step k; return the state after it, and the smoother step.
 
-        That holds what a backward pass needs of the row, and its squared innovation.
+        A smoother step holds what a backward pass needs of the row, and the row's squared innovation.
         """
         z, u = row
         prior = self.filter.predict(state, u, k)

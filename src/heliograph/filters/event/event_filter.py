@@ -75,7 +75,7 @@ class EventFilter(AbstractSizedFilter):
         return self.loses and self.trigger.reference == "sent"
 
     def with_room_for_heartbeats_of(self, others: Sequence[AbstractFilter]) -> "EventFilter":
-        """Return the filter with room for the longest heartbeat (steps after which one must send) of the others."""
+        """Return the filter with as many `ages`, counts of steps since a sender sent, as the largest of the others."""
         ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
         if self.trigger.heartbeat is None or ages <= self.ages:
             return self
@@ -96,7 +96,7 @@ class EventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> EventBelief:
-        """Return the prior of (x, r), x the plant's state and r the reference of the sender: none was sent yet."""
+        """Return the prior of (x, r): x is the plant's state, and r, the senders' reference, is known to be 0."""
         start, m = at(self.plant, k=0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
         known_reference = WeightedColumns(np.eye(m), jnp.zeros(m))
@@ -122,8 +122,8 @@ class EventFilter(AbstractSizedFilter):
 
     @property
     def _known_reference_count(self) -> int:
-        """Number of Gaussians of known reference: pieces of the region, and of its outside if a loss may hide there."""
-        if not self.loses or self.reference_may_be_lost:  # loses: transmissions may be lost
+        """Number of Gaussians of known reference: one for each piece inside, and outside if values may be lost."""
+        if not self.loses or self.reference_may_be_lost:
             return self.known
         return self.known + self.region.count_outside_parts(self.senders[0])
 
@@ -231,10 +231,10 @@ class EventFilter(AbstractSizedFilter):
         return self._restore_if_impossible(truncate(augmented, s, SilenceByCause(unsent, dropped, forced)), augmented)
 
     def _truncate_with_known_reference(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
-        """Return the sum over (x, r) given silence of sender s, r the value that it compares y with, known here.
+        """Return the sum over (x, r) given silence of sender s, where its reference r is known.
 
-        Every Gaussian is cut to each piece of |y - r| <= delta, and of |y - r| > delta if values may be lost; those of
-        the same piece are joined.
+        The sender sends y if |y - r| > delta. So every Gaussian is cut to each piece of |y - r| <= delta. If values may
+        be lost, it is also cut to each piece of |y - r| > delta. Then the Gaussians of each piece are joined.
         """
         sender, state_and_reference = self.senders[s], np.arange(len(self.states) + self.outputs)
         inside = augmented.relabel_sender(s, labels.unsent + labels.forced if self.loses else labels.unsent)
@@ -316,9 +316,9 @@ class EventFilter(AbstractSizedFilter):
         return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
 
     def _predict_sent_value(self, sent: Sequence[GaussianSum], links: Sequence[LinkMoments], sender: slice) -> Gaussian:
-        """Return the Gaussian (1, ...) of a value that arrives, from the sums over (x, r, y) where it is sent.
+        """Return the Gaussian (1, ...) of a value that arrives, from the sums over (x, r, y) given that it is sent.
 
-        `sent`, `links`: the sum and the link's moments of each mode.
+        `sent` and `links` hold for each mode of the link the sum over (x, r, y), and the link's moments.
         """
         received_by_mode = []
         for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
@@ -327,9 +327,9 @@ class EventFilter(AbstractSizedFilter):
         return merge_groups(concatenate_sums(received_by_mode)).gaussian
 
     def _restrict_to_sent(self, used: GaussianSum, s: int, has_sent: jax.Array) -> GaussianSum:
-        """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
+        """Restrict each Gaussian to where sender s sends: |y - r| > delta, or anywhere at a heartbeat.
 
-        Returns one sum of the pieces outside, of a floor where these have next to no probability, and of those due.
+        Returns one sum: the pieces of |y - r| > delta, a floor where these have no mass, and those at a heartbeat.
         """
         waiting, due = self._split_label_by_sending(used.label[:, s], has_sent)
         before_event = used.relabel_sender(s, waiting)
@@ -342,9 +342,9 @@ class EventFilter(AbstractSizedFilter):
         return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
 
     def _split_label_by_sending(self, label: jax.Array, has_sent: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
+        """Split a sender's label (K, M, A, C) into parts: where |y - r| > delta decides, and where it must send."""
         heartbeat = self.trigger.heartbeat
-        # A: steps since it sent. It must send at first (not begun), and at the heartbeat where there is one.
+        # The axis A counts steps since it sent. It must send if it never has, and at a heartbeat if there is one.
         is_heartbeat = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
         due = jnp.where(~has_sent | is_heartbeat, label, 0.0)
         return label - due, due
@@ -365,7 +365,7 @@ class EventFilter(AbstractSizedFilter):
         return indices
 
     def _restore_if_impossible(self, mixture: GaussianSum, before: GaussianSum) -> GaussianSum:
-        """Return the updated sum; where all its weights are 0, the sum `before` with FLOOR (1e-6) as likelihood."""
+        """Return the updated sum, or the sum `before` with the likelihood FLOOR (1e-6) if all updated weights are 0."""
         unchanged = before.select_components(np.arange(mixture.gaussian.mean.shape[1]))
         unchanged = unchanged._replace(log_weight=unchanged.log_weight + np.log(FLOOR))
         is_impossible = ~jnp.isfinite(log_total_weight(mixture.log_weight))
@@ -390,7 +390,7 @@ class EventFilter(AbstractSizedFilter):
 
 
 def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Append the reported losses to the innovation: known numbers, so value 0 (NaN if missing) and covariance 0."""
+    """Append reported losses to an innovation: known numbers have value and covariance 0, missing ones NaN."""
     loss_values = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
     value = jnp.concatenate([value, loss_values])
     arrived = ~jnp.isnan(value)

@@ -34,9 +34,10 @@ class EventBelief(NamedTuple):
 
     @staticmethod
     def from_sum(mixture: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
-        """Return the state that holds a sum, with its weights themselves, since log 0 is no number to be stored.
+        """Return the state that holds a sum of Gaussians, with weights in place of their logarithms.
 
-        `begun`: which senders have sent; `moved`: whether a step was predicted already.
+        A stored state should be finite, which log 0 is not. `begun` is True for the senders that have sent. `moved` is
+        True once a step was predicted.
         """
         return EventBelief(
             weight=jnp.exp(mixture.log_weight), gaussian=mixture.gaussian, label=mixture.label, begun=begun, moved=moved

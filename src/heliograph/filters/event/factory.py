@@ -107,14 +107,14 @@ def event_filter(
 def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:
     """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities.
 
-    A pattern of arrivals says which components arrive. A channel that drifts, without a finite number of modes, is
+    A pattern of arrivals says which components arrive. A channel that drifts has no finite number of modes, and is
     refused.
     """
     drifting = [memory for memory in memories(first(channel)).values() if memory.drifts]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
-    # One flag of probability 1 in each mode: nothing is told of the mode.
+    # The receiver is told nothing of the mode: every mode has the same flag, with probability 1.
     by_pattern = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return vary_over_steps(by_pattern, channel), np.asarray(steps[0].initial)
 
@@ -122,14 +122,15 @@ def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
     """Return the claim of the one-Gaussian filter: "exact" if it is the posterior, else "nominal".
 
-    Behind a schedule (`Periodic`) its mean and covariance need to be the posterior's only.
+    Behind a schedule (`Periodic`) it is exact if mean and covariance are those of the posterior.
     """
     steps = unstack(_describe_channel(channel)[0])
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
         return lower_claim_by_noise("exact", plant, sensor, channel)
-    # Given silence x stays Gaussian, unless a loss may hide there; given a value, if its being sent says nothing more.
+    # Given silence x stays Gaussian, unless silence may also be a loss. Given a value x stays Gaussian if the value
+    # determines y: then the fact that it was sent says nothing more.
     losses_are_hidden = trigger.losses == "unknown" and any(_may_lose_components(step) for step in steps)
     determined = all(_arrival_determines_y(step) for step in steps)
     is_exact = determined and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
@@ -147,10 +148,10 @@ def _has_known_gain(channel: ChannelByPattern) -> bool:
 
 
 def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
-    """Return the covariance of (G, n), z = G y + n, by mode and pattern of arrivals, zero where it is only rounding.
+    """Return the covariance of (G, n) by mode and pattern of arrivals, with z = G y + n, and 0 for mere rounding.
 
-    With M = E G, the spread E[G G'] - M M' of a known gain comes out as some eps of |M M'|. `squared_gain`: |M M'|,
-    with a last row and column of zeros for n.
+    A known gain has the spread 0, but E[G G'] - M M' with M = E G is computed as some eps of |M M'|. `squared_gain`
+    holds |M M'|, with a last row and column of zeros for n.
     """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
     size = np.abs(gain)
@@ -167,12 +168,12 @@ def _has_gaussian_noise(*models: PyTree) -> bool:
 
 
 def _arrival_determines_y(channel: ChannelByPattern) -> bool:
-    """Return whether y follows from whatever arrives, without noise: then that it was sent says nothing more.
+    """Return whether whatever arrives determines y, without noise.
 
-    So it is where the gain of each possible mode and pattern of arrivals has no spread, and as many independent rows as
-    y has components.
+    The fact that y was sent then says nothing more. It holds if in each possible mode and pattern of arrivals all
+    components arrive, gain and noise have no spread, and the gain has as many independent rows as y has components.
     """
-    # (mode, pattern) that can occur, of patterns in which something arrives.
+    # The pairs (mode, pattern of arrivals) that can occur and in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
         gain, arrives = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
@@ -201,7 +202,7 @@ def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
 def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
     """Return whether what arrives is y itself, all of it.
 
-    p: numbers in y; m: received numbers; mean: E[(G, n)] of z = G y + n, by mode and pattern of arrivals.
+    y has p numbers, and m numbers are received. `channel.mean` is E[(G, n)] of z = G y + n by mode and pattern.
     """
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:
@@ -240,8 +241,8 @@ def _check_threshold_rule(
 def _has_independent_losses(channel: ChannelByPattern) -> bool:
     """Return whether components arrive unchanged, and are lost independently of each other, without modes.
 
-    So the probability of each pattern of arrivals is the product of those of its components. mean: E[(G, n)] of z = G y
-    + n.
+    The probability of each pattern of arrivals is then the product of the probabilities of its components.
+    `channel.mean` is E[(G, n)] of z = G y + n.
     """
     m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
     if len(chance) > 1:

@@ -30,10 +30,10 @@ class BallMoments(NamedTuple):
 def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
     """Return log probability, mean and covariance of independent e_i ~ N(centre_i, variance_i) in a ball or outside.
 
-    By recursion on the components. Given e_1 = radius sin(t), the others lie in (or outside) a ball of the radius
-    radius cos(t): the same problem with one component less, of which the last is a truncated normal number. The
-    integral over t is a sum over 32 Gauss-Legendre nodes. Its terms are joined as a mixture is, from their means and
-    covariances, so that no variance is negative.
+    This is a recursion on the components. Given e_1 = radius sin(t), the others lie in (or outside) a ball with the
+    radius radius cos(t), so one component less is left. A single component is a truncated normal number. The integral
+    over t is a sum over 32 Gauss-Legendre nodes. Its terms are joined like the components of a mixture, so that no
+    variance is negative.
 
     Args:
         centre: means (m,).
@@ -72,9 +72,9 @@ def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: ja
 
 
 def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Array, radius: jax.Array) -> BallMoments:
-    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere.
+    """Append the two pieces e_1 < -radius and e_1 > radius, in which the other components may lie anywhere.
 
-    `pieces`: moments (piece, ...) where |e_1| <= radius; the components are independent.
+    `pieces` are the moments (piece, ...) where |e_1| <= radius. The components of e are independent.
     """
     tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
@@ -144,8 +144,8 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
 
 
 def _join_pieces(pieces: BallMoments) -> BallMoments:
-    """Return the moments of the mixture of pieces (piece, ...), each weighted by its mass; log of their whole mass."""
-    # Masses relative to the largest one; where none has any, equal shares.
+    """Return the log of the whole mass, and the moments of the mixture of pieces (piece, ...) by their masses."""
+    # Masses are divided by the largest one. If all are 0, the pieces get equal shares.
     largest = jnp.max(pieces.log_mass)
     largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
     weight = jnp.exp(pieces.log_mass - largest)

@@ -36,7 +36,7 @@ class GaussianSum(NamedTuple):
     def relabel_sender(self, s: int, label: jax.Array) -> "GaussianSum":
         """Give sender s these labels (K, ...), probabilities of its states in each of the K Gaussians.
 
-        They need not sum to 1: their sum multiplies the Gaussian's weight. Where it is 0 the label stays.
+        The labels need not sum to 1: their sum multiplies the Gaussian's weight. If the sum is 0, the old label stays.
         """
         beside_label = (-1, *[1] * (label.ndim - 1))
         total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
@@ -72,9 +72,9 @@ def safe_log(x: jax.Array) -> jax.Array:
 
 
 def log_total_weight(log_weight: jax.Array) -> jax.Array:
-    """Return log of the sum of weights; -inf where all are 0.
+    """Return the log of the sum of the weights exp(log_weight) (K,); -inf if all weights are 0.
 
-    `log_weight` (K,); relative to the largest one, so that no exponential overflows.
+    The weights are divided by the largest one first, so that no exponential overflows.
     """
     largest = jnp.max(log_weight)
     largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
@@ -96,12 +96,12 @@ def truncate_between(mixture: GaussianSum, direction: jax.Array, lower: jax.Arra
 
 @jax.jit
 def truncate_outside(mixture: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
-    """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians.
+    """Truncate each of K Gaussians to d'x >= edge, and each to d'x <= -edge; return the sum of these 2 K.
 
-    `mean`, `slopes`: those of d'x in each Gaussian, x = m + L xi.
+    `mean` and `slopes` are those of d'x in each Gaussian: d'x = mean + slopes xi for x = m + L xi.
     """
     slopes, mean = _project_on_direction(mixture, direction)
-    # d'x <= -edge is (-d)'x >= edge: the second half is truncated with both signs turned.
+    # d'x <= -edge is (-d)'x >= edge, so mean and slopes change sign in the second half.
     edges = jnp.full(2 * len(mean), edge)
     mean, slopes = jnp.concatenate([mean, -mean]), jnp.concatenate([slopes, -slopes])
     return _truncate(concatenate_sums([mixture, mixture]), mean, slopes, [edges])
@@ -132,7 +132,7 @@ def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
     """
 
     def merge_group(mixture: GaussianSum) -> GaussianSum:
-        """Merge one group; where no component has weight, all count alike."""
+        """Merge one group of Gaussians by their weights, or by equal shares if all weights are 0."""
         total = log_total_weight(mixture.log_weight)
         # Weights relative to their sum, which has the logarithm `total`.
         share = jnp.exp(mixture.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
@@ -147,10 +147,10 @@ def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
 
 
 def reduce_to_count(mixture: GaussianSum, count: int, places: slice) -> GaussianSum:
-    """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
+    """Merge the cheapest pair of Gaussians again and again, until at most `count` are left.
 
-    The cost of a pair of weights w1 and w2 is w1 w2 / (w1 + w2) times its squared distance in a range of the vector's
-    components, each in units of its variances.
+    The cost of a pair with weights w1 and w2 is w1 w2 / (w1 + w2) times its squared distance in the components
+    `places` of the vector, each in units of its variance.
     """
     while len(mixture.log_weight) > count:
         mixture = _merge_cheapest_pair(mixture, (places.start, places.stop))
@@ -188,10 +188,10 @@ def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int]) -> Gaussia
     merged = merge_groups(mixture._replace(log_weight=jnp.where(is_first | is_second, mixture.log_weight, -jnp.inf)))
 
     def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:
-        """Return these numbers of the Gaussians after two of them are joined: one fewer.
+        """Return `values` (K, ...) of the Gaussians after two are joined, (K - 1, ...).
 
-        `joined`, of the pair joined, goes to the first one's place (mask `is_first`), and the last Gaussian to the
-        second one's.
+        `joined`, the value of the joined pair, goes to the place of the pair's first one. The last Gaussian's value
+        goes to the place of the second. The masks `is_first` and `is_second` (K,) are True at these places.
         """
         one_each = (-1, *[1] * (values.ndim - 1))  # a mask of Gaussians, beside their numbers
         with_last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)

@@ -33,9 +33,9 @@ class LinkMoments(NamedTuple):
     noise: WeightedColumns
 
     def select_sender(self, sender: slice, m: int) -> "LinkMoments":
-        """Select the outputs that carry a sender's components: all, unless each component has its own sender.
+        """Return the moments of the outputs that carry a sender's components `sender` among the m of y.
 
-        `sender`: its components among the m of y; a link of all components at once is not divided.
+        A sender of all m components has all outputs. Else each component has a sender and an output of its own.
         """
         rows = slice(None) if sender == slice(0, m) else sender
         noise = WeightedColumns(self.noise.matrix[rows], self.noise.weights)
@@ -64,7 +64,7 @@ def augment_by_signal(
 
 
 def _append_signal(joint: Gaussian, signal: Signal) -> Gaussian:
-    """Return the Gaussian of (x, r, y) from that of (x, r), `joint`: y = slopes x + noise, whatever r is."""
+    """Return the Gaussian of (x, r, y) from that of (x, r), `joint`; the signal y depends on x alone, not on r."""
     length_of_r = len(joint.mean) - signal.slopes.shape[1]
     slopes = jnp.pad(signal.slopes, ((0, 0), (0, length_of_r)))
     noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
@@ -74,15 +74,16 @@ def _append_signal(joint: Gaussian, signal: Signal) -> Gaussian:
 def predict_with_reference(
     plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of (f(x, u) + w, r): r stays; `initial_power` (n,) is E[x_i^2] before any data.
+    """Return the Gaussian of (f(x, u) + w, r) from that of (x, r), where r stays as it is.
 
-    r: the value that a sender compares with its signal. E[x_i^2] sets the size of numbers that rounding acts on.
+    r is the value with which a sender compares its signal. `initial_power` (n,) is E[x_i^2] before any data, the size
+    of the numbers that are rounded.
     """
     n = len(initial_power)
     length_of_r = len(joint.mean) - n
     image = find_transition_moments(plant, transform, take_leading(joint, n), u)
     noise = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
-    # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
+    # The rows of x become those of f's slopes, and the rows of r stay. Only x has noise.
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), joint.root[n:]])
     noise_of_joint = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
     mean = jnp.concatenate([image.mean + plant.noise_mean(), joint.mean[n:]])
@@ -92,8 +93,8 @@ def predict_with_reference(
 def set_known_components(x: Gaussian, indices: np.ndarray, values: jax.Array) -> Gaussian:
     """Return the Gaussian with the components at `indices` replaced by known values, independent of all others.
 
-    With the covariance root diag(variances) root' a known component has a column of its own, of variance 0, and as
-    its row of the root that of the identity. The root is made lower triangular again.
+    The covariance is root diag(variances) root'. A known component gets the row of the identity in the root, and the
+    variance 0 in its column.
     """
     root = x.root.at[indices].set(np.eye(len(x.mean))[indices])
     variances = x.variances.at[indices].set(0.0)
@@ -132,14 +133,14 @@ def condition_parts_on_received(
 def _condition_on_received(
     x: Gaussian, z: jax.Array, arrived: jax.Array, link: LinkMoments, sender: slice, m: int, delivers: bool
 ) -> tuple[Gaussian, jax.Array]:
-    """Return one Gaussian x of (state, r, y) given z = G y + n, and log of the density of z.
+    """Return one Gaussian x of (state, r, y) given z = G y + n, and the log density of z.
 
-    z: what a sender's message brought, of which `arrived` came; `link`: moments of G and n; `sender`: its components
-    of y (m,); `delivers`: what arrives is y itself.
+    z is what a sender's message brought, and `arrived` says which of its numbers came. `link` holds the moments of G
+    and n, `sender` the sender's components of y (m,). If `delivers`, z is y itself.
     """
     expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
     after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
-    if delivers:  # y is z, to the last digit
+    if delivers:  # conditioning has rounded y, which is z to the last digit
         size = len(x.mean)  # y are the last m components
         after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
     return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
@@ -148,8 +149,8 @@ def _condition_on_received(
 def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
     """Return the Gaussian of z = G y + n from each Gaussian of (x, r, y).
 
-    x: the plant's state, r: the value that the sender compares with its signal y (m,). `link`: moments of G and n;
-    `sender`: the components sent.
+    x (K, ...) are K Gaussians of the plant's state, the reference r and the signal y (m,) of the senders. `link` holds
+    the moments of G and n, and `sender` the components that are sent.
     """
 
     def receive_one(x: Gaussian) -> Gaussian:
@@ -162,9 +163,9 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
 
 
 def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
-    """Return E z, the slopes of z in xi and its noise for z = G y + n, y the last m components of x: centre + rows xi.
+    """Return the mean, the slopes and the noise of z = G y + n, with y = centre + rows xi the last m components of x.
 
-    The mean gain makes the slopes; the gain's spread about it is noise beside n.
+    The slopes are E[G] rows. The noise is n and (G - E G) y, since the gain's spread about its mean acts like noise.
     """
     centre, rows = x.mean[-m:], x.root[-m:]
     gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n

@@ -23,17 +23,17 @@ class SilenceByCause(NamedTuple):
 
 
 def status_after_sending(label: jax.Array, is_lost: bool) -> jax.Array:
-    """Return the probabilities of a sender's status after a transmission, which starts its count of steps anew.
+    """Return the probabilities of a sender's status after a transmission, which sets its count of steps to 0.
 
-    `label` (K, M, A, C): K Gaussians, M modes of the link, A steps since a transmission, C transmissions lost since
-    the last that arrived; `is_lost`: this one too. The last entry of C stands for all larger numbers too; with C = 1
-    losses are not counted.
+    `label` (K, M, A, C) has axes for K Gaussians, M modes of the link, A numbers of steps since a transmission, and C
+    numbers of transmissions lost since the last arrival. The last of the C entries stands for all larger numbers too.
+    With C = 1 losses are not counted. `is_lost` says whether this transmission is lost.
     """
     label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
     if label.shape[-1] == 1:
         return label
     if not is_lost:
         return jnp.zeros_like(label).at[..., 0].set(jnp.sum(label, axis=-1))
-    # One loss more: each entry of C moves up by one, and the last one keeps its own too.
+    # One more loss moves each entry of C up by one. The last one keeps its probability too.
     one_more = jnp.concatenate([jnp.zeros_like(label[..., :1]), label[..., :-1]], axis=-1)
     return one_more.at[..., -1].add(label[..., -1])

@@ -39,9 +39,9 @@ class SilentRegion(NamedTuple):
         return 2 * len(range(self.outputs)[sender]) + self.is_ball
 
     def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
-        """Return for each component of a sender the row d with d'(x, r, y) = y - r, and its threshold delta.
+        """Return for each component i of a sender the row d with d'(x, r, y) = y_i - r_i, and its threshold delta_i.
 
-        x: n states, r: the m values that the sender compares with the m signals y.
+        x has n states, and the sender compares the m signals y with the m references r.
         """
         n, m = self.states, self.outputs
         delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
@@ -82,13 +82,11 @@ class SilentRegion(NamedTuple):
         return merge_groups(cut.select_range(0, count), self.known), cut.select_range(count)
 
     def truncate_outside(self, mixture: GaussianSum, sender: slice, scale: float) -> GaussianSum:
-        """Truncate each Gaussian to |y - r| > scale delta, as `count_outside_parts` pieces, one after the other.
+        """Truncate each Gaussian to |y - r| > scale delta, in `count_outside_parts` pieces, and return their sum.
 
-        Two pieces for each component: it is above or below, and those before it are inside. Of a ball these are what
-        is outside of the box around it; one piece more is what the ball leaves of the box.
-
-        y: the signal of the sender's components, r: what it compares them with, delta: its threshold, a radius if
-        `is_ball`.
+        The sender compares its signal y with r. delta is its threshold, or a radius if `is_ball`. There are two pieces
+        for each component i: y_i - r_i is above or below the interval, and all components before i are inside. For a
+        ball these pieces are the outside of the box around it. One more piece is the box without the ball.
         """
         outside, errors = [], self._error_directions(sender)
         for i, (direction, delta) in enumerate(errors, 1):

@@ -69,7 +69,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> StochasticBelief:
-        """Return the prior: of x, and of the link's modes (`law`); nothing was sent or predicted (`moved`) yet."""
+        """Return the prior of x and the initial law of the link's modes; nothing was sent or predicted yet."""
         start = at(self.plant, k=0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(
@@ -78,9 +78,9 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
-        """Move x and the law of the link's modes; both ends of the link compute the next reference.
+        """Predict x, the law of the link's modes, and the reference with which the sender compares its signal.
 
-        The reference is what the sender compares its signal with.
+        Where the reference is a prediction, both ends of the link compute the same one.
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         predicted = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
@@ -187,10 +187,10 @@ class StochasticEventFilter(AbstractSizedFilter):
         return merge_groups(concatenate_sums(parts))
 
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives.
+        """Return the link's mean gain (m, p) and spread (m, m, p+1, p+1), given that all components arrive.
 
-        The spread is that of (G, n) in z = G y + n; `law` (M,): probabilities of the modes. `joint_probability` (M,
-        patterns): of a mode and a pattern in which all arrives.
+        The spread is that of (G, n) in z = G y + n. `law` (M,) holds the probabilities of the modes.
+        `joint_probability` (M, patterns) is that of a mode and a pattern of arrivals, 0 unless all arrives.
         """
         joint_probability = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
@@ -225,10 +225,10 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _log_probability_sent(
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
-        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z; no less than log FLOOR, FLOOR 1e-6.
+        """Return log P(sent | z) = log(1 - P(silent | z)) by the law of y given z, at least log FLOOR (FLOOR 1e-6).
 
-        z = gain y + noise has the innovation `value`, of this covariance; the noise is what it has beside that of
-        gain y. Silence depends on y and on the reference.
+        z = gain y + noise has the innovation `value` with the given covariance, and Cov(noise) is this covariance less
+        that of gain y. Silence depends on y and on the reference.
         """
         y = _law_of_signal(signal)
         slopes = gain @ y.root
@@ -240,10 +240,10 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _observe_silence(
         self, x: Gaussian, slopes: jax.Array, noise: WeightedColumns, expected: jax.Array, reference: jax.Array
     ) -> tuple[jax.Array, Gaussian]:
-        """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise.
+        """Return log P(silent), and the law of x = mean + L xi given silence, for y = expected + slopes xi + noise.
 
-        Silence of probability exp(-e' W e / 2), e = y - r, is as if the reference r were measured with the noise v,
-        and x = mean + L xi. The density of r times a constant (the normaliser) is the probability of silence.
+        Silence has the probability exp(-e' W e / 2) with e = y - r. So it acts like a measurement r = y + v with
+        Cov v = W^-1: the probability of silence is the density of r times a constant (the normaliser).
         """
         noise = join_columns(noise, eliminate(self._inverse_weight()))
         after, innovations = condition_on_observation(x, slopes, reference - expected, noise)
@@ -256,10 +256,9 @@ class StochasticEventFilter(AbstractSizedFilter):
         return psd_solve(self.trigger.matrix(self.outputs), jnp.eye(self.outputs))
 
     def _log_silence_normaliser(self) -> jax.Array:
-        """Return log of exp(-e' W e / 2) / N(e; 0, W^-1), the same for all e.
+        """Return the log of exp(-e' W e / 2) / N(e; 0, W^-1), which is (m log(2 pi) - log det W) / 2 for all e.
 
-        W is the matrix of the sender's rule, which stays silent with the probability exp(-e' W e / 2), e = y - r of m
-        outputs.
+        W is the matrix of the sender's rule: it stays silent with the probability exp(-e' W e / 2), e = y - r (m,).
         """
         assert isinstance(self.trigger, StochasticTrigger)
         root = cholesky(self.trigger.matrix(self.outputs))
@@ -271,8 +270,8 @@ class StochasticEventFilter(AbstractSizedFilter):
     ) -> tuple[jax.Array, Gaussian]:
         """Return log P(silent) while the link is up, and the prior given silence.
 
-        By a schedule (`Periodic`) silence has the probability 0 in a step that is due, and else 1: it says nothing of
-        x.
+        With a schedule (`Periodic`) the sender is silent with probability 0 in a step that is due, and 1 in any other.
+        Silence then says nothing of x.
         """
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase

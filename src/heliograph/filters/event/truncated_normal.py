@@ -34,11 +34,11 @@ Moments = Callable[..., TruncatedNormalMoments]
 def _loop_two_intervals_at_a_time(moments: Moments) -> Moments:
     """Return `moments` as one operation that takes intervals in a loop, PAIR (2) at a time.
 
-    So native code holds the code of the moments once, however many intervals there are.
+    Native code then holds the program of the moments only once, for any number of intervals.
     """
 
     def compute_in_loop(*ends: jax.Array) -> TruncatedNormalMoments:
-        """Compute `moments` of intervals with these ends, PAIR (2) at a time, or one by one of an odd number."""
+        """Compute `moments` of intervals with these ends, PAIR (2) at a time, or singly if their number is odd."""
         width = 1 if ends[0].size % PAIR else PAIR
         results = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
         return TruncatedNormalMoments(*(moment.reshape(ends[0].shape) for moment in results))

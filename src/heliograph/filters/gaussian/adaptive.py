@@ -85,9 +85,9 @@ class AdaptiveFilter(AbstractWrapper):
 
     @compile_on_call
     def init(self) -> AdaptiveBelief:
-        """Return the filter's prior, and for each noise variance an inverse gamma law about its variance in the model.
+        """Return the filter's prior, and an inverse gamma law for each noise variance about that of the model.
 
-        PRIOR_SHAPE: the shape of that law, 3, as much as six noises say.
+        The law's shape is PRIOR_SHAPE, 3, as much as six observed noises would give.
         """
         shape = jnp.full(self.received, PRIOR_SHAPE)
         variance = jnp.diagonal(jnp.asarray(at(self.noise, k=0).covariance))
@@ -138,8 +138,8 @@ class AdaptiveFilter(AbstractWrapper):
     def noise_deviations(self, state: AdaptiveBelief, k: Step = 0) -> Float[jax.Array, " outputs"]:
         """Return standard deviations of each output's noise as they were learned, in units of those of the model.
 
-        The root mean square over the received numbers that carry the output; 1 where none does. scale / shape of the
-        inverse gamma law is the learned variance of each received number.
+        The learned variance of each received number is scale / shape of its inverse gamma law. An output's deviation is
+        the root mean square over the received numbers that carry it, or 1 if none does.
         """
         noise = at(self.noise, k)
         ratio = state.scale / state.shape / jnp.diagonal(jnp.asarray(noise.covariance))
@@ -270,11 +270,11 @@ def _scale_branches(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
 
 
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
-    """Return the filter with the noise variances of its sensor learned on line, each forgetting with `memory` a step.
+    """Return the filter with the noise variances of its sensor learned on line.
 
-    What is forgotten is replaced by the filter's own variance, never by zero; a component that does not arrive keeps
-    what was learned. The process noise is taken as true: a Q that is too small is absorbed by R (learn Q first, with
-    `fit`).
+    At each step a share 1 - `memory` of what was learned is forgotten, and replaced by the filter's own variance. A
+    component that does not arrive forgets nothing. The process noise is taken as true: a Q that is too small makes the
+    learned R too large, so learn Q first, with `fit`.
 
     Claim: "nominal".
 
@@ -301,7 +301,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
 
 
 def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
-    """Return the sensor's noise as it arrives behind the filter's channel, for each step where these vary."""
+    """Return the sensor's noise behind the filter's channel, over time if sensor or channel varies."""
 
     def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
         """Return the sensor's noise in the received numbers at one step, by its `channel`'s second moments."""

@@ -57,7 +57,7 @@ class DiffuseFilter(AbstractSizedFilter):
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
         """Predict x over x+ = A x + B u + w.
 
-        Where something of x is unknown its variance is infinite; E[x_i^2] at the start sets the rounding of the rest.
+        Unknown directions of x have infinite variance. E[x_i^2] at the start gives the rounding of the others.
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
@@ -65,7 +65,7 @@ class DiffuseFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Diffuse, z: ArrayLike, k: Step = 0) -> tuple[Diffuse, Innovation]:
-        """Condition on z; the innovation of a number that depends on a direction still unknown is NaN."""
+        """Condition on z; a number that depends on a direction of x that is still unknown has the innovation NaN."""
         sensor, z = at(self.sensor, k), jnp.asarray(z)
         matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
         value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
@@ -97,7 +97,7 @@ def has_unknown_start(plant: AnyPlant) -> bool:
 
 
 def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
-    """Return the filter of a plant with an unknown start; raise at models that vary or are not linear."""
+    """Return the filter of a plant with an unknown start; raise ValueError for a plant that varies or is not linear."""
     check_linear("Kalman filter from an unknown start", plant, sensor)
     if isinstance(plant, OverTime):
         raise fail("plant with an unknown start", "one that does not vary over time", "one in over_time")

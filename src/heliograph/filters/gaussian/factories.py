@@ -188,7 +188,7 @@ def mean_gain_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """Return the cubature filter that takes the mean gain for the gain: the naive filter, as a baseline.
+    """Return the cubature filter that uses the mean gain as if it were certain, a naive baseline.
 
     Args:
         plant: the plant, n states.
@@ -213,7 +213,7 @@ def mean_gain_filter(
 def make_base_gaussian_filter(
     name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
 ) -> GaussianFilter:
-    """Return the Gaussian filter inside another filter; raise if the receiver is told anything of the link's state.
+    """Return the Gaussian filter inside another filter; raise ValueError if the receiver is told the link's state.
 
     Args:
         name: of the other filter, for the message.

@@ -83,9 +83,10 @@ class GaussianFilter(AbstractGaussianStateFilter):
         """
 
         def step(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
-            """Filter one row (k, z, u); return the state, and the mean and covariance of its signal before z, and z.
+            """Filter one row (k, z, u); return the state, and the triple (mean, covariance, z).
 
-            z is put near what is expected of it: angles within half a turn.
+            Mean and covariance are those of the row's signal before z. Angles in the returned z are within half a turn
+            of their expected values.
             """
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
@@ -94,9 +95,9 @@ class GaussianFilter(AbstractGaussianStateFilter):
             return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
         def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """Return for all rows of z mean and covariance of the signal before each, and z with angles near it.
+            """Return for all rows the mean and covariance of the signal before z, and z with angles near their mean.
 
-            `step` filters one row of them; u are the inputs of all rows.
+            `step` filters one row. u holds the inputs of all rows.
             """
             start, rows = jax.tree.map(jnp.asarray, self.init()), (jnp.arange(len(z)), z, jnp.asarray(u))
             mean, covariance, near = jax.lax.scan(step, start, rows)[1]
@@ -107,10 +108,10 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the measurement z; a transform draws its points of h(x) anew from the prediction.
+        """Correct with the measurement z, with moments of h(x) about the prediction.
 
-        `unknown`: the signal about its mean, where gain and covariance depend on no data (all is linear). `settle`
-        puts attitudes on their group again.
+        `unknown` is the part of the signal that decides gain and covariance. Where all is linear, the signal's mean is
+        left out, so that they depend on no data. `settle` turns corrected attitudes back to their group.
         """
         channel, signal = at(self.channel, k), self.predict_signal(state, k)
         unknown = signal.about_mean() if self.linear else signal

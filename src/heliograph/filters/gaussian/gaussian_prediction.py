@@ -70,7 +70,8 @@ class AbstractGaussianStateFilter(AbstractSizedFilter):
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """Return the mean and covariance of f(x, u) + w.
 
-        Moments of f are those of the filter's transform; E[x_i^2] at the start sets the rounding.
+        The filter's transform computes the moments of f. E[x_i^2] at the start gives the size of the numbers that are
+        rounded.
         """
         return predict_gaussian(
             at(self.plant, k), self.transform, state, jnp.asarray(u), second_moments_at_start(self.plant, self)
@@ -95,10 +96,10 @@ class HasInitialMoments(Protocol):
 
 
 def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = None) -> Float[jax.Array, " n"]:
-    """Return E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
+    """Return E[x_i^2] at the start plus Var w_i of a step, (n,), the size of the numbers that are rounded.
 
-    `start`: whose law of the first state counts, by default the plant's; of a law that is partly unknown, the known
-    part. A noise that depends on inputs counts where it is added.
+    `start` gives the law of the first state, by default the plant does. Of a law that is partly unknown only the known
+    part counts. A noise that depends on inputs is left out here: it is counted where it is added.
     """
     first_step = at(plant, k=0)
     if isinstance(first_step, ModalPlant):  # the largest of the models
@@ -114,9 +115,10 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
 
 
 def factor_process_noise(plant: AbstractPlant, u: jax.Array, initial_power: jax.Array) -> WeightedColumns:
-    """Return factors of Cov w plus the rounding of a state that had the second moments `initial_power`, (n,).
+    """Return factors of Cov w plus the covariance of rounding, for a state of second moments `initial_power` (n,).
 
-    Numbers of second moments s have a rounding of some eps^2 s as variance: so no covariance is singular by rounding.
+    A number of second moment s has a rounding with the variance of some eps^2 s. With it no covariance becomes singular
+    by rounding.
     """
     noise = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
     rounding = rounding_of(initial_power + diagonal(plant.noise_covariance(u)))
@@ -128,7 +130,7 @@ def factor_process_noise(plant: AbstractPlant, u: jax.Array, initial_power: jax.
 def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
     """Return the moments of f(x, u), exactly where it is linear, else by the transform.
 
-    An image is the mean, the slopes in the factors of x, and the covariance that these leave.
+    An image holds the mean of f, its slopes in the factors of x, and the covariance that the slopes do not explain.
     """
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
@@ -138,9 +140,10 @@ def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, 
 def predict_gaussian(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of f(x, u) + w; `initial_power` (n,) is E[x_i^2] before any data, which rounding acts on.
+    """Return the Gaussian of f(x, u) + w from that of x.
 
-    `settle` puts attitudes back on their group about `middle`, the state about which moments are taken.
+    `initial_power` (n,) is E[x_i^2] before any data, the size of the numbers that are rounded. `settle` turns attitudes
+    back to their group about `middle`, the state about which moments are taken.
     """
     noise = factor_process_noise(plant, u, initial_power)
     if isinstance(plant, LinearPlant):
@@ -153,13 +156,13 @@ def predict_gaussian(
 def transform_about_mean(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array
 ) -> tuple[jax.Array, Image]:
-    """Return the state about which moments of f(x, u) are taken, and these moments; of attitudes it is their mean.
+    """Return the state about which the moments of f(x, u) are taken, and these moments.
 
-    The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean
-    change from m_i, in MEAN_STEPS (4) steps: each multiplies the error by about the square of the attitudes'
-    deviation.
+    Without attitudes the state is the mean of x. With attitudes it is their mean, from which changes have the mean 0.
+    The search for it begins at middle_0 = f(mean of x, u), and middle_(i+1) = middle_i plus the mean change from
+    middle_i. Each of MEAN_STEPS (4) steps multiplies the error by about the square of the attitudes' deviation.
     """
-    # Only attitudes have a mean that must be searched; a transform that keeps the centre stays at f(m, u).
+    # A transform that keeps the centre has no mean change, and stays at f(mean of x, u).
     middle = jnp.asarray(plant.transition(x.mean, u)) if plant.attitude else x.mean
     image = transform.image(plant.make_motion_about(u, x.mean, middle), x)
     for _ in range(MEAN_STEPS if plant.attitude and not transform.keeps_center else 0):
@@ -179,8 +182,8 @@ class PredictsByTransform(Protocol):
 def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasInitialMoments) -> SmootherStep:
     """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
 
-    `start`: the plant or filter from whose initial law rounding is counted. `unexplained`: covariance of x+ given x,
-    which the slopes of f in x do not explain.
+    `start` is the plant or filter whose initial law gives the size of rounded numbers. `unexplained` is the covariance
+    of x+ that the slopes of f in x do not explain.
     """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     image = find_transition_moments(plant, filter.transform, gaussian_of(step.before), u)
@@ -191,7 +194,10 @@ def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, sta
 def choose_initial_moments(
     plant: AbstractPlant, initial_mean: ArrayLike | None, initial_covariance: ArrayLike | None
 ) -> tuple[Array, Array, bool]:
-    """Return initial mean (n,) and covariance (n, n), the plant's where None is given, and whether any was given."""
+    """Return the initial mean (n,) and covariance (n, n), and whether the user gave one of them.
+
+    Where the user gave None, it is the plant's.
+    """
     n = len(plant.states)
     mean = plant.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
     initial = plant.initial_covariance

@@ -48,7 +48,7 @@ class AbstractTransform(Module):
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Return the moments of function(x) for x with mean (n,) and covariance (n, n)."""
-        # A transform writes either `apply` or `image`; this one, by default, uses the other.
+        # A transform defines `apply` or `image`. This default computes `apply` from `image`, if that is defined.
         if type(self).image is AbstractTransform.image:
             raise unwritten(self, "apply")
         x = from_covariance(mean, covariance)
@@ -65,9 +65,9 @@ class AbstractTransform(Module):
 
 
 def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
-    """Return the image of x = m + L xi, Cov xi = D, by f: mean, slopes in xi, and the covariance left over.
+    """Return the image of x = m + L xi by f: its mean, its slopes in xi, and the covariance that is left.
 
-    Slopes: (D^-1 L^-1 Cov(x, f))'; the curvature is Cov f less slopes D slopes'.
+    With Cov xi = D, the slopes are (D^-1 L^-1 Cov(x, f))', and Cov f - slopes D slopes' is left.
     """
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
     unexplained = moments.covariance - (slopes * x.variances) @ slopes.T
@@ -87,16 +87,14 @@ class Cubature(AbstractTransform):
     def image(self, function: Function, x: Gaussian) -> Image:
         """Return the moments of f(x) from its values at the 2 n points.
 
-        With s_j = sqrt(n d_j) L_j the differences f(m + s_j) - f(m - s_j) make the slopes, and what the sums
-        f(m + s_j) + f(m - s_j) differ by from their mean makes the curvature, both with weights 1 / (4 n).
-
-        x has n components, mean m and covariance L D L': d_j are the diagonal of D (variances), L_j the columns of L
-        (root).
+        x has n components, mean m and covariance L diag(d) L', with the columns L_j of L, and s_j = sqrt(n d_j) L_j.
+        The differences f(m + s_j) - f(m - s_j) are the slopes. The sums f(m + s_j) + f(m - s_j), less their mean, are
+        the curvature. Both have the weights 1 / (4 n).
         """
         n = len(x.mean)
         steps = square_root(n * x.variances)
         ahead, behind = evaluate_beside_mean(function, x, steps)
-        # Odd and even parts are (f(m + s) -+ f(m - s)) / 2: sums without the half are twice as large.
+        # The factor 1 / 2 of the mean of two values is left out here, and taken into the weights and the mean below.
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
         weights = np.full(n, 1 / (4 * n))
@@ -107,7 +105,7 @@ class Cubature(AbstractTransform):
 def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each.
 
-    m: the mean of x (n,); L_j: column j of its root; p: length of f.
+    x has the mean m (n,) and a root with the columns L_j. f has length p.
     """
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
@@ -158,7 +156,10 @@ class PolynomialMoments(AbstractTransform):
         self.degree = check_count("degree of the polynomial", degree)
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Return the moments of f(x), exact for a polynomial of `degree`: by coefficients at 2, else by quadrature."""
+        """Return the moments of f(x), exact for polynomials up to `degree`.
+
+        For degree 2 they come from the polynomial's coefficients, else from Gauss-Hermite quadrature.
+        """
         deviations = square_root(x.variances)
         factor = x.root @ jnp.diag(deviations)
         if self.degree == 2:
@@ -167,17 +168,19 @@ class PolynomialMoments(AbstractTransform):
         values = evaluate_at_points(function, x.mean + points @ factor.T).T
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
-        # What f has beside its best linear fit, at each point.
+        # The differences between f and its best linear fit, at each point.
         residuals = values - center[:, None] - slopes @ points.T
         explained = WeightedColumns(slopes, np.ones(len(deviations)))
         return Image(center, explained, deviations, eliminate(WeightedColumns(residuals, weights).covariance))
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:
-    """Return f(m + L xi) = c + sum a_i xi_i + sum b_i xi_i^2 + sum_i<j b_ij xi_i xi_j, xi standard normal.
+    """Return the image of x = mean + factor xi, xi standard normal, by a function f of degree 2.
 
-    Mean c + sum b_i, slopes a_i, and uncorrelated with xi: 2 sum b_i b_i' + sum b_ij b_ij'. From the values at m,
-    m + L_i, m - L_i and m + L_i + L_j for i < j.
+    f(m + L xi) = c + sum a_i xi_i + sum b_i xi_i^2 + sum_{i<j} b_ij xi_i xi_j, with L = factor. Its coefficients follow
+    from the values at m, m + L_i, m - L_i and m + L_i + L_j for i < j. The mean is c + sum b_i, and the slopes are a_i.
+    The part that is uncorrelated with xi has the covariance 2 sum b_i b_i' + sum b_ij b_ij'. `deviations` (n,) are only
+    passed on to the Image: its slopes are in these units.
     """
     n, center = mean.shape[0], mean[:, None]
     rows, columns = np.triu_indices(n, 1)

@@ -191,10 +191,10 @@ class CentredFilter(AbstractWrapper):
 
 
 def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFilter:
-    """Return a filter about an origin that moves with it; one of attitudes or of modes of motion as it is.
+    """Return a filter about an origin that moves with the estimate.
 
-    Numbers far from zero then keep the digits of small changes. `known_gain`: no gain of the channel is random or
-    uncertain.
+    States far from zero then keep the digits of small changes. A filter whose plant has attitudes, or several modes of
+    motion, is returned as it is. `known_gain` is True if no gain of the channel is random or uncertain.
 
     Args:
         filter: one that uses its fields plant, sensor and channel alone.
@@ -215,7 +215,7 @@ def _start_at_zero(base: Any) -> Any:
 def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
     """Return the plant of deviations from a center, whose state starts at zero.
 
-    `level`: what is subtracted from f, the origin after the step; `unit`: eps of the precision.
+    `level` is the origin after the step, which is subtracted from f. `unit` is eps of the precision.
     """
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
@@ -227,7 +227,7 @@ def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float
 def _center_sensor(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
     """Return the sensor of deviations from a center.
 
-    `level`: what is subtracted from h, the signal of the center; `unit`: eps of the precision.
+    `level` is the signal h of the center, which is subtracted from h. `unit` is eps of the precision.
     """
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,

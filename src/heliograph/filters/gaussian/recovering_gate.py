@@ -92,10 +92,10 @@ class GivingInFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> GateAndRival:
-        """Return the belief before any data: gate and rival alike, nothing refused.
+        """Return the belief before any data, with equal states of gate and rival and nothing refused.
 
-        The rival is the state that explains what the gate refuses. `step`: when the gate last gave in; NEVER (-1):
-        not yet.
+        The rival is the state that explains what the gate refuses. `step` is the step at which the gate last gave in,
+        NEVER (-1) at first.
         """
         start, zero = self.base.init(), jnp.zeros(())
         return GateAndRival(
@@ -113,7 +113,8 @@ class GivingInFilter(AbstractSizedFilter):
     def predict(self, state: GateAndRival, u: ArrayLike = (), k: Step = 0) -> GateAndRival:
         """Predict the gate's state and its rival over step k.
 
-        The rival is the state that explains what the gate refused. `elapsed`: time since the first refusal in a row.
+        The rival is the state that explains what the gate refused. `elapsed` is the time since the first of the present
+        refusals in a row, 0 if nothing is refused.
         """
         elapsed = state.elapsed
         if TIME_STEP in self.inputs:
@@ -160,10 +161,10 @@ class GivingInFilter(AbstractSizedFilter):
         return belief, _select_tree(gives_in, rival_innovation, innovation)
 
     def _is_refused_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
-        """Return whether a number has been refused for long enough in a row: often enough, or over enough time.
+        """Return whether some number has been refused often enough in a row, or for long enough.
 
-        `refused`: of each received number, its refusals in a row (m,); `elapsed`: time since the first of them.
-        `after`, `seconds`: limits of the gate's rule, None where it has none.
+        `refused` (m,) counts the refusals in a row of each received number, and `elapsed` is the time since the first.
+        `self.after` and `self.seconds` are the limits of the gate's rule; None means no limit.
         """
         is_long = jnp.zeros((), dtype=bool)
         if self.after is not None:
@@ -200,10 +201,10 @@ class GivingInFilter(AbstractSizedFilter):
         """
 
         def log_density(innovation: Innovation) -> jax.Array:
-            """Return each number's log density under its Gaussian, without the 2 pi term; 0 where it does not count.
+            """Return each number's log density under its Gaussian, without the 2 pi term.
 
-            `counts` (m,): which numbers are compared. Squared innovations over variances are clipped at c, the gate's
-            limit.
+            It is 0 for numbers that are not compared, where `counts` (m,) is False. The squared innovation over its
+            variance is clipped at the gate's limit c.
             """
             variance = jnp.diagonal(jnp.asarray(innovation.covariance))
             variance = jnp.where(counts, variance, 1.0)
@@ -220,7 +221,8 @@ class GivingInFilter(AbstractSizedFilter):
     def remark(self, state: GateAndRival) -> Remark:
         """Say how often the gate has given in, when it last did, and which states moved how far then.
 
-        `given_in`: how often; `step`: number of the last time; `jumps`: by how much each state jumped then.
+        The state counts in `given_in` how often, and holds the step of the last time in `step` and in `moved` by how
+        much each state jumped then.
         """
         count = int(state.given_in)
         if not count:
@@ -233,8 +235,8 @@ class GivingInFilter(AbstractSizedFilter):
 def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
     """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m).
 
-    n states, m received numbers, t their values without noise; `of_state` holds V_i, the variance of t_i by the
-    state's, 0 where t_i does not depend on it.
+    There are n states and m received numbers, with values t without noise. `of_state` (m,) holds V_i, the variance that
+    the state gives to t_i. Where it is 0, t_i does not depend on the state, and the change is 0.
     """
     prior = predicted.prior
     cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
@@ -258,7 +260,7 @@ def _select_tree(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
 
 
 def build_giving_in_filter(base: RobustFilter, rule: Gate) -> GivingInFilter:
-    """Return the gate that gives in as its rule says.
+    """Return the filter with a gate that gives in when its rule says so.
 
     Args:
         base: the gate.

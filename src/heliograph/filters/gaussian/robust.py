@@ -110,7 +110,10 @@ class Gate(AbstractWeightingRule):
     seconds: float | None = eqx.field(static=True)
 
     def __init__(self, c: "Float[ArrayLike, '']" = 9.0, after: int | None = None, seconds: float | None = None):
-        """Keep c, the limit of a squared innovation over its variance, and when the gate gives in (None: never)."""
+        """Keep the limit c of a squared innovation over its variance, and when the gate gives in.
+
+        It gives in `after` that many refusals in a row, or after `seconds` of refusals; if both are None, never.
+        """
         self.c = scalar("limit of the gate", c, low=TINY)
         self.after = None if after is None else check_count("after, of a gate", after)
         self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, low=TINY))
@@ -151,10 +154,11 @@ class StudentVB(AbstractWeightingRule):
     def iterate(
         self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the weights (m,) of the last of `iterations` updates, and those that it would give the next one.
+        """Return the weights (m,) of the last of `iterations` updates, and the weights that follow from it.
 
-        w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i) for nu degrees and noise of variance r_i, from weights of 1. e:
-        innovations; t: the part of e that is the state's. A weight divides the variance of a noise.
+        A weight divides the variance of a noise. The first weights are 1. After each update they are
+        w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i), with nu degrees of freedom and a noise of variance r_i. t is the
+        part of the innovations e that comes from the state's error.
         """
         variance = noise.diagonal
         weights = next_weights = jnp.broadcast_to(jnp.ones_like(variance), e.shape)
@@ -192,10 +196,10 @@ class RobustFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Use what arrived of the measurement, component after component or with weights.
+        """Correct with what arrived of z, by the rule's weights or by the noise's own law.
 
-        `rule`: how weights are given to components; None to use the noise's law itself, a mixture of Gaussian
-        branches. `sensor_mean`: mean of the sensor's signal, on which the law may depend.
+        `self.rule` gives the components weights. If it is None, the noise's law is used, a mixture of Gaussian
+        branches, one component after another. It may depend on `sensor_mean`, the mean of the sensor's signal.
         """
         before, sensor_mean = self.predict_received(state, k)
         z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
@@ -213,7 +217,7 @@ class RobustFilter(AbstractGaussianStateFilter):
         return make_moving_origin_filter(self)
 
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
-        """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""
+        """Return the prediction of z without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         initial_power = second_moments_at_start(self.plant, self)
         signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, initial_power)
@@ -229,16 +233,17 @@ def signal_without_noise(
 ) -> Signal:
     """Return the moments of h(x) and the mean of its noise, without the noise's spread.
 
-    `initial_power`: E[x_i^2] before any data (n,), the size of numbers that rounding acts on.
+    `initial_power` (n,) is E[x_i^2] before any data, the size of the numbers that are rounded.
     """
     no_noise = zero_covariance(len(sensor.outputs))
     return find_signal_moments(plant, sensor, transform, state, initial_power, no_noise)
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
-    """Return t = G y + n behind a channel: mean M E y + b, slopes M times the signal's, noise of gain and channel.
+    """Return the mean, slopes and noise of t = G y + n, what a channel makes of the signal y.
 
-    G, n: gain and noise of the channel, M = E G, b = E n; the noise is that of n and of the spread of G.
+    With M = E G and b = E n the mean is M E y + b, and the slopes are M times those of y. The noise is that of n and
+    that of the spread of G.
     """
     gain = jnp.asarray(channel.mean_gain)
     mean = gain @ signal.mean + channel.offset

@@ -118,10 +118,9 @@ class AbstractWeightingRule(Module):
     def iterate(
         self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the weights of the update, and those to report: the same for a rule that takes one step.
+        """Return the weights of the update, and the weights to report, which are equal for a rule of one step.
 
-        They are functions of the innovations e, of e^2 over its variance, noise included, and of the noise's
-        variance.
+        They are functions of the innovations e, of e^2 over its variance (with noise), and of the noise's variance.
         """
         scale = noise.diagonal
         squared = e**2 / (before.columns.diagonal + scale)
@@ -132,7 +131,7 @@ class AbstractWeightingRule(Module):
 def update_with_weights(
     before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeightingRule
 ) -> ScoreUpdate:
-    """Return one joint update by all of z (m,), its noise r_ij divided by sqrt(w_i w_j) with the weights w of a rule.
+    """Return one joint update by all of z (m,), with the noise covariance r_ij / sqrt(w_i w_j) for a rule's weights w.
 
     Args:
         before: prediction of z without its noise.
@@ -143,7 +142,7 @@ def update_with_weights(
     """
     arrived = ~jnp.isnan(z)
     innovation = jnp.where(arrived, z - before.signal - center, 0.0)
-    # A rule that iterates has weights of its last update, and newer ones that follow from it, which are reported.
+    # A rule that iterates returns the weights of its last update, and newer ones that follow from it, to be reported.
     weights, reported_weights = rule.iterate(before, noise, innovation, arrived)
     after = joint_update(before, innovation, arrived & (weights > SMALLEST), divide_noise_by_weights(noise, weights))
     return ScoreUpdate(
@@ -168,8 +167,8 @@ def expected_squared_residuals(
 ) -> jax.Array:
     """Return E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,).
 
-    e: innovations (m,), of which `present` arrived; t: the part of e that is the state's, e = t + noise; t+ and V+:
-    mean and covariance of t given e.
+    e (m,) are the innovations, and `present` says which arrived. e = t + noise, where t comes from the state's error.
+    t+ and V+ are the mean and covariance of t given e.
     """
     t = from_columns(jnp.zeros_like(e), before.columns)
     after, _ = condition_on_observation(t, t.root, e, noise, present)
@@ -179,11 +178,11 @@ def expected_squared_residuals(
 def expected_branch_precision(
     before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the expected precision sum q_j r / r_j of each component's noise, and the noise's mean by it; (m,) each.
+    """Return each noise's expected precision sum_j q_j r / r_j (m,) and its mean weighted by precision (m,).
 
-    The noise's law is a mixture of Gaussians j (branches) of log shares, means m_j and variances r_j; q_j is the
-    probability of j given the component alone, r a unit (`scale`). The mean is sum q_j m_j / r_j over sum q_j / r_j.
-    `before`: prediction without noise.
+    The noise's law is a mixture of Gaussian branches j, with means m_j, variances r_j and logarithms of shares. q_j is
+    the probability of branch j given the component alone, and r is a unit (`scale`). The mean is
+    (sum_j q_j m_j / r_j) / (sum_j q_j / r_j). `before` is the prediction without noise.
     """
     log_share, mean, variance, branch_variance = law
     total = jnp.maximum(before.columns.diagonal[:, None] + variance, branch_variance)

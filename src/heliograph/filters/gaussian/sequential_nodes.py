@@ -64,11 +64,11 @@ class SequentialFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with each node's measurement in turn; z: those of all nodes, one behind the other."""
+        """Correct with each node's measurement in turn; z holds the measurements of all nodes, one after another."""
         z = jnp.asarray(z)
         if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)
-        # Filters of different structure: one correction each.
+        # Filters of different structure cannot be stacked, so each corrects by itself.
         # ends: index behind each node's last number.
         ends, innovations = np.cumsum([filter.received for filter in self.filters]), []
         for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
@@ -77,7 +77,7 @@ class SequentialFilter(AbstractSizedFilter):
         return state, _join_innovations(innovations)
 
     def _correct_in_one_loop(self, state: Gaussian, z: jax.Array, k: Step) -> tuple[Gaussian, Innovation]:
-        """Correct as `correct` does, for filters of one structure: one correction compiled, run over the nodes."""
+        """Correct as `correct` does, by a loop over nodes whose filters have one structure: it is compiled once."""
         # `arrays`: what differs from node to node, stacked; `rest`: what all filters share.
         arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
@@ -103,9 +103,9 @@ class SequentialFilter(AbstractSizedFilter):
 
 
 def _join_innovations(innovations: Sequence[Innovation]) -> Innovation:
-    """Return one innovation of all nodes' measurements, from each node's given the nodes before it.
+    """Return one innovation of all nodes' measurements, from each node's innovation given the nodes before it.
 
-    The log likelihoods add up. Between nodes the covariance is 0, since each innovation is given the nodes before.
+    The log likelihoods add up. The covariance between nodes is 0, since each innovation is given the nodes before it.
     """
     covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in innovations))
     total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in innovations]))

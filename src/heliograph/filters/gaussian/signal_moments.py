@@ -100,10 +100,10 @@ def find_signal_moments(
 
 
 def bound_signal_power_at_start(sensor: LinearSensor, initial_power: jax.Array) -> jax.Array:
-    """Return (|H| root E[x_i^2] + |E v|)^2 + Var v of the p outputs y = H x + v at the start: it bounds E[y_i^2].
+    """Return a bound of E[y_i^2] (p,) at the start, for y = H x + v: (|H| sqrt(E[x_i^2]) + |E v|)^2 + Var v.
 
-    `initial_power` (n,): E[x_i^2] before any data, since moments before data at later steps may grow without end. The
-    noise counts without its outliers: Student's law of at most two degrees has no variance.
+    `initial_power` (n,) is E[x_i^2] at the start, since at later steps the moments without data may grow for ever. The
+    noise counts without its outliers, since Student's law of at most two degrees of freedom has no variance.
     """
     law = sensor.noise
     bound = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(initial_power) + lax.abs(
@@ -124,9 +124,10 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
-    """Return the columns of Cov(M (noise of y) + (G - M) y + n), of z = G y + n with the mean gain M.
+    """Return the columns of Cov(M v + (G - M) y + n), the noise of z = G y + n behind the mean gain M.
 
-    `gain_spread`: Cov G; `link`: columns of Cov n; `signal.size` bounds E[y_i^2], for rounding.
+    v is the noise of the signal y. `gain_spread` is Cov G, and `link` holds columns of Cov n. `signal.size` bounds
+    E[y_i^2], which gives the rounding of M y.
     """
     rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
     without_gain_noise = keep_for_derivatives(
@@ -161,7 +162,8 @@ def condition_on_measurement(
 ) -> tuple[Gaussian, Innovation]:
     """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive.
 
-    `angles`: the components of z that are angles. The covariance of the innovation is NaN beside a missing number.
+    `angles` are the components of z that are angles. The innovation's covariance is NaN in the rows and columns of
+    missing components.
     """
     present = ~jnp.isnan(z)
     z = wrap_near(z, expected, angles)
@@ -184,7 +186,7 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
 
 
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
-    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y]; its last entry is `last`: 1, or 0 to leave the constant out."""
+    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` as its last entry, which is 1 or is set to 0."""
     top = jnp.concatenate([second, mean[:, None]], axis=1)
     bottom = jnp.concatenate([mean, jnp.full(1, last, mean.dtype)])
     return jnp.concatenate([top, bottom[None]])

@@ -49,7 +49,7 @@ class Scalars(Module):
 
 
 def scalars_as_array(scalars: Scalars | None) -> np.ndarray:
-    """Return the two scalars of the bound as numbers; NaN for None, where the trace is to be minimised over them."""
+    """Return the two scalars of the bound; NaN for None, which means that the bound's trace is minimised over them."""
     if scalars is None:
         return np.full(2, np.nan)
     return instance("scalars", scalars, Scalars, "Scalars").values
@@ -130,10 +130,10 @@ def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: Arrive
 def _find_received_slopes_and_covariances(
     signal: Signal, channel: SecondOrder, present: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return M H (m, n), and M H D H' M' and M R M' (m, m): slopes and two parts of the covariance of M y.
+    """Return the slopes M H (m, n) of M y, and the two parts M H D H' M' and M R M' (m, m) of its covariance.
 
-    The signal is y = H xi + v, xi uncorrelated of variances D (`prior.variances`), Cov v = R; n states, m received
-    numbers. M: the channel's mean gain, with rows of zeros for what did not arrive.
+    The signal is y = H xi + v, with uncorrelated xi of variances D (`prior.variances`) and Cov v = R. There are n
+    states and m received numbers. M is the channel's mean gain, with rows of zeros for what did not arrive.
     """
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes
@@ -148,10 +148,10 @@ def unit_variance_where_absent(present: jax.Array) -> jax.Array:
 
 
 def mask_received(channel: SecondOrder, present: jax.Array) -> jax.Array:
-    """Return the mask (p,) of the signal's components that act on what arrived; the others count as never measured.
+    """Return the mask (p,) of the signal's components that act on what arrived.
 
-    `channel.power` maps E[y y'] to the received power, center and radius: its entry [i, i, a, a] is what y_a adds to
-    z_i.
+    The other components count as not measured. `channel.power` maps E[y y'] to the received power, with a center and a
+    radius (m, m, p+1, p+1). y_a acts on z_i if its entry [i, i, a, a] is not 0.
     """
     m, p = channel.mean_gain.shape[:2]
     contributes = (channel.power.center != 0) | (channel.power.radius != 0)

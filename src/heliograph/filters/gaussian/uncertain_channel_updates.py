@@ -70,10 +70,10 @@ class AbstractUpdate(Module):
             raise unwritten(self, "correct")
 
         def update(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
-            """Return the mean after an update with this innovation, whose derivative is the gain, and the posterior.
+            """Return the mean after an update with this innovation, and the posterior.
 
-            `present`: which components arrived; `signal`, `channel`: moments of the signal, and the channel's uncertain
-            ones.
+            The derivative of the mean by the innovation is the gain. `present` says which components arrived. `signal`
+            and `channel` hold the moments of the signal, and the uncertain moments of the channel.
             """
             z = ArrivedInnovation(innovation, present)
             after = self.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
@@ -83,16 +83,16 @@ class AbstractUpdate(Module):
         return gain, jnp.asarray(after.covariance)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
-        """Condition `signal.prior` on z - E z; by default from `correct`.
+        """Condition `signal.prior` on z - E z, with the gain and the covariance bound of `correct`.
 
         Args:
             signal: moments of the sensor's signal.
             channel: what `describe` returned.
             z: z - E z, and what of it arrived.
-            nominal: the prior conditioned behind the nominal law, the best update of a law that is known.
+            nominal: the prior conditioned by the nominal law, the best update if that law is known to be true.
         """
         prior = signal.prior
-        # `bound`: covariance of the error that this gain leaves, at most.
+        # `bound` is an upper bound of the error's covariance with this gain.
         gain, bound = self.correct(prior.covariance, signal, channel, z.present)
         mean = prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0)
         after = from_covariance(mean, bound)
@@ -160,7 +160,7 @@ class ZeroMean(AbstractUpdate):
     scalar: np.ndarray
 
     def __init__(self, scalar: float | None = None):
-        """Keep the positive scalar of the bound; NaN for None, where the trace is to be minimised over it."""
+        """Keep the positive scalar of the bound; NaN for None, which means that the trace is minimised over it."""
         self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
@@ -193,7 +193,7 @@ class Interval(AbstractUpdate):
         self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Return moments of the chain's gain, in the worst case of each hop's interval.
+        """Return moments of the chain's gain in the worst case over the interval of each hop.
 
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
@@ -279,13 +279,11 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
     gain = amplitude * float(np.prod([hop.mean for hop in hops])) * np.eye(len(noise))
 
     def make_map(value: float, constant: np.ndarray) -> QuadraticMap:
-        """Return the map Y -> amplitude^2 value E[y y'] + constant of Y = E[(y, 1)(y, 1)'], of one gain for all of y.
+        """Return the map Y -> amplitude^2 value E[y y'] + constant, for Y = E[(y, 1)(y, 1)'] and one gain for all of y.
 
-        As a tensor [i, j, a, b] its result is sum_ab center[i, j, a, b] Y[a, b]; the constant multiplies Y's last
-        corner, which is 1.
-
-        `amplitude`: product of the hops' fixed factors; `value`: a second moment of the gain; `noise`: of the result's
-        size.
+        The map is a tensor: its result is sum_ab center[i, j, a, b] Y[a, b]. The constant multiplies Y's last entry,
+        which is 1. `amplitude` is the product of the hops' fixed factors, and `value` a second moment of the gain. y
+        has as many components as `noise` has rows.
         """
         center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
         center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))

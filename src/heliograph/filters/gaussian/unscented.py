@@ -56,9 +56,10 @@ class Unscented(AbstractTransform):
         self.kappa = scalar("kappa", kappa)
 
     def check(self, n: int) -> None:
-        """Raise ValueError where there are no such points of n states, or their covariance may be indefinite.
+        """Raise ValueError if n states have no such sigma points, or if a covariance by them may be indefinite.
 
-        alpha, beta, kappa: parameters of the sigma points. ROUNDING: by how much a condition may fail, 1e-12.
+        The sigma points have the parameters alpha, beta and kappa. They exist if n + kappa > 0. No covariance is
+        indefinite if alpha^2 kappa + beta n >= 0, which may fail by the rounding ROUNDING, 1e-12.
         """
         if is_traced(self.alpha, self.beta, self.kappa):
             return

@@ -43,7 +43,7 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     free = jnp.isnan(given)
 
     def move(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-        """Return t, the scalars' logarithms, after a Newton step for f(t) = t in the free ones; `refined`: f(t)."""
+        """Return the scalars' logarithms t after a Newton step for f(t) = t in the free scalars; `refined` is f(t)."""
         zero_if_given = [
             [jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in zip(free, slopes, strict=True)
         ]
@@ -52,17 +52,18 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         """Return whether a free scalar still moves, and sweeps are left.
 
-        `carry`: logarithms t of the scalars, those before, and sweeps done. `free`: which scalars are searched;
-        SWEEPS: the most sweeps. A change up to CONVERGED, or up to the rounding of t in a loop, counts as none.
+        `carry` holds the scalars' logarithms t, the t before, and the number of sweeps done, which is at most SWEEPS.
+        `free` is True for the scalars that are searched. A change up to CONVERGED, or up to the rounding of t in a
+        loop, counts as none.
         """
         t, previous, sweeps = carry
         smallest_move = rounding(CONVERGED, t, LOOP)
         return (sweeps < SWEEPS) & jnp.any(free & (jnp.abs(t - previous) > smallest_move))
 
     def iterate(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the next t = log beta, the one before it, and the number of sweeps.
+        """Return the next logarithms t of the scalars, the present t, and the number of sweeps done.
 
-        `sweep` returns f(t) and its slopes. The first sweep takes f(t) itself, the later ones Newton's step.
+        `sweep` returns f(t) and its slopes. The first sweep takes f(t) itself, and the later ones Newton's step.
         """
         t, _, sweeps = carry
         refined, slopes = sweep(t, *fixed)
@@ -77,9 +78,9 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
 
 
 def newton_step(t: jax.Array, f_of_t: jax.Array, slopes: Slopes) -> jax.Array:
-    """Return t + (I - J)^-1 (f(t) - t), Newton's step for f(t) = t in one or two components; f(t) where it is too long.
+    """Return t + (I - J)^-1 (f(t) - t), Newton's step for f(t) = t in one or two components.
 
-    `slopes`: J, the derivatives of f. LONGEST: the longest step that is trusted, 5.
+    `slopes` are J, the derivatives of f. If the step is longer than LONGEST, 5, in a component, f(t) is returned.
     """
     residual = f_of_t - t
     if len(residual) == 1:
@@ -133,10 +134,9 @@ def zero_mean_fixed_point_map(
 ) -> tuple[jax.Array, Slopes]:
     """Return the next t = log beta, and its slope, in the search of the beta that minimises the bound's trace.
 
-    The trace is tr P - tr(Omega^-1 C' C) + beta e, Omega = base + S / beta, S = shift, e = trace_explained. It is
-    stationary where beta^2 e = tr(W S), W = Omega^-1 C' C Omega^-1: the next beta is sqrt(tr(W S) / e).
-
-    beta is the free scalar of Young's inequality, in a bound of the covariance P after an update.
+    beta is the free scalar of Young's inequality, in a bound of the covariance P after an update. The bound's trace is
+    tr P - tr(Omega^-1 C' C) + beta e, with Omega = base + S / beta, S = shift and e = trace_explained. It is stationary
+    where beta^2 e = tr(W S) with W = Omega^-1 C' C Omega^-1. So the next beta is sqrt(tr(W S) / e).
 
     Args:
         t: log beta (1,).
@@ -160,9 +160,9 @@ def zero_mean_fixed_point_map(
 def _trace_weight(
     omega: jax.Array, cross_square: jax.Array, matrices: Sequence[jax.Array]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Return W = Omega^-1 C' C Omega^-1, C' C = cross_square, and Omega^-1 X of each of the others, all (m, m).
+    """Return W = Omega^-1 C' C Omega^-1 with C' C = cross_square, and Omega^-1 X for each X of `matrices`.
 
-    Omega: a covariance of what is received; the others X are solved with it in the same call.
+    Omega is a covariance of what is received. All matrices are (m, m), and are solved in one call.
     """
     solve = solver(omega)
     solved = solve(jnp.concatenate([cross_square, *matrices], axis=1))
@@ -175,11 +175,10 @@ def _half_log_ratio(
 ) -> tuple[jax.Array, list[jax.Array]]:
     """Return v = max(log(top / bottom) / 2, log SMALLEST_SCALAR), and its derivative by each variable.
 
-    The derivatives are (top' / top - bottom' / bottom) / 2, from those of both; None in `by_bottom` where bottom does
-    not depend on the variable. Where top or bottom is zero v is the limit, and at the limit the derivatives are 0. No
-    quotient or root of zero is taken, so that second derivatives exist.
-
-    SMALLEST_SCALAR: the least scalar, 1e-12.
+    The derivative is (top' / top - bottom' / bottom) / 2, with top' from `by_top` and bottom' from `by_bottom`. None in
+    `by_bottom` means that bottom does not depend on the variable. If top or bottom is zero, v is log SMALLEST_SCALAR
+    (1e-12), and wherever v is that limit the derivatives are 0. Zeros are replaced by 1 before the quotients, so that
+    second derivatives exist.
     """
     is_positive = (top > 0) & (bottom > 0)
     top, bottom = jnp.where(is_positive, top, 1.0), jnp.where(is_positive, bottom, 1.0)

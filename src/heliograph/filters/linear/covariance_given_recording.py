@@ -72,8 +72,8 @@ class LinearFilterOfRecord(AbstractSizedFilter):
         def correct_mean(mean: jax.Array, value: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the corrected mean and the innovation (0 for what is missing), from the predicted mean and z.
 
-            `state.own`: the filter's state, whose covariance and gain depend on no data, so that both are affine in the
-            arguments.
+            `state.own` is the filter's own state. Its covariance and gain depend on no data, so that the mean and the
+            innovation are affine in both arguments.
             """
             gaussian = state.own.gaussian._replace(mean=mean)
             after, innovation = self.filter.correct(state.own._replace(gaussian=gaussian), value, k)

@@ -74,7 +74,7 @@ class ScoreRecursion(Recursion):
         def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
             """Step over one row: add its information, and put out its log-density and score.
 
-            `now`: the estimate with its derivatives, and the information summed so far, of both halves of the
+            `now` holds the estimate with its derivatives, and the information summed so far, for each half of the
             recording.
             """
             estimate, information = now
@@ -87,9 +87,10 @@ class ScoreRecursion(Recursion):
         return density, score, halves
 
     def sum_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return the sums over all rows of a long recording, by chunks; None where it cannot be divided into these.
+        """Return the sums over all rows of a long recording, computed in chunks of rows.
 
-        `self._start()`: the estimate before the first row, with its derivatives.
+        Returns None if the recording is short or cannot be divided into chunks. `self._start()` is the estimate before
+        the first row, with its derivatives.
         """
         if not is_long(len(z)):
             return None
@@ -100,11 +101,11 @@ class ScoreRecursion(Recursion):
         return summed
 
     def scan_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return what `scan` does of a long recording, by chunks; None where it cannot be divided into these."""
+        """Return what `scan` returns, computed in chunks of rows; None where `sum_long` returns None."""
         sums = self.sum_long(z, u)
         if sums is None:
             return None
-        # Rows are passed again, for log-densities and scores row by row: information is a sum already.
+        # A second pass gives log-densities and scores row by row. It leaves out information, which is summed already.
         rows = scan_in_chunks(replace(self, informed=False), self._start(), (z, u))
         *_, information = sums
         return None if rows is None else (*rows.outputs, information)

@@ -103,8 +103,8 @@ class LinearFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of x+ = A x + b + w by the Rauch-Tung-Striebel recursion.
 
-        It is the best linear one: w is white and independent of gains and past draws. `slopes_and_noise`: slopes of A
-        x in the factors of x, and factors of w.
+        It is the best linear smoother, since w is white and independent of gains and past draws. `slopes_and_noise`
+        holds the slopes of A x in the factors of x, and factors of Cov w.
         """
         motion = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
         slopes_and_noise = motion.matrix @ step.before.gaussian.root, motion.noise
@@ -130,12 +130,12 @@ class LinearFilter(AbstractSizedFilter):
     def score_rows(
         self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array
     ) -> "ScoreRecursion":
-        """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
+        """Return the recursion that gives the log-likelihood of rows, its derivatives by free numbers and information.
 
         Args:
-            make: the filter by the free numbers, one that `has_score_recursion`.
-            x: the free numbers.
-            half: number of the first row of the second half of the recording, of which information is summed apart.
+            make: makes a filter from the free numbers; it `has_score_recursion`.
+            x: values (p,) of the free numbers.
+            half: number of the row at which the recording's second half begins. Information is summed by halves.
 
         Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
         """
@@ -164,7 +164,10 @@ class LinearFilter(AbstractSizedFilter):
         return plan_filter(self, inputs)
 
     def given_record(self) -> AbstractFilter:
-        """Return the same filter with covariances given its data where gains are random: else they are its own."""
+        """Return a filter with the same estimates, whose covariances are those given its data.
+
+        Where no gain is random, they are the filter's own covariances, and the filter itself is returned.
+        """
         if self.premise is None or self.premise.channel is None or first(self.premise.channel).has_known_gain:
             return self  # no gain is random
         from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
@@ -175,8 +178,8 @@ class LinearFilter(AbstractSizedFilter):
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, initial_power: jax.Array) -> Signal:
     """Return the moments of y = C x + v before any data, E y and E[y y'], with the slopes of the estimate's error.
 
-    They depend on the error covariance and the state's moments before data alone, not on the estimate: derivatives by
-    the estimate do not involve them. `initial_power`: E[x_i^2] at the start, the size of numbers that rounding acts on.
+    They depend on the error covariance and on the state's moments before data, but not on the estimate. So derivatives
+    by the estimate leave them out. `initial_power` is E[x_i^2] at the start, the size of the numbers that are rounded.
     """
     y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
@@ -199,10 +202,8 @@ def correct_linear(
 ) -> tuple[LinearBelief, Innovation]:
     """Return the estimate corrected with the components of z (m,) that arrived, and the innovation.
 
-    What is expected of z is by the estimate; gain and covariance are by the moments before any data.
-
-    `rule`: how uncertain probabilities of the channel are bounded; `initial_power`: E[x_i^2] before data, for
-    rounding.
+    The estimate gives the expected value of z. The moments before any data give the gain and the covariance. `rule`
+    says how uncertain probabilities of the channel are bounded. `initial_power` is E[x_i^2] before data, for rounding.
     """
     before_data = signal_before_data(state, sensor, initial_power)
     expected_y = jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean)
@@ -291,8 +292,8 @@ def linear_filter(
 def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
     """Return the filter that estimates the modes of links, plant and sensor jointly with the state.
 
-    By kind of channel: modes of plant or sensor, losses that reveal the mode, an uncertain chain, a sum of independent
-    links, or any other.
+    There is a filter for each case, tested in this order: plant or sensor has modes, losses reveal the channel's mode,
+    the chain is uncertain, the channel is a sum of independent links, or none of these.
     """
     if is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor)):
         return _make_jump_system_filter(plant, sensor, channel)
@@ -309,7 +310,7 @@ def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Chan
 
 
 def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
-    """Return the filter of a plant or sensor that has modes; raise behind links that lose or have uncertain laws."""
+    """Return the filter of a plant or sensor that has modes; refuse a link that loses or has an uncertain chain."""
     if first(channel).erases:
         expected = "a link without losses where plant or sensor has modes (a row that is lost is NaN; imm_filter else)"
         raise fail("channel of a linear filter", expected, "an erasure")
@@ -345,9 +346,10 @@ def memoryless_filter(
     forgets, matters = without_memory(channel), memory_matters(channel)
 
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
-        """Return the filter of a channel without memory; its claim is "nominal" where delay or memory was ignored.
+        """Return the filter of a channel without memory.
 
-        `matters`: whether it was; `update`: how uncertain probabilities are bounded.
+        Its claim is "nominal" if a delay or memory that matters was ignored (`matters`). `update` says how uncertain
+        probabilities are bounded.
         """
         ignoring = linear_filter(plant, sensor, channel, update)
         assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
@@ -369,7 +371,7 @@ def as_current_filter(
         channel: from the sensor to the filter; its delays and memory are ignored.
         update: how uncertain probabilities are bounded; `Polytope()` by default.
 
-    Claim: "nominal" where anything can be late or memory matters; `true_error` computes the error that results, before
+    Claim: "nominal" where anything can be late or memory matters. `true_error` computes the error that results before
     any data.
 
     Raises:

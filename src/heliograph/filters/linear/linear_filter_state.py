@@ -32,7 +32,7 @@ class PlantMotion(NamedTuple):
 def motion_of_plant(plant: LinearPlant, u: jax.Array, initial_power: jax.Array) -> PlantMotion:
     """Return the plant's motion under the input u; `initial_power` is E[x_i^2] before the first step, (n,).
 
-    x+ = matrix x + shift + w; `covariance`, `noise`: Cov w, and its factors with rounding.
+    It is x+ = matrix x + shift + w. `covariance` is Cov w, and `noise` holds its factors, with rounding added.
     """
     return PlantMotion(
         matrix=plant.transition_matrix(u),
@@ -63,7 +63,7 @@ class SignalMoments(NamedTuple):
 
 
 def prior_belief(start: AbstractPlant) -> LinearBelief:
-    """Return the prior, both as estimate and as the state's moments before data."""
+    """Return the prior law of x_0 twice: as the estimate, and as the state's moments before data."""
     xp = library(start.initial_mean, start.initial_covariance)
     mean, covariance = xp.asarray(start.initial_mean), xp.asarray(start.initial_covariance)
     estimate = from_covariance(start.initial_mean, start.initial_covariance)
@@ -92,7 +92,7 @@ class MomentsBeforeData(NamedTuple):
     def measure(self, sensor: LinearSensor) -> SignalMoments:
         """Return the moments of the signal y = C x + v: its mean, E[y y'] and the columns of Cov v.
 
-        The law of v may depend on the signal's mean and variances; `state_part`: C Cov(x) C'.
+        The law of v may depend on the signal's mean and variances. `state_part` is C Cov(x) C'.
         """
         matrix, law = jnp.asarray(sensor.matrix), sensor.noise
         mean = matrix @ self.mean + law.mean
@@ -105,12 +105,12 @@ class MomentsBeforeData(NamedTuple):
 def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
-    Second moments are limited by `largest`, the root of the largest number, means by its root. Behind a known gain
-    nothing depends on them.
+    Covariances are limited to `largest`, the root of the largest number, and means to the root of `largest`. Behind a
+    known gain nothing depends on these moments.
     """
     largest = float(np.finfo(covariance.dtype).max) ** 0.5
-    # The mean of a plant that damps decays for ever, to numbers with which processors compute ten times as long. Added
-    # and taken off again, c leaves no smaller one than eps c, 8e-140; those above c / eps, 2e-108, it does not change.
+    # The mean of a damped plant decays to subnormal numbers, with which processors are ten times slower. Adding and
+    # subtracting c rounds numbers to multiples of eps c (8e-140), and does not change those above c / eps (2e-108).
     c = float(np.finfo(covariance.dtype).tiny) ** 0.4
     return _clip_to((mean + c) - c, largest**0.5), _clip_to(covariance, largest)
 

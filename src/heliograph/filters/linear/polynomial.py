@@ -115,7 +115,7 @@ class PolynomialFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the lifted system, about the mean.
 
-        The state is of all monomials, with the estimate in a part; `shift` adds the mean that was subtracted.
+        The lifted state holds all monomials, and the estimate is a part of it. `shift` adds the subtracted mean again.
         """
         z = _subtract_mean(self.centre, step.z, step.prior.mean, step.k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
@@ -132,7 +132,7 @@ class PolynomialFilter(AbstractSizedFilter):
 
 
 def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
-    """Return E[x_0] (n,) of the unconditional mean `centre` that the filter subtracts; zeros where there is none."""
+    """Return E[x_0] (n,), where the unconditional mean `centre` begins; zeros if `centre` is None."""
     start = np.zeros(n) if centre is None else centre.start
     mean: jax.Array = library(start).asarray(start)
     return mean
@@ -141,7 +141,7 @@ def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
 def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Array:
     """Return E[x+] = A E[x] + b over step k.
 
-    `centre`: the plant about its unconditional mean; None where no mean is subtracted, and it stays as it is.
+    `centre` has A and b of each step. If it is None, no mean is subtracted, and `mean` is returned as it is.
     """
     if centre is None:
         return mean
@@ -161,10 +161,7 @@ def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
 
 
 def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
-    """Return the innovation of z itself, out of that of its monomials.
-
-    `degree`: of all monomials of (z, 1).
-    """
+    """Return the innovation of z itself, selected from the innovation of all monomials of (z, 1) of this degree."""
     # z_i is the monomial of exponent 1 in z_i and degree - 1 in the constant, the last factor.
     m, position_of = len(z), position(len(z) + 1, degree)
     exponents = [(*row, degree - 1) for row in np.eye(m, dtype=int).tolist()]
@@ -178,10 +175,9 @@ def polynomial_filter(
 ) -> PolynomialFilter:
     """Return the best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
 
-    For linear plants and sensors behind any channel, with noises of any law whose moments up to 2 degree exist. It
-    estimates the whole state, a dynamical bias included, and its covariance is recomputed where z has gaps. For many
-    complete runs `scheduled_polynomial_filter` does the same with saved gains. Behind a known gain all moments are
-    about the mean.
+    It takes linear plants and sensors behind any channel, and noises of any law with moments up to order 2 degree. It
+    estimates the whole state with a dynamical bias, and recomputes its covariance where z has gaps. For many complete
+    runs `scheduled_polynomial_filter` does the same with saved gains. Behind a known gain moments are about the mean.
 
     Args:
         plant: a linear plant without inputs, n states.
@@ -191,9 +187,9 @@ def polynomial_filter(
             reached a steady state by then.
         degree: of the polynomial in z_k; 2 by default.
 
-    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are used), where noise is known by
-    bounds ("upper" at degree 1), or where rounding is more than 1e-6 of a claimed variance, with a warning: behind a
-    random gain, far from zero.
+    Claim: "exact" where all laws are known. "nominal" where probabilities are uncertain (the nominal ones are used), or
+    where noise is known by bounds (at degree 1: "upper"). "nominal" too, with a warning, where rounding is more than
+    1e-6 of a claimed variance, as for states far from zero behind a random gain.
 
     Raises:
         ValueError: parts that do not fit, a plant with inputs, a lift of more than the stated memory.
@@ -212,7 +208,7 @@ def _lift_about_mean(
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
     """Lift the model to monomials up to `degree`, about its mean where the gain is known.
 
-    Return the unconditional mean that is subtracted, None behind a random gain, and the lifted system.
+    Return the unconditional mean that is subtracted, or None behind a random gain, and the lifted system.
     """
     check_model(plant, sensor, channel)
     centre = find_unconditional_mean(plant, sensor, channel)
@@ -221,9 +217,9 @@ def _lift_about_mean(
 
 
 def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
-    """Test whether the matrices of a time-invariant model have reached a steady state, to rounding.
+    """Return whether the matrices of a time-invariant model have reached a steady state, up to rounding.
 
-    `steps`: the matrices along time, of which the last two are compared.
+    The last two steps of each matrix in `system.steps` are compared. A model that varies over time is never steady.
     """
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
@@ -240,7 +236,7 @@ def scheduled_polynomial_filter(
         sensor: a linear sensor, m outputs.
         channel: from the sensor to the filter.
         horizon: number of steps.
-        degree: of the polynomial in z_k; 2 by default.
+        degree: degree of the polynomial in z_k; 2 by default.
 
     Claim: as `polynomial_filter`.
 
@@ -277,7 +273,10 @@ class MemoryFilter(AbstractSizedFilter):
     def __init__(
         self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: UnconditionalMean | None = None
     ):
-        """Join the linear filter and that of its products with z; `centre`: the mean that is subtracted, or None."""
+        """Join the linear filter and the filter of its products with z.
+
+        `centre` is the unconditional mean that is subtracted, or None if none is.
+        """
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
         self.kept = products.kept
@@ -295,9 +294,9 @@ class MemoryFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
-        """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other.
+        """Correct the linear filter with z, and then the filter `products` with (z, z z', z times the linear estimate).
 
-        `products`: the filter of all products. The innovation returned is that of z alone.
+        The returned innovation is that of z alone.
         """
         z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
@@ -346,14 +345,14 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
 def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:
     """Return "exact" if all laws are known, "nominal" if some probability is uncertain.
 
-    Where noise is known by a bound of its covariance alone, "upper" at degree 1, and "nominal" beyond, since no higher
-    moment has a bound.
+    Where a noise is known only by a bound of its covariance, the claim is "upper" at degree 1. At a higher degree it is
+    "nominal", since higher moments have no bound.
     """
     if degree > 1 and has_bounded_noise(plant, sensor, channel):
         return "nominal"
     if first(channel).remembers:
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     else:
-        # The extreme laws of uncertain probabilities: only one if all are known.
+        # `corner_count` is the number of extreme laws of uncertain probabilities, 1 if all probabilities are known.
         claim = "exact" if all(step.corner_count() == 1 for step in unstack(channel)) else "nominal"
     return lower_claim_by_noise(claim, plant, sensor, channel)

@@ -93,10 +93,9 @@ class PlannedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
-        """Return m + K (z - C m - c).
+        """Return the mean m + K (z - C m - c), with the recorded gain K, output C and offset c of step k.
 
-        m: mean; K, C, c: gain, output and offset of step k, as recorded. The stage counts predictions and corrections:
-        2 k + 2 after this.
+        The stage counts predictions and corrections, and is 2 k + 2 after this one.
         """
         step: LinearStep = at(self.steps, k)
         z, expected = jnp.asarray(z), step.expect(state.mean)
@@ -116,7 +115,7 @@ class PlannedFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the planned smoother step with the means of these data.
 
-        `past`: the planned smoother steps, None where none were planned.
+        `self.past` holds the planned smoother steps, or is None if none were planned.
         """
         if self.past is None:
             return super().smoother_step(step)
@@ -142,12 +141,11 @@ def _convert_stage(state: PlannedMean, stage: Step) -> jax.Array:
 def plan_filter(
     filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
-    """Return a filter with its matrices recorded for these inputs and complete data.
+    """Return the filter with its matrices of each step recorded, for these inputs and complete data.
 
-    Its state is a Gaussian, or holds one. Only the mean may depend on data, and affinely: then F, K and C are
-    derivatives, the same at every mean. `projection` (n, N) maps the filter's mean to the plant's states.
-
-    F, K, C: matrices of prediction, gain and output of each step.
+    The filter's state is a Gaussian, or holds one. Only its mean may depend on data, and only affinely. So the matrices
+    F (prediction), K (gain) and C (output) are derivatives that are the same at every mean. `projection` (n, N) maps
+    the filter's mean to the plant's states.
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
     if is_traced(arguments):
@@ -168,10 +166,10 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
     zeros = jnp.zeros(filter.received)
 
     def record_step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
-        """Step the filter; the output is the step's matrices, and the covariances before and after correction.
+        """Step the filter; return its state, and the step's matrices with the covariances before and after correction.
 
-        `zeros`: a complete measurement, since matrices depend on no value; `projection`: from the filter's mean to the
-        plant's states.
+        The measurement is `zeros`, since the matrices depend on no value of it. `projection` maps the filter's mean to
+        the plant's states.
         """
         k, u = row
         step, prior, after = record_step_matrices(filter, state, zeros, u, k)
@@ -238,7 +236,10 @@ def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
 def _correction_slopes(
     filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
-    """Return derivatives of the corrected mean, and of the innovation, each by (prior mean, z), and both themselves."""
+    """Return the derivatives of the corrected mean and of the innovation, and the corrected state and the innovation.
+
+    Each derivative is a pair: by the prior mean, and by z.
+    """
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
         """Return corrected mean and innovation, and the objects that hold them."""
@@ -250,9 +251,10 @@ def _correction_slopes(
 
 
 def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearStep:
-    """Return the matrices of one step of a filter of which only the mean depends on data; z says what arrived.
+    """Return the matrices of one step of a filter in which only the mean depends on data.
 
-    Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
+    z matters only by what arrived. A component that did not arrive has zeros in its column of the gain and in its rows
+    of output and offset.
     """
     if isinstance(filter, PlannedFilter):
         recorded: LinearStep = at(filter.steps, k)

@@ -70,7 +70,7 @@ class ScheduledFilter(AbstractSizedFilter):
         gains = schedule.gains
         self.gains = OverTime(_gains_for_expected_measurement(gains))
         self.unused = np.all(gains.gain == 0, axis=1) & np.all(gains.direct == 0, axis=1)
-        # Before and after each correction, one after the other; NaN at the start, where none is claimed.
+        # NaN before the first step, where no covariance is claimed; then those before and after each correction.
         covariances = np.stack([gains.predicted, gains.covariance], axis=1).reshape(-1, *gains.covariance.shape[1:])
         self.covariances = np.concatenate([np.full_like(covariances[:1], np.nan), covariances])
         self.start, self.claim = schedule.start, schedule.claim
@@ -81,8 +81,8 @@ class ScheduledFilter(AbstractSizedFilter):
     def init(self) -> ScheduleState:
         """Return the schedule's initial state.
 
-        Nothing is estimated or expected yet (NaN); `complete`: no number was missing; `stage`: predictions and
-        corrections made.
+        Estimate and expected measurement are NaN before the first step. `complete` says that no number was missing so
+        far. `stage` counts the predictions and corrections made.
         """
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
         return ScheduleState(
@@ -97,8 +97,8 @@ class ScheduledFilter(AbstractSizedFilter):
     def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
         """Predict as if the expected measurement arrived.
 
-        s: state of the recursion of the saved gains; `complete`: no number was missing; `stage`: predictions and
-        corrections made.
+        `state.value` is the state s of the recursion with the saved gains. `complete` says that no number was missing
+        so far. `stage` counts the predictions and corrections made.
         """
         gains: Gains = at(self.gains, k)
         s = state.value
@@ -147,10 +147,10 @@ class ScheduledFilter(AbstractSizedFilter):
 
 
 def _gains_for_expected_measurement(gains: Gains) -> Gains:
-    """Return the gains of a step without data, z being replaced by what is expected of it, e = G s + g.
+    """Return the gains of steps without data, in which z is replaced by its expected value G s + g.
 
-    The saved recursion of s is s+ = F s + K z + c, with the estimate L s + J z + d: of s alone it has F + K G, c + K
-    g, L + J G and d + J g.
+    The saved recursion is s+ = F s + K z + c, with the estimate L s + J z + d. Without z it becomes
+    s+ = (F + K G) s + (c + K g), with the estimate (L + J G) s + (d + J g).
     """
     return gains._replace(
         transition=gains.transition + gains.gain @ gains.expected,
@@ -202,7 +202,7 @@ class LinearSystemFilter(AbstractSizedFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the components of z that arrived.
 
-        z = output x + offset + noise; `slopes` of z are in the factors of x.
+        z = output x + offset + noise. `slopes` are those of z in xi, for x = mean + root xi.
         """
         step: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
@@ -235,10 +235,10 @@ class SystemNoises(NamedTuple):
 
 @in_float64
 def _factor_noises(system: LinearSystem) -> SystemNoises:
-    """Return the factors of both noises at each step, with the rounding of numbers as large as the system makes them.
+    """Return the factors of both noises at each step, with the rounding of the state and of what is received.
 
-    Without the noise's own rounding, a combination of measurements that repeats another would seem to measure the
-    state without noise, by what rounding left of their difference.
+    Measurements may repeat each other, and their difference is then only rounding. Without the rounding as a noise,
+    this difference would seem to measure the state without noise.
     """
     steps = system.steps
     state_moments, received_moments = _second_moments_of_steps(system)
@@ -256,7 +256,7 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
 def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, rounding_errors: Array) -> WeightedColumns:
     """Return the factors of each step's noise, joined with the rounding of numbers of these second moments.
 
-    `rounding_errors`: of the noise's own variances. Shapes: noise (steps, n, columns), the others (steps, n).
+    `rounding_errors` are those of the noise's variances. Shapes: noise (steps, n, columns), the others (steps, n).
     """
 
     def factor_step(noise: WeightedColumns, second_moments: jax.Array, rounding_errors: jax.Array) -> WeightedColumns:

@@ -178,11 +178,15 @@ def _take_derivatives_of_correction(
 
 @_take_derivatives_of_correction.defjvp
 def _differentiate_correction(primals: Any, tangents: Any) -> tuple[StateMoments, StateMoments]:
-    """Return the corrected moments, and m-' + K e' + (C' - K S') w and P-' - C' K' - K C'' + K S' K'."""
+    """Return the corrected moments, and their derivatives along the tangents dC, de, dS and those of the prior.
+
+    With w = S^-1 e and the gain K = C S^-1 they are dm = dm- + K de + (dC - K dS) w for the mean, and
+    dP = dP- - dC K' - K dC' + K dS K' for the covariance.
+    """
     (C, e, S), (prior, (dC, de, dS), _) = primals[1], tangents
     solved = psd_solve(S, jnp.concatenate([e[:, None], C.T], axis=1))
     w, K = solved[:, 0], solved[:, 1:].T
-    # C' K' + K C'' - K S' K' = (C' - K S' / 2) K' and its transpose.
+    # dC K' + K dC' - K dS K' is (dC - K dS / 2) K' plus its transpose.
     KS = K @ dS
     turned = (dC - KS / 2) @ K.T
     mean = prior.mean + K @ de + (dC - KS) @ w
@@ -201,7 +205,7 @@ def take_derivatives_of_log_density(e: jax.Array, S: jax.Array, value: jax.Array
 
 @take_derivatives_of_log_density.defjvp
 def _differentiate_log_density(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the log-density and -w' e' - tr((S^-1 - w w') S') / 2."""
+    """Return the log-density of e under N(0, S), and its derivative -w' de - tr((S^-1 - w w') dS) / 2, w = S^-1 e."""
     (e, S, _), (de, dS, _) = primals, tangents
     solved = psd_solve(S, jnp.concatenate([e[:, None], jnp.eye(len(e), dtype=S.dtype)], axis=1))
     w, inverse = solved[:, 0], solved[:, 1:]

@@ -44,12 +44,15 @@ def trace_log_likelihood(
         return plain(*jax.tree.unflatten(form, _replace_entries(leaves, traced, values)))
 
     def differentiate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-        """Return the log-likelihood and its derivative along the tangents, of which some are known to be zero."""
+        """Return the log-likelihood and its derivative along the tangents.
+
+        A tangent that is a SymbolicZero is known to be zero, so only the derivatives by the other values are computed.
+        """
         (values,), (slopes,) = primals, tangents
         moving = [n for n, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
 
         def by_covariances(moved: list[jax.Array]) -> jax.Array:
-            """Return the log-likelihood with other values of what moves."""
+            """Return the log-likelihood with the values `moved` in place of those with tangents."""
             all_values = _replace_entries(values, moving, moved)
             return _sum_by_covariances(*jax.tree.unflatten(form, _replace_entries(leaves, traced, all_values)))
 
@@ -79,9 +82,10 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
     constant = _hold_constant(filter)
 
     def step(before: Carried, row: tuple[jax.Array, ...]) -> tuple[Carried, jax.Array]:
-        """Filter a row (number, measurement, input) in factors, nothing of which is differentiated, and by covariances.
+        """Filter a row (number, measurement, input) twice: by factors, and by covariances for the derivatives.
 
-        Return what is carried to the next row, and the log-likelihood of this one.
+        The values are those by factors, which are exact but are not differentiated. Return what is carried to the next
+        row, and the log-likelihood of this one.
         """
         (state, moments, before_data), (k, z, u) = before, row
         prior = constant.predict(state, _hold_constant(u), k)

@@ -102,7 +102,7 @@ def true_error(
 
 
 def _check_fits(filter: AbstractFilter, plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
-    """Raise ValueError unless plant and sensor are linear, and the filter has the sizes of this world, in any model."""
+    """Raise ValueError unless plant and sensor are linear and the filter has their sizes; its own model may differ."""
     check_linear("true error", plant, sensor)
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     n = len(first(plant).states)

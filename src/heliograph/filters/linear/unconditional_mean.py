@@ -61,7 +61,7 @@ def centre_plant(plant: AnyPlant) -> AnyPlant:
 
 
 def _centre_plant(plant: AbstractPlant) -> LinearPlant:
-    """Return the plant of x less its mean: without the means of its noise and of its start."""
+    """Return the plant of x - E x, which has the same matrices but zero means of noise and start, and no offset."""
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     return LinearPlant(

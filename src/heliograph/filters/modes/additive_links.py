@@ -129,11 +129,9 @@ class AdditiveModalFilter(AbstractModalFilter):
     def correct(self, state: AdditiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdditiveBelief, Innovation]:
         """Correct with the components of z that arrived.
 
-        Cov(z - E[z | zeta]) = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n, T the mean spread of the
-        gains given the modes, D_0 = Hbar.
-
-        zeta: products of x~ = (x - centre, 1) and functions of the modes, D_a the gain by function a, Gamma the
-        functions' second moments.
+        The estimate is that of zeta, the products of x~ = (x - centre, 1) and functions of the modes. Given zeta,
+        Cov z = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n. T is the mean spread of the gains given
+        the modes, D_a is the gain by function a (D_0 = Hbar), and Gamma holds the functions' second moments.
         """
         output, x = self._measurement_model(state, k), state.gaussian
         deviation = x.mean - self._mean_from_centre(state.centre)
@@ -143,8 +141,8 @@ class AdditiveModalFilter(AbstractModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise, zeta the products of x~ and functions of the modes.
 
-        x~ = (x - centre, 1). `slopes`: F L, L the factor of Cov zeta; the projection maps zeta to the plant's state
-        x.
+        x~ = (x - centre, 1). `slopes` is F L, with L the factor of Cov zeta. The projection maps zeta to the plant's
+        state x.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         slopes_and_noise = slopes, triangularise(noise)
@@ -231,7 +229,8 @@ class AdditiveModalFilter(AbstractModalFilter):
 def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
     """Return Hbar and all D_a, stacked: (1 + functions, m, p + 1).
 
-    z = sum of terms' H y: Hbar is the mean gain over modes, D_a that of a mode less that of its term's first mode.
+    z is the sum of the terms' H y. Hbar is the mean of H over all modes. D_a belongs to a mode that is not the first of
+    its term: it is the mean gain in this mode less that in the term's first mode.
     """
     means = [jnp.asarray(term.mean) for term in terms]
     total_mean = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
@@ -246,7 +245,7 @@ def _next_laws(laws: Laws, rows: Laws) -> Laws:
 def _function_transition(transitions: Laws) -> jax.Array:
     """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j.
 
-    phi: 1 and, of each chain of modes, the indicators of its modes but the first, less their probabilities; Pi: a
+    phi holds 1, and for each chain the indicators of all its modes but the first, less their probabilities. Pi is a
     chain's transition matrix.
     """
     blocks = [(pi[1:, 1:] - pi[:1, 1:]).T for pi in transitions if len(pi) > 1]
@@ -267,20 +266,20 @@ def _second_moment_of_functions(laws: Laws) -> WeightedColumns:
 def _block_diagonal_columns(first_factor: np.ndarray, covariances: Sequence[jax.Array]) -> WeightedColumns:
     """Return the columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i.
 
-    `first_factor` (rows, columns): factor of the first block; an empty C_i adds nothing.
+    `first_factor` (1, columns) is the factor `one` of the first block. An empty C_i adds nothing.
     """
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(first_factor.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)
     blocks: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
-    # Right of the first factor, a row, are zeros, and left of the other blocks.
+    # The first factor is one row. There are zeros to the right of it, and to the left of the other blocks.
     top = jnp.concatenate([jnp.asarray(first_factor), np.zeros((1, blocks.shape[1]))], axis=1)
     below = jnp.pad(blocks, ((0, 0), (first_factor.shape[1], 0)))
     return WeightedColumns(jnp.concatenate([top, below]), weights)
 
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
-    """Return the best linear filter behind a sum of links, its terms, which share no memory; each has all outputs."""
+    """Return the best linear filter behind a sum of links (`terms`) that share no memory; each term has all outputs."""
     laws, models = zip(*(channels_by_mode(term) for term in terms), strict=True)
     claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
     sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)
@@ -288,7 +287,7 @@ def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Ch
 
 
 def independent_terms(channel: Channel) -> list[Channel]:
-    """Return the terms of a sum that share no memory; a channel that is no sum, or of one term, is that term."""
+    """Return the terms of a sum of links that share no memory, or the channel itself if it cannot be split."""
     terms_by_step = [split_terms_without_common_memory(step) for step in unstack(channel)]
     # Steps that split differently have no terms in common.
     if len({len(terms) for terms in terms_by_step}) > 1 or len(terms_by_step[0]) == 1:

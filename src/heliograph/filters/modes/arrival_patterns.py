@@ -44,10 +44,10 @@ class ChannelByPattern(Module):
 
 
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[ChannelByPattern]:
-    """Return the channel at each step by mode and pattern of arrivals, the patterns being those of all steps.
+    """Return the channel at each step by mode and by pattern of arrivals, with the same patterns at all steps.
 
-    A pattern says which components arrive; `flags`: P(flag | mode), a flag being a received number that tells of the
-    mode. The transition to a step is that of the step before; the first step, which has none before, takes its own.
+    A pattern says which components arrive. A flag is a received number that tells of the mode, and `flags` holds
+    P(flag | mode). The transition to a step is that of the step before it. The first step takes its own.
     """
     outcomes_by_step = [[mode.list_outcomes() for mode in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in outcomes_by_step for outcomes in modes for o in outcomes}
@@ -123,8 +123,8 @@ class HasPatterns(Protocol):
 def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:
     """Return the index of the smallest possible pattern in which all components that arrived arrive.
 
-    A larger one may have brought numbers that were left out as NaN. `present` (pattern, component): what arrives;
-    `chance` (mode, pattern): probabilities.
+    A larger pattern is possible too, if numbers that arrived were replaced by NaN. `channel.present` (pattern,
+    component) says what arrives, and `channel.chance` (mode, pattern) holds probabilities.
     """
     present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
     is_candidate = jnp.all(present | ~arrived, axis=1) & possible
@@ -133,10 +133,10 @@ def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:
 
 
 def append_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the innovation of a flag, 0 as it is known, NaN if it is missing, and the covariance with it appended.
+    """Return the innovation of a flag, and the innovations' covariance with a row and column for it.
 
-    A flag is a received number that tells the mode of a link; its covariance is 0. Of what is missing the covariance
-    is NaN.
+    A flag is a received number that tells the mode of a link. Its innovation and covariance are 0. A missing number has
+    the innovation NaN, and NaN in its row and column.
     """
     innovation = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
     is_missing = jnp.isnan(jnp.append(jnp.diagonal(covariance), innovation))

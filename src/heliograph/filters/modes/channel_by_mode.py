@@ -35,7 +35,7 @@ class ChannelByMode(Module):
 def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
     """Return the law of the modes at the first step, and the channel by mode; links without memory have one mode.
 
-    `beside`: plant and sensor, whose modes come before the channel's.
+    `beside` holds a plant and a sensor that have modes. Joint modes are of plant, sensor and channel, in this order.
     """
     steps = [joint_modes(step, beside=beside) for step in unstack(channel)]
     steps_before = [steps[0], *steps[:-1]]
@@ -44,7 +44,7 @@ def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array
 
 
 def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
-    """Return the moments of the channel by mode at one step, and the transition from the step before."""
+    """Return the channel's moments in each mode at the step `now`, with the transition from the step `before`."""
     mean = stack_parts([affine.moments(1).mean[:-1] for affine in now.maps])
     gains, noises = zip(*(split_off_noise(nominal_spread(affine).center) for affine in now.maps), strict=True)
     noise = WeightedColumns(

@@ -122,14 +122,17 @@ class MixtureFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> MixtureBelief:
-        """Return the prior, and the initial law of the modes; `moved`: no step was predicted yet."""
+        """Return the prior and the initial law of the modes; `moved` is False until a step is predicted."""
         start = at(self.plant, k=0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
-        """Return A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
+        """Return the mean A m + B u + E w and the covariance A P A' + Q, and the modes' law after a transition.
+
+        At the first prediction the modes keep their initial law.
+        """
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         predicted = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
@@ -151,8 +154,8 @@ class MixtureFilter(AbstractSizedFilter):
         def condition_on_combination(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> _CombinationUpdate:
             """Return the Kalman update by z = gain x + offset + noise.
 
-            x: the predicted Gaussian; `size`: roots of E[x_i^2], for rounding; `present`: which of z arrived.
-            `certain`: how many components it determines exactly.
+            x is the predicted Gaussian. `size` (n,) holds the roots of E[x_i^2], which give the rounding. `present`
+            says which components of z arrived. `certain` is the number of components that are determined exactly.
             """
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
@@ -193,10 +196,10 @@ class MixtureFilter(AbstractSizedFilter):
 
 
 def drop_below_point_mass(log_likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
-    """Return log-likelihoods, -inf for combinations whose density another one's point mass outweighs.
+    """Return the log-likelihoods, with -inf for combinations that others outweigh by a point mass.
 
-    `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
-    density is negligible.
+    `certain` (a,) counts the components that each combination determines exactly. It has a point mass there, against
+    which a density is negligible. So only combinations with the largest count among those that agree with z are kept.
     """
     agrees = jnp.isfinite(log_likelihood)
     # -1: no combination agrees with z.

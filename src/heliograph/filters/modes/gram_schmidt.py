@@ -14,10 +14,10 @@ def orthogonalise_first_rows(
     """Subtract from each row its projections on those of the first `count` rows that are above it (Gram-Schmidt).
 
     Args:
-        rows: random numbers (k, columns), of which products a W b', W = diag(weights), are second moments.
+        rows: random numbers a, b, ... (k, columns), whose second moments are a W b' with W = diag(weights).
         numbers: values (k,) of the rows, from which the same multiples are subtracted.
-        weights: of the columns.
-        count: number of the rows on which is projected, one after the other.
+        weights: weights (columns,) of the columns.
+        count: number of first rows on which the rows below them are projected, one after another.
 
     Returns:
         The rows, the numbers, and the second moments (count,) of the first rows after the subtraction.

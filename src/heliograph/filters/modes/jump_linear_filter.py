@@ -154,14 +154,14 @@ class ModalFilter(AbstractJointModalFilter):
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
         """Move the mode by the chain and x~ by its plant; at the first prediction the mode has its initial law.
 
-        Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
-
-        zeta: x~ = (x - c, 1) times each mode's indicator; E_i = E[x~ x~' 1{i}]; Pi: the chain; A~, Q~: the plant.
+        zeta holds x~ = (x - c, 1) times each mode's indicator. With the chain Pi, the plant's A~ and Q~ in each mode
+        and E_i = E[x~ x~' 1{i}], the noise of zeta+ = F zeta + noise has the covariance, in the block of modes j and l,
+        A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
         """
         transition = self._transition_matrix(state, k)
         moments_before_motion, motion = mix_moments_of_modes(transition, state.moments), self._motion(state, u, k)
         law = moments_before_motion[:, -1, -1]
-        # F zeta about the moving centre.
+        # The mean of F zeta. The part that the centre has in it is moved by itself.
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         mean = predict_by_mode(deviation[:, None], motion.moves, transition)[:, 0] + mean_from_centre(
             law, motion.centre
@@ -175,10 +175,9 @@ class ModalFilter(AbstractJointModalFilter):
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
         """Correct with the components of z that arrived.
 
-        Cov(z - E[z | zeta]) = sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j), T_j the
-        spread of the gains in mode j.
-
-        zeta: x~ = (x - c, 1) times each mode's indicator; E_j = E[x~ x~' 1{j}]; C~, R~: the sensor; Hbar: mean gain.
+        zeta holds x~ = (x - c, 1) times each mode's indicator. Mode j has the sensor C~_j, R~_j, the mean gain Hbar_j
+        and the spread T_j of gains. With E_j = E[x~ x~' 1{j}], Cov(z - E[z | zeta]) is
+        sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j).
         """
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         output = self._measurement_model(state, k)
@@ -216,7 +215,7 @@ class ModalFilter(AbstractJointModalFilter):
         return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
-        """Return z = common + H zeta + v, zeta the state times each mode's indicator, and columns of Cov v."""
+        """Return the model z = common + H zeta + v, with columns of Cov v; zeta is the state times mode indicators."""
         channel, law = at(self.channel, k), state.law
         sensors = list_mode_models(at(self.sensor, k))
         measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
@@ -233,7 +232,7 @@ class ModalFilter(AbstractJointModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise, zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...).
 
-        `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
+        `slopes` is F L, for zeta = E zeta + L xi. The projection maps zeta to the plant's state x.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         slopes_and_noise = slopes, triangularise(noise)
@@ -259,7 +258,7 @@ def covariance_of_mode(rows: jax.Array) -> jax.Array:
 def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
     """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
 
-    `covariance` (M - 1, s, M - 1, s): that of all modes but the last, whose part is minus the sum of theirs.
+    `covariance` (M - 1, s, M - 1, s) is that of all modes but the last. The last part is minus the sum of the others.
     """
     other_modes, size = covariance.shape[:2]
     factors = factor_spread(covariance.reshape(other_modes * size, other_modes * size))
@@ -268,9 +267,9 @@ def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
 
 
 def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
-    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales.
+    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which do not depend on the signal.
 
-    Hbar_j: mean gain in mode j of probability P(j), v_j: noise of what is sent, n_j: that of the link.
+    Mode j has the probability P(j) and the mean gain Hbar_j. v_j is the noise of what is sent, n_j that of the link.
     """
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
@@ -298,9 +297,10 @@ def make_mode_sum_matrix(n: int, modes: int) -> Float[np.ndarray, "n N"]:
 def condition_modes_on_received(
     x: Gaussian, deviation: jax.Array, output: MeasurementModel, z: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
-    """Return zeta, the state times the indicator of each mode, given the components of z that arrived; the innovation.
+    """Return the law of zeta given the components of z that arrived, and the innovation.
 
-    `deviation`: the mean of zeta less P(mode) c, c the centre. `output`: z = common + matrix zeta + noise.
+    zeta is the state times the indicator of each mode. `output` describes z = common + matrix deviation + noise, where
+    the `deviation` is zeta less P(mode) c, with c the centre; its mean is given.
     """
     expected = output.common + output.matrix @ deviation
     slopes = output.matrix @ x.root
@@ -310,12 +310,13 @@ def condition_modes_on_received(
 def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
     """Return the law of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...) at the start, x~ = (x - c, 1), and E[x~ x~'].
 
-    Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
+    x and the mode are independent at the start, and the mode has the law p. With e = E[x~] = (0, 1) and Kronecker's
+    product x, Cov(zeta) = diag(p) x Cov(x~) + (diag(p) - p p') x e e'.
     """
     covariance, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
     state = from_covariance(start.initial_mean, start.initial_covariance)
     mode = factor_with_last_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
-    # Factors of both, x before the indicator in each part; `unit_moment` is e e'.
+    # In each mode's part of the factor, x comes before the indicator. `unit_moment` is e e'.
     unit_moment = np.zeros((len(covariance), len(covariance)))
     unit_moment[-1, -1] = 1.0
     mode_root = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
@@ -331,10 +332,10 @@ def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
 
 
 def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Subtract the mean output over the modes, as the indicators sum to 1; return what is left and the mean output.
+    """Subtract the mean output over the modes from every mode; return what is left, and the mean output (m,).
 
-    `output` (M, m, n + 1): E[z 1{mode}] as a matrix of (x, 1); `law` (M,): probabilities of the modes. The mean is
-    (m,).
+    The modes' indicators sum to 1, so that the mean output can be added as a constant. `output` (M, m, n + 1) maps
+    (x, 1) to E z in each mode. `law` (M,) holds the probabilities of the modes.
     """
     mean_output = law @ output[:, :, -1] / jnp.sum(law)
     return output.at[:, :, -1].add(-mean_output), mean_output

@@ -45,7 +45,7 @@ def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Ar
 def noise_in_mode(plant: LinearPlant, u: ArrayLike, initial_power: jax.Array) -> WeightedColumns:
     """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator.
 
-    `initial_power`: E[x_i^2] at the start, the size of numbers that rounding acts on.
+    `initial_power` is E[x_i^2] at the start, the size of the numbers that are rounded.
     """
     process_noise = factor_process_noise(plant, jnp.asarray(u), initial_power)
     of_indicator = rounding_of(np.ones(1))
@@ -72,17 +72,17 @@ class MotionByMode(NamedTuple):
 def centred_motion(
     plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, centre: jax.Array, moments_before: jax.Array
 ) -> MotionByMode:
-    """Return how x - c moves in each mode, and the next centre: E[x+] before any data.
+    """Return how x - c moves in each mode j, and the next centre c+ = E[x+] before any data.
 
-    x+ - c+ = A_j (x - c) + d_j + w_j with d_j = A_j c + B_j u + E w_j - c+. Of one law of motion d is 0: known inputs
-    move the mean alone.
+    x+ - c+ = A_j (x - c) + d_j + w_j with d_j = A_j c + B_j u + E w_j - c+. If all modes have one law of motion, d_j is
+    0 for all j.
 
     Args:
         plants: the laws of motion.
-        modes: which of them each mode has.
+        modes: for each mode the index of its law in `plants`.
         u: input (inputs,).
         centre: c (n,).
-        moments_before: E[(x - c, 1) 1{mode j}] of the mode that moves (M, n + 1).
+        moments_before: E[(x - c, 1) 1{mode j}] (M, n + 1), with j the mode by which x moves.
     """
     by_plant = [transition_with_constant(plant, jnp.asarray(u)) for plant in plants]
     moves, noises = (jnp.stack(matrices) for matrices in zip(*(by_plant[mode] for mode in modes), strict=True))
@@ -103,7 +103,7 @@ def noise_by_mode(
 
     The block of mode j is P(j) Cov w_j, with P(j) = law[j] and the plant number modes[j].
 
-    `initial_power`: E[x_i^2] at the start, for rounding.
+    `initial_power` is E[x_i^2] at the start, which gives the size of rounding.
     """
     noises = [noise_in_mode(plant, u, initial_power) for plant in plants]
     matrix = jax.scipy.linalg.block_diag(*(noises[mode].matrix for mode in modes))
@@ -116,8 +116,7 @@ def centred_sensing(
 ) -> tuple[jax.Array, jax.Array]:
     """Return C~_j and R~_j of the centred state in each mode (M, p + 1, n + 1), (M, p + 1, p + 1).
 
-    y~ = C~_j x~ + noise of covariance R~_j, with x~ = (x - centre, 1) and y~ = (y, 1); modes[j]: the sensor that mode j
-    has.
+    y~ = C~_j x~ + noise of covariance R~_j, with x~ = (x - centre, 1) and y~ = (y, 1). Mode j has sensor modes[j].
     """
     by_sensor = [centred_measurement(sensor, centre) for sensor in sensors]
     measures, noises = zip(*(by_sensor[mode] for mode in modes), strict=True)

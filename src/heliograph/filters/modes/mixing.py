@@ -105,8 +105,8 @@ class MergeByMode(AbstractMerging):
     def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return one component for each present mode, merged over the modes before, and the weights (M, M).
 
-        `gaussians`, `weight`: a Gaussian and its weight for each pair (mode before, present mode). A component holds
-        the weight of its own mode alone: the weights returned are diagonal.
+        `gaussians` and `weight` hold a Gaussian and its weight for each pair (mode before, present mode). The returned
+        weights are diagonal, since each component belongs to one mode.
         """
         _, present_mode = self.list_update_pairs(modes)
         weight_by_mode = weight[:, None] * (present_mode[:, None] == np.arange(modes))  # (pair, present mode)
@@ -154,9 +154,9 @@ class MergePairs(AbstractMerging):
 
 
 def normalise_columns(weight: jax.Array) -> jax.Array:
-    """Divide weights (components, mixtures) by their column sums; equal weights where a column is zero."""
+    """Divide weights (components, mixtures) by their column sums; a column of zeros becomes equal weights."""
     total = jnp.sum(weight, axis=0)
-    is_positive = total > float(np.finfo(total.dtype).tiny)  # the reciprocal of less is infinite
+    is_positive = total > float(np.finfo(total.dtype).tiny)  # the reciprocal of a smaller number would be infinite
     return jnp.where(is_positive, weight * (1 / jnp.where(is_positive, total, 1.0)), 1 / len(weight))
 
 

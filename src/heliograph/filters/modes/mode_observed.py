@@ -78,7 +78,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     def init(self) -> ModeObservedBelief:
         """Return the belief before any data.
 
-        Nothing was received (z is NaN), and the last step moved nothing (matrix I, no noise).
+        There is no last measurement (z is NaN), and no last step (the matrix is I, without noise).
         """
         belief = prior_belief(at(self.plant, k=0))
         n = len(belief.gaussian.mean)
@@ -132,10 +132,10 @@ class ModeObservedFilter(AbstractSizedFilter):
         return belief, Innovation(value, spread, innovation.log_likelihood)
 
     def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:
-        """Return the prior of step k after the last measurement is used again, with what was learned since.
+        """Return the prior of step k, after the last correction is made again with what was learned since.
 
-        The states of the links' memories are received one step late: then the last correction can be made with the
-        channel's moments given them.
+        The states of the links' memories are received one step late. They give better moments of the channel for the
+        last measurement `state.z`, which corrects the belief `state.before` again.
         """
         last_step = jnp.maximum(jnp.asarray(k) - 1, 0)
         channel = _find_moments_given_states(at(self.channel, last_step), memory_states)
@@ -146,9 +146,10 @@ class ModeObservedFilter(AbstractSizedFilter):
         return predict_belief(corrected, state.move)
 
     def _describe_channel_after(self, has_begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
-        """Return the channel's moments at step k given the memories' states one step before; at the first step none.
+        """Return the channel's moments at step k, given the states of the links' memories one step before.
 
-        `has_begun`: whether a step was before. A memory is what a link remembers, such as its mode.
+        A memory is what a link remembers, such as its mode. At the first step (`has_begun` is False) there are no such
+        states.
         """
         channel, last_step = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
         at_later_step = _find_moments_given_earlier_states(at(self.channel, last_step), channel, memory_states)
@@ -189,7 +190,8 @@ def _find_moments_given_earlier_states(
 def _find_nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
     """Return the mean and spread of the channel under the nominal law, for numbers that may be traced.
 
-    Nominal: under the probabilities as given, without their radii; traced: free numbers of a fit.
+    The nominal law has the probabilities as given, without their radii of uncertainty. Traced numbers are those that a
+    fit searches.
     """
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))

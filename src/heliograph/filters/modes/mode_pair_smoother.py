@@ -80,8 +80,8 @@ def move_pairs(
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
         """Move one Gaussian x by one plant: return the law of f(x, u) + w, and x given the next state.
 
-        f(x, u) is known by its slopes in x and what these do not explain. `transform`: moments of a nonlinear f; u:
-        input; `initial_power`: E[x_i^2] at the start, for rounding.
+        f(x, u) is described by its slopes in x and the covariance that they do not explain. `transform` gives these for
+        a nonlinear f. u is the input. `initial_power` is E[x_i^2] at the start, for rounding.
         """
         image = find_transition_moments(plant, transform, x, u)
         unexplained = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
@@ -170,9 +170,9 @@ class ModalSmootherStep(SmootherStep):
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
         def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
-            """Condition one pair (mode, next mode) on what later data say of it; return it and the log-likelihood.
+            """Condition the Gaussian x of one pair (mode, next mode) on later data; return it and the log-likelihood.
 
-            Later data say value = rows x + noise, as if this were measured.
+            Later data act like a measurement value = rows x + noise.
             """
             noise = WeightedColumns(jnp.eye(len(x.mean)), observed.noise)
             expected, slopes = observed.rows @ x.mean, observed.rows @ x.root
@@ -215,7 +215,7 @@ class ModalSmootherStep(SmootherStep):
 
     def start(self) -> EarlierState:
         """Return the state after this step as an earlier state, whose law is then carried from step to step."""
-        # `before` is None for several plants, where no one function moves the whole mixture.
+        # With several plants no single function moves the whole mixture, and `before` is None.
         if self.before is None:
             raise fail("smoothing of plants with modes", "FixedInterval or FixedLag", "a fixed point")
         return super().start()

@@ -24,7 +24,7 @@ def describe_joint_modes(
 ) -> tuple[JointModes, ChannelByPattern | OverTime]:
     """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step.
 
-    `nodes`: number of modes that stand for a gain that drifts.
+    A gain that drifts is replaced by a chain of `nodes` modes.
     """
     steps = [joint_modes(step, nodes, beside=(plant, sensor)) for step in unstack(channel)]
     modes = len(steps[0].initial)
@@ -32,21 +32,20 @@ def describe_joint_modes(
     if modes > 1:
         for step in by_pattern:
             _check_density(step)
-    # The chain is the same at each step; what it does to the signal may differ.
+    # The chain is the same at all steps, so the first one is returned. The links' effect on the signal may vary.
     return steps[0], vary_over_steps(by_pattern, channel)
 
 
 def _check_density(channel: ChannelByPattern) -> None:
-    """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one.
+    """Raise ValueError unless z has a density in every mode and pattern of arrivals, for an x that has one.
 
-    What is traced, as by what a message tells, has no numbers to judge: it was judged by typical ones.
-
-    `present`: which components arrive; `mean`, `spread`: moments of (G, n), z = G y + n.
+    `channel.present` says which components arrive in a pattern. `channel.mean` and `channel.spread` are moments of
+    (G, n) with z = G y + n. Traced moments have no numbers, and are not checked: typical ones were checked before.
     """
     if is_traced((channel.mean, channel.gain_spread, channel.noise)):
         return
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
-        # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.
+        # E[z z'] for E[y y'] = I, without n, is regular if every combination of the rows that arrive is random.
         arriving, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
         second_moment = gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a]))
         if np.linalg.matrix_rank(second_moment[np.ix_(arriving, arriving)]) < len(arriving):
@@ -54,9 +53,9 @@ def _check_density(channel: ChannelByPattern) -> None:
 
 
 def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...]:
-    """Return for each joint mode the number of the plant's or sensor's model in it, 0 for one that has no modes.
+    """Return for each joint mode the index of the plant's or sensor's model in it; all 0 if it has no modes.
 
-    `by_mode`: the model itself in each joint mode, which is found again by identity.
+    `by_mode` holds the model in each joint mode. Its index is found by identity.
     """
     if isinstance(model, OverTime) and isinstance(first(model), ModalPlant | ModalSensor):
         raise fail(kind, "one whose models are the same at all steps", "modes in over_time")

@@ -108,9 +108,9 @@ def correct_in_every_mode(
 def _correct_in_mode(
     signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
 ) -> tuple[Gaussian, Innovation]:
-    """Correct the prior of a signal y with z = G y + n in one mode of the channel, of which `mean` is E[(G, n)].
+    """Correct the prior of a signal y with z = G y + n in one mode of the channel.
 
-    `gain_spread`, `link`: covariance of G and columns of Cov n; `angles`: components of z.
+    In this mode `mean` is E[(G, n)], `gain_spread` is Cov G and `link` holds columns of Cov n; `angles` are those of z.
     """
     gain = mean[:, :-1]
     expected = gain @ signal.mean + mean[:, -1]
@@ -180,7 +180,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> ModalBeliefs:
-        """Return the prior in every component, and the initial law of the modes; no step was predicted (`moved`)."""
+        """Return the prior in every component, and the initial law of the modes; `moved` is False before any step."""
         start, weight = at(self.plant, k=0), self.merging.initial_weights(jnp.asarray(self.initial))
         gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
         return ModalBeliefs(gaussians, weight, moved=jnp.asarray(False))
@@ -212,7 +212,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Correct each component in each mode with z, and weight them by their likelihood.
 
-        `updating_mode`: of each pair (component, mode) the mode in which it is updated.
+        There is an update for each pair (component, mode), and `updating_mode` holds the mode of each.
         """
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
         _, updating_mode = self.merging.list_update_pairs(modes)
@@ -264,7 +264,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         law = self._find_law_by_mode(step.after)
         pairs_of_modes = self._describe_pairs(step, law)
         merged = step.map_states(_merge_mixture)
-        # Of several plants there is no one function by which the whole mixture moves.
+        # With several plants no single function moves the whole mixture, so it has no smoother step of its own.
         moments: Any = None
         if len(plants) == 1:
             moments = smoother_step_by_transform(self, merged, first(self.plant)).before
@@ -314,9 +314,9 @@ def imm_filter(
 ) -> MultipleModelFilter:
     """Return the interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
 
-    Before each step they are mixed by the mode that the next one comes from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
-    modes are weighted by the likelihood of z. A gain that is random within a mode enters by its second moments;
-    erasures inside the channel are information on the mode too.
+    Before a step the Gaussians are mixed for each next mode j by the shares mu_(i|j) = Pi_ij mu_i / c_j. After it the
+    modes are weighted by the likelihood of z. A gain that is random within a mode enters by its second moments, and
+    erasures inside the channel are information on the mode.
 
     Args:
         plant: the plant, n states.
@@ -325,8 +325,8 @@ def imm_filter(
         transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
-    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps. With next to no
-    noise in plant and link the merged Gaussian may leave out the true mode: squared errors were 1e11 times the claim.
+    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps. With almost no noise
+    in plant and link the merged Gaussian may leave out the true mode: squared errors were 1e11 times the claim.
 
     Raises:
         ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
@@ -347,7 +347,7 @@ def gpb1_filter(
 ) -> MultipleModelFilter:
     """Return the first-order generalised pseudo-Bayes filter behind links with memory: one Gaussian, and modes' law.
 
-    M updates a step; the correlation of state and mode is not propagated.
+    It makes M updates a step for M modes. The correlation of state and mode is not propagated.
 
     Args:
         plant: the plant, n states.
@@ -376,7 +376,7 @@ def gpb2_filter(
 ) -> MultipleModelFilter:
     """Return the second-order generalised pseudo-Bayes filter: a Gaussian per mode, updated in every next mode.
 
-    M^2 updates a step.
+    It makes M^2 updates a step for M modes.
 
     Args:
         plant: the plant, n states.
@@ -386,7 +386,7 @@ def gpb2_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small, as for the others. With next to no noise in plant and link squared errors were 17 times
+    many modes it is too small, as for the others. With almost no noise in plant and link squared errors were 17 times
     the claim.
 
     Raises:

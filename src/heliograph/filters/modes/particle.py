@@ -96,8 +96,8 @@ class ParticleFilter(AbstractSizedFilter):
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law.
 
-        Particle i of n has the mode at the share (i + 1/2) / n of the distribution. `moved`: whether a step was
-        predicted.
+        Particle i of n has the mode at which the distribution function passes (i + 1/2) / n. `moved` is False until a
+        step is predicted.
         """
         start, n = at(self.plant, k=0), self.particles
         gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
@@ -114,8 +114,8 @@ class ParticleFilter(AbstractSizedFilter):
     def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
         """Draw each particle's next mode, and predict its Gaussian.
 
-        It is drawn by its row of the channel's transition matrix; at the first step the modes stay as drawn at the
-        start.
+        The next mode is drawn from the row of the transition matrix that belongs to the present mode. At the first step
+        the particles keep the modes of the start.
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)

@@ -105,11 +105,11 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> SideInformationBelief:
-        """Return the prior, in which state and mode are independent; x~ = (x - c, 1), p the law of the modes."""
+        """Return the prior, in which state and mode are independent; x~ = (x - c, 1), and p is the law of the modes."""
         start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         unit = np.eye(len(self.states) + 1)[:, -1:]
-        # Columns of q = (e, x~) in each mode: e, the error of (x~ 1{mode 1}, ...), is 1_j (x) x~ - p (x) (0, 1).
+        # Columns of q = (e, x~) in each mode j. e is the error of (x~ 1{mode 1}, ...): e = 1_j (x) x~ - p (x) (0, 1).
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
         constant = jnp.zeros_like(x).at[:, -1:].set(unit)
         errors = [kron(indicator[:, None], x) - kron(law[:, None], constant) for indicator in jnp.eye(len(law))]
@@ -145,8 +145,8 @@ class SideInformationFilter(AbstractSizedFilter):
         def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> WeightedColumns:
             """Return E[q+ q+' 1{next mode j}], from the indicator 1_j, P(j | i) by mode i (`chances`), and P(j).
 
-            Closed over: `errors`, `x`, columns of e and x~ by mode i, of `weights`; `rows`, the transition matrix of
-            the modes; `noise`, columns of the process noise; `move_columns`, from (e, x~) to (e+, x~+).
+            `errors` and `x` hold columns of e and x~ in each mode i, with `weights`. `rows` is the modes' transition
+            matrix, and `noise` holds columns of the process noise. `move_columns` maps (e, x~) to (e+, x~+).
             """
             moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
             process = WeightedColumns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
@@ -196,7 +196,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
-        """Return x = c + sum_j zeta_j, zeta_j the estimate of (x - c) 1{mode j}, and the covariance of its error."""
+        """Return the estimate c + sum_j zeta_j, zeta_j that of (x - c) 1{mode j}, and its error's covariance."""
         projection = make_mode_sum_matrix(len(self.states), len(self.initial))
         covariance = state.errors.through(projection).covariance
         return Estimate(state.centre + projection @ state.mean, covariance, self.claim)
@@ -229,7 +229,7 @@ def _split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, 
 def _make_belief(
     mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
 ) -> SideInformationBelief:
-    """Build the state from the triangular factors of each mode's moments (M, q, q)."""
+    """Return the filter's state, with the triangular factors of each mode's moments (M, q, q)."""
     lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))  # what is below the unit diagonal
     return SideInformationBelief(
         mean=mean, lower=lower, variances=jnp.asarray(moments.weights), centre=centre, moved=moved
@@ -269,10 +269,10 @@ def _make_measurement_model(
     def describe_noise(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
-        """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain.
+        """Return the noise of z = G y + n in one mode of probability p: sensor, link, rounding and the gain's spread.
 
-        `gain`, `spread`: mean and covariance of (G, n) in z = G y + n; `link`: columns of Cov n; `x`: columns of E[x~
-        x~' 1{mode}], x~ = (x, 1). (y, 1) = measure x~ + noise; `size`: E[x_i^2] at the start, for rounding.
+        `gain` and `spread` are the mean and covariance of (G, n), and `link` holds columns of Cov n. `x` holds columns
+        of E[x~ x~' 1{mode}], x~ = (x, 1). (y, 1) = measure x~ + noise. `size` is E[x_i^2] at the start, for rounding.
         """
         signal_moments = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
         known_noise = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
@@ -394,7 +394,7 @@ def side_information_filter(
 def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[ChannelByPattern], bool]:
     """Return the modes' initial probabilities, the channel by mode at each step, and whether all laws are known."""
     steps = [joint_modes(step) for step in unstack(channel)]
-    # Probabilities are known where they have one extreme law (corner).
+    # All probabilities are known if every map has only one extreme law (corner).
     is_known = all(affine.corner_count() == 1 for step in steps for affine in step.maps)
     no_flag = np.ones((len(steps[0].initial), 1))
     return steps[0].initial, describe_by_pattern(steps, no_flag), is_known and not uncertain_chain(channel)

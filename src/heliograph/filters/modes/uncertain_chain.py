@@ -67,7 +67,8 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known.
 
-        `low`, `high`: ends of the modes' law, equal at the start; `second_moment`: E[x~ x~'], x~ = (x - centre, 1).
+        `low` and `high`, the ends of the modes' law, are equal at the start. `second_moment` is E[x~ x~'] with
+        x~ = (x - centre, 1).
         """
         start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior, second_moment = compute_initial_moments(start, self.initial)
@@ -98,7 +99,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         )
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
-        """Return the modes' transition matrix and the radius of its entries; before the first prediction I and 0."""
+        """Return the modes' transition matrix and the radius of its entries; they are I and 0 at the first step."""
         channel = at(self.channel, k)
         # Modes keep their initial law up to the first step.
         transition = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
@@ -150,8 +151,8 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing.
 
-        zeta: the state times each mode's indicator; `young`: scalar of the bound, by which its nominal part grows;
-        `added_noise`: process noise and the uncertain part.
+        zeta is the state times each mode's indicator. `young` is the scalar of the bound: F P F' grows by this share.
+        `added_noise` holds the process noise and the uncertain part.
         """
         slopes, young, added_noise = self._transition_factors(step.before, step.u, step.k)
         growth = WeightedColumns(slopes, young * step.before.gaussian.variances)
@@ -167,11 +168,10 @@ def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
 def _bound_moves(transition: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return bounds on Cov(1{next} | i) and on Delta_i Delta_i' (M, M, M), for each mode i and every Delta_i.
 
-    pi_i, row i of `transition`: the nominal law of the next mode after i; Delta_i: its error, |Delta_ij| <= r_ij
-    (`radius`).
-
-    Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
-    the projection that removes the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
+    Row i of `transition` is pi, the nominal law of the next mode after i. Delta_i is its error, with |Delta_ij| <= r_ij
+    (`radius`). For each i, Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta', and replacing Delta_j by
+    r_j bounds it. Delta Delta' <= P diag(r_j sum r) P, with P the projection that removes the mean, since
+    Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
     """
     modes = len(transition)
     difference = jnp.eye(modes)[None] - transition[:, None, :]  # [i, j] = e_j - pi_i
@@ -184,7 +184,7 @@ def _bound_moves(transition: jax.Array, radius: jax.Array) -> tuple[jax.Array, j
 def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return a law between the ends (its sum is 1), and the largest deviation of a possible law from it.
 
-    `low`, `high` (M,): the least and greatest probability of each mode.
+    `low` and `high` (M,) are the least and the greatest probability of each mode.
     """
     middle = (low + high) / 2
     middle = middle + (1 - jnp.sum(middle)) / len(low)
@@ -194,7 +194,7 @@ def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Ar
 def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
     """Return a bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|.
 
-    X_i: symmetric matrices, |X| has the absolute eigenvalues of X; `reach`: by how much p_i may differ from middle_i.
+    The X_i are symmetric, and |X| has the absolute eigenvalues of X. `reach` (M,) is how far p_i may be from middle_i.
     """
     values, vectors = jax.vmap(eigh)(matrices - jnp.mean(matrices, axis=0))
     absolute = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
@@ -204,9 +204,9 @@ def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax
 def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     """Return a bound on diag(p) over all laws p of the modes, tight in the direction of equal entries.
 
-    p = middle + delta, |delta_i| <= reach_i, delta summing to 0. With u = (1, ..., 1) / root M, P = I - u u' and d =
-    delta / root M: diag(delta) = P diag(delta) P + u d' + d u', and u d' + d u' <= e u u' + d d' / e by Young's
-    inequality. P diag(delta) P is 0 for two modes. `low`, `high` (M,): ends of each mode's probability.
+    p = middle + delta with |delta_i| <= reach_i, and the delta_i sum to 0. With u = (1, ..., 1) / root M, P = I - u u'
+    and d = delta / root M, diag(delta) = P diag(delta) P + u d' + d u'. By Young's inequality
+    u d' + d u' <= e u u' + d d' / e. P diag(delta) P is 0 for two modes. `low` and `high` (M,) are the ends of p.
     """
     modes = len(low)
     middle, reach = _find_middle_law(low, high)
@@ -223,21 +223,21 @@ def _bound_next_law(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the least and the greatest probability of every mode one step later, over laws between low and high.
 
-    `transition`: nominal transition matrix; `radius`: by how much each entry may be off; `low`, `high`: ends of the
-    present law.
+    `transition` is the nominal transition matrix, and `radius` bounds the error of each entry. `low` and `high` (M,)
+    are the ends of the present law.
     """
     lowest, highest = jnp.clip(transition - radius, 0.0, 1.0), jnp.clip(transition + radius, 0.0, 1.0)
     largest_by_mode = jax.vmap(_largest_payoff, (1, None, None))
-    # The least value is minus the largest one of the negative.
+    # The least payoff is minus the largest payoff of the negative entries.
     return -largest_by_mode(-lowest, low, high), largest_by_mode(highest, low, high)
 
 
 def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first.
+    """Return the maximum of sum_i p_i payoff_i over all laws p with low <= p <= high.
 
-    `payoff`, `low`, `high` (M,): what each mode is worth, and the ends of its probability p.
+    p begins at `low`, and the mass that is left of 1 goes to the largest payoffs first. All arguments are (M,).
     """
-    # [i, j]: mode i gets its mass before mode j, by payoff and then by number.
+    # is_served_before[i, j]: mode i gets mass before mode j, since its payoff is larger or, if equal, its number lower.
     number = jnp.arange(len(payoff))
     is_served_before = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))
     capacity = high - low

@@ -37,14 +37,14 @@ class _EntryDegrees(NamedTuple):
 def is_affine(function: Callable[..., jax.Array], x: np.ndarray, indices: Sequence[int], *others: np.ndarray) -> bool:
     """Return whether f(x, *others) is seen to be affine in the entries of x at these indices, whatever all others are.
 
-    Each entry has a degree: KNOWN, GIVEN (no dependence on those entries), AFFINE in them, or OTHER; they are passed
-    on operation by operation.
+    Each entry of each result has a degree: KNOWN, GIVEN (it does not depend on x at these indices), AFFINE in them, or
+    OTHER. Degrees are found operation by operation.
 
     Args:
         function: f, in operations of jax.numpy.
-        x: a point (n,), by its shape.
-        indices: of the entries of x in which f is to be affine.
-        others: further arguments, by their shapes.
+        x: a point (n,), of which only the shape matters.
+        indices: the entries of x in which f should be affine.
+        others: further arguments of f, of which only the shapes matter.
     """
     program = jax.make_jaxpr(function)(x, *others)
     degree = np.full(x.shape, GIVEN)
@@ -56,7 +56,7 @@ def is_affine(function: Callable[..., jax.Array], x: np.ndarray, indices: Sequen
 def _classify_dependence(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of a program's results, operation by operation.
 
-    A degree says how an entry depends on the arguments: known, given, affine, or otherwise.
+    A degree says how an entry depends on the entries asked about: KNOWN, GIVEN (not at all), AFFINE or OTHER.
     """
     values = dict(zip(program.jaxpr.invars, arguments, strict=True))
     values.update(zip(program.jaxpr.constvars, map(_trace_known_array, program.consts), strict=True))
@@ -143,10 +143,9 @@ def _degree_of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _degree_of_contraction(a: _EntryDegrees, b: _EntryDegrees, dimensions: Any) -> np.ndarray:
     """Return the degrees of the sums of products that a contraction (dot_general) of a and b makes.
 
-    A product with a known zero is none. A sum is AFFINE where some product has one AFFINE factor, and OTHER where a
-    factor is OTHER or both are AFFINE; else GIVEN. `dimensions`: JAX's numbers of the contracted and batch axes.
-
-    Degrees in their order: KNOWN, GIVEN (whatever it is), AFFINE (in the states asked about), OTHER.
+    The degrees in their order are KNOWN, GIVEN, AFFINE (in the states asked about) and OTHER. A product with a known
+    zero does not count. A sum is OTHER if some product has an OTHER factor or two AFFINE ones. Else it is AFFINE if
+    some product has an AFFINE factor, and GIVEN if none has. `dimensions` are JAX's contracted and batch axes.
     """
 
     def count(of_a: np.ndarray, of_b: np.ndarray) -> np.ndarray:

@@ -114,10 +114,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
     def compute_innovation(
         self, weight: jax.Array, predicted: tuple[jax.Array, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z less its mean, its covariance and the log-likelihood, by sums over what particles (N,) expect.
+        """Return z - E z, the covariance of z and the log-likelihood, by sums over the particles (N,).
 
-        `predicted`: what each particle expects of z; `density`: log p(z). Sums are about the heaviest particle's
-        expectation, so that large numbers keep their digits.
+        `predicted` holds what each particle expects of z, and `density` is log p(z). The expectation of the heaviest
+        particle is subtracted first, so that large numbers keep their digits.
         """
         heaviest = find_reference_particle(weight, predicted)
         reference = tuple(expectations[heaviest] for expectations in predicted)
@@ -130,10 +130,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         return True
 
     def choose_particles(self, log_weight: jax.Array, key: jax.Array) -> ResampledParticles:
-        """Resample systematically where the effective number is too small; else all particles go on as they are.
+        """Resample systematically if the effective number is too small; else keep all particles.
 
-        It is too small below the share `resample` of all; log weights of resampled particles are 0, of others
-        unchanged.
+        It is too small below the share `resample` of all. Resampled particles have log weights of 0. Else the log
+        weights do not change.
         """
         weight = jax.nn.softmax(log_weight)
         resamples = effective_number(weight) < jnp.asarray(self.resample) * self.particles

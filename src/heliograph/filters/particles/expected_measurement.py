@@ -38,10 +38,10 @@ class ExpectedMeasurement(NamedTuple):
 
         Args:
             weight: weights (B,) of particles before z is known, of any sum.
-            predicted: their h(x), (B, p); where it is no number they do not count, unless none does.
+            predicted: their h(x), (B, p). A particle with an infinite or NaN h(x) has no weight, unless all have one.
         """
         is_finite = jnp.all(jnp.isfinite(predicted), axis=1)
-        some_is_finite = jnp.all(jnp.isfinite(self.reference))  # else the reference would be a finite one
+        some_is_finite = jnp.all(jnp.isfinite(self.reference))  # a finite reference is chosen if there is one
         joint_weight = jnp.where(is_finite | ~some_is_finite, weight, 0.0)[:, None] * jnp.asarray(self.atoms.weight)
         value = self.z - jax.vmap(self.atoms.expected)(jnp.where(is_finite[:, None], predicted, 0.0))
         difference = wrap_near(value - self.base, jnp.zeros(len(self.z)), self.angles)
@@ -50,25 +50,26 @@ class ExpectedMeasurement(NamedTuple):
     def compute_innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
         """Return mean and covariance of the innovation, and log p(z).
 
-        Atoms are the Gaussians whose mixture is the channel. Covariance: noise within them, and spread of their means.
+        Atoms are the Gaussians whose mixture is the channel. The covariance is their noise plus the spread of their
+        means.
 
         Args:
-            first: first sums of what is apart from the base.
-            second: second sums of it (m, m), about the base.
-            density: log p(z), where something arrived.
+            first: first sums of the innovations less the base, a reference innovation.
+            second: second sums (m, m) of the same differences.
+            density: log p(z), used only if something arrived.
         """
         mean, present = first.mean(()), ~jnp.isnan(self.z)
         noise = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
         noise = jnp.where(present[:, None] & present, noise, jnp.nan)
         spread = second / first.weight - jnp.outer(mean, mean)
-        nothing_arrived = ~jnp.any(present)  # of nothing the density is 1, to rounding
+        nothing_arrived = ~jnp.any(present)  # then the density is exactly 1
         return Innovation(self.base + mean, noise + spread, jnp.where(nothing_arrived, 0.0, density))
 
 
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
-    """Return the number of the heaviest of particles (N,) whose expectations are numbers; of all if none has any.
+    """Return the index of the heaviest particle (N,) with finite expectations, or of the heaviest if no one has any.
 
-    `predicted`: what particles expect of z, in several arrays; they are numbers if all are finite.
+    `predicted` holds what particles expect of z, in several arrays (N, ...).
     """
     xp = library(weight, predicted)
     finite_by_array = [

@@ -59,10 +59,10 @@ def sum_mixtures(
 
 
 def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array, density: jax.Array) -> Innovation:
-    """Return the innovation's mean, covariance and log-likelihood given what arrived; `density`: log p(z, arrivals).
+    """Return the innovation's mean, covariance and log-likelihood, given which components arrived.
 
-    `base`: a reference innovation, about which sums are taken; p(z) given arrivals is p(z, arrivals) over the mean
-    chance of these.
+    `base` is a reference innovation, about which the sums are taken. `density` is log p(z, arrivals). p(z | arrivals)
+    is p(z, arrivals) over the mean chance of these arrivals.
     """
     present = ~jnp.isnan(z)
     weight = jnp.where(sums.weight > 0, sums.weight, 1.0)
@@ -70,5 +70,5 @@ def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array
     covariance = sums.spread / weight - jnp.outer(mean, mean)
     covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
     log_likelihood = density - jnp.log(jnp.asarray(sums.chance) / sums.of_all)
-    nothing_arrived = ~jnp.any(present)  # of nothing the density is 1, to rounding
+    nothing_arrived = ~jnp.any(present)  # then the density is exactly 1
     return Innovation(base + mean, covariance, jnp.where(nothing_arrived, 0.0, log_likelihood))

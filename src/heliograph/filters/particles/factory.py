@@ -82,7 +82,7 @@ def build_partly_drawn(
 
 
 def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the indices of the drawn states, in the plant's order; of all states for None."""
+    """Return the indices of the drawn states in the plant's order; None means that all states are drawn."""
     if drawn is None:
         return tuple(range(len(start.states)))
     wanted = [str(name) for name in items("drawn", drawn, "names of states")]

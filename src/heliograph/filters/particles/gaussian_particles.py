@@ -61,10 +61,10 @@ def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
 
 
 def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
-    """Return the first sums of particles (B,) and modes, and of the weights of modes, None of one mode.
+    """Return the first sums over particles (B,) and modes, and the sum of weights in each mode (None for one mode).
 
-    Each particle has a Gaussian in each of M modes; first sums are of weights, their squares, means, and angles' sine
-    and cosine. The mean direction is that of E exp(i angle), which for a Gaussian angle is exp(i m - variance / 2).
+    Each particle has a Gaussian in each of M modes. The first sums are those of weights, of squared weights, of means,
+    and of the angles' sines and cosines: E exp(i angle) of a Gaussian angle is exp(i mean - variance / 2).
     """
     weights, mean = _list_parts(weight, particles)
     variances = jnp.diagonal(particles.gaussian.covariance, axis1=-2, axis2=-1).reshape(mean.shape)

@@ -14,9 +14,9 @@ from heliograph.numerics.gaussian_density import LOG_TURN
 def slopes_given_drawn(
     function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Return f(mean), and the slopes (m, n) of f in xi of x = m + L xi; `drawn`: leading states that are known.
+    """Return f(mean), and the slopes (m, n) of f in xi, for x = mean + L xi.
 
-    The slopes in the drawn states are 0, since these have no variance.
+    The first `drawn` states are known and have no variance, so that the slopes in their xi are 0.
     """
 
     def of_others(others: jax.Array) -> jax.Array:
@@ -32,7 +32,7 @@ def slopes_given_drawn(
 def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
     """Return x given its leading states, drawn as mean + L sqrt(variance) draw; draw (drawn,) is standard normal.
 
-    L: unit triangular factor of x's covariance.
+    L is the unit triangular factor of the covariance of x.
     """
     drawn = len(draw)
     xi = square_root(x.variances[:drawn]) * draw
@@ -40,9 +40,9 @@ def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
 
 
 def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
-    """Return which of the leading states d (drawn,), given those before them, have no variance but rounding's.
+    """Return which of the leading states d (drawn,) have no variance given those before them, except rounding.
 
-    `second_moment`: bound of E[d^2], of which rounding is a share.
+    `second_moment` bounds E[d^2], and the variance of rounding is a share of it.
     """
     drawn = len(d)
     second_moment = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
@@ -50,9 +50,10 @@ def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
 
 
 def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
-    """Return x given its leading states d (drawn,), and log of their density; `certain` ones have none and count 0.
+    """Return x given its leading states d (drawn,), and the log of their density.
 
-    xi: what each leading state differs by from its mean given those before it; LOG_TURN: log 2 pi.
+    xi is the difference of each leading state from its mean given those before it. A `certain` state has no density,
+    and adds 0 to the log. LOG_TURN is log 2 pi.
     """
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]

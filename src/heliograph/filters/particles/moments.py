@@ -22,7 +22,7 @@ class FirstSums(NamedTuple):
     cosine: jax.Array
 
     def mean(self, angles: Angles) -> jax.Array:
-        """Return the weighted mean (n,), of an angle the mean direction, that of the sums of sine and cosine."""
+        """Return the weighted mean (n,); for an angle it is the direction of the sums of cosine and sine."""
         mean = jnp.asarray(self.value) / self.weight
         for i, sine, cosine in zip(angles, self.sine, self.cosine, strict=True):
             mean = mean.at[i].set(jnp.arctan2(sine, cosine))
@@ -39,7 +39,7 @@ class StateSums(NamedTuple):
 def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
     """Return the first sums of numbers x (N, n) by weights (N,), which need not sum to 1.
 
-    They are of the weights, their squares and x, and of sine and cosine of the components that are angles.
+    These are the sums of the weights, of their squares, of x, and of sine and cosine of the components that are angles.
     """
     angle_columns = x[:, list(angles)]
     sum_of_squares = jnp.sum(weight**2)
@@ -60,7 +60,7 @@ def pack_sums(sums: PyTree) -> jax.Array:
 def unpack_sums(vector: Array, function: Callable[..., PyTree], *arguments: Any) -> Any:
     """Return the sums that `pack_sums` joined in one vector, with the tree and shapes of function(*arguments).
 
-    The function is not computed: its result is known by its shapes alone.
+    The function is not computed: only the shapes of its result are needed.
     """
     leaves, structure = jax.tree.flatten(jax.eval_shape(function, *arguments))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()

@@ -67,7 +67,7 @@ def filter_particles(
         filter: the filter.
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
-        state: before the first row; that before any unless given.
+        state: the state before the first row; by default that before any data.
         begin: number of the first row.
 
     Returns:
@@ -164,9 +164,9 @@ def _compile_programs(
 def _compile_in_place(
     function: Call, filter: Any, arguments: tuple[Any, ...], differs_by_run: tuple[bool, ...], runs: int
 ) -> Any:
-    """Return a call of function(filter, *arguments), `runs` times, that reads these arrays in place.
+    """Return a call that computes function(filter, *arguments) for all `runs`, and reads these arrays in place.
 
-    `differs_by_run`: which arguments have an entry for each run. None without native code.
+    `differs_by_run` says which arguments have an entry for each run. Returns None without native code.
     """
     code = _compile_call(function, filter, arguments, differs_by_run)
     if code is None:
@@ -176,7 +176,7 @@ def _compile_in_place(
 
 
 def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs_by_run: tuple[bool, ...]) -> Any:
-    """Return the compiled function(filter, *arguments), to be called with the arguments; None without native code."""
+    """Return compiled code of function(filter, *arguments) that takes the arguments; None without native code."""
     choice = choose_code(function, (filter, *arguments), differs_by_run=[False, *differs_by_run])
     if choice.code is None:
         return None
@@ -199,8 +199,8 @@ def _advance_particle(
 ) -> tuple[PyTree, jax.Array, tuple[jax.Array, ...]]:
     """Move a particle and weigh it by z if the row `is_used`; return it, its log weight, and what it expected of z.
 
-    `number`: of the particle, of which its random numbers depend. The filter's methods take arrays of particles, here
-    of one.
+    The particle's random numbers depend on its `number`. The filter's methods take arrays of particles, so the particle
+    gets a leading axis of length 1 here.
     """
     numbers = jnp.asarray(number)[None]
     one_particle = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
@@ -214,7 +214,7 @@ def _advance_particle(
 def _sum_for_mean(
     filter: Any, row: DataRow, reference: tuple[Array, ...], group: ParticleGroup
 ) -> tuple[jax.Array, jax.Array]:
-    """Return, as a vector each, the first sums of a group's states, and the sums of what its particles expect of z."""
+    """Return two vectors: the first sums of a group's states, and the sums of what its particles expect of z."""
     group = jax.tree.map(jnp.asarray, group)
     states = filter.sum_for_mean(group.weight, group.particles)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
@@ -222,7 +222,7 @@ def _sum_for_mean(
 
 
 def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
-    """Return second sums of a group's states about the means of all particles, of which `states` has the sums."""
+    """Return second sums of a group's states about the means of all particles, whose first sums are in `states`."""
     weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
     sums = unpack_sums(states, filter.sum_for_mean, weight, particles)
     second: jax.Array = filter.sum_for_covariance(weight, particles, sums)
@@ -281,12 +281,12 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
 
 
 def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
-    """Return the random keys and numbers of rows that no particle changes.
+    """Return the random keys and numbers of rows, which do not depend on the particles.
 
     Args:
         filter: the filter.
-        z: measurements (rows, received), which keys depend on.
-        key: of the state before the rows; None before any.
+        z: measurements (rows, received), on which keys depend.
+        key: key of the state before the rows; None for the start before any data.
 
     Returns:
         Key of x_0; uniform numbers by which particles are chosen (rows,); the key after the last row; keys of noises,
@@ -313,7 +313,7 @@ class _ParticleLoop:
     """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
 
     def __init__(self, filter: Any, programs: _ParticlePrograms):
-        """Keep the filter, its compiled programs, the memory that they read and write, and the number of particles."""
+        """Keep the filter, its compiled programs and their memory; `pairs`: arrays of present and of next particles."""
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
         self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
         self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
@@ -321,7 +321,7 @@ class _ParticleLoop:
         self.pairs = list(zip(self.held, jax.tree.leaves(self.memory.particles), strict=True))
 
     def set_particles(self, particles: PyTree, log_weight: np.ndarray) -> None:
-        """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
+        """Set the particles (N, ...) before the next row, and their log weights, of which the largest must be 0."""
         memory, count = self.memory, self.count
         for array, values in zip(self.held, jax.tree.leaves(particles), strict=True):
             array[:count], array[count:] = values, values[0]  # copies of one particle fill the last lanes
@@ -362,7 +362,7 @@ class _ParticleLoop:
         return ParticleSums(states.copy(), received, second, reference=reference, density=np.asarray(density))
 
     def _choose_particles(self, start: float) -> None:
-        """Let particles go on as they are, or resampled where the effective number is too small."""
+        """Copy the particles to those of the next row, resampled if the effective number is too small."""
         memory, count = self.memory, self.count
         effective_number = self.sum**2 / self.square
         if not effective_number < self.resample * count:
@@ -384,7 +384,7 @@ class _ParticleLoop:
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:
-        """Keep what the heaviest particle before z expects: sums of innovations are taken about it."""
+        """Keep what the heaviest particle before z expects of z, about which sums of innovations are taken."""
         prior: Any = self.memory.prior
         heaviest: Any = np.argmax(prior)
         if not all(np.isfinite(array_of_expectations[heaviest]).all() for array_of_expectations in self.predicted):

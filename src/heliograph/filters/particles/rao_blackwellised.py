@@ -88,13 +88,13 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @compile_on_call
     def init(self) -> PartlyDrawn:
-        """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
+        """Return the law of x_0 in every particle, with drawn states unless all plants are linear."""
         key, start_key = self.start_keys()
         particles = self.draw_start(start_key, jnp.arange(self.particles))
         return self.make_state(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def allocate_particles(self, count: int) -> Any:
-        """Return arrays of so many particles, to be filled: in each mode mean, factors and log probability."""
+        """Return arrays for `count` particles, to be filled: in each mode a mean, factors and a log probability."""
         modes, n = len(self.initial), len(self.order)
         arrays: Any = [np.zeros((count, modes, *shape)) for shape in ((n,), (n * (n - 1) // 2,), (n,), ())]
         mean, lower, variances, log_mode = arrays
@@ -114,7 +114,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return key, own
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
-        """Return the law of x_0 for the particles of these numbers (B,), drawn states first, in every mode."""
+        """Return the law of x_0 in every mode for the particles with these numbers (B,); drawn states come first."""
         plants, count, order = list_mode_models(at(self.plant, k=0)), len(numbers), np.array(self.order)
         prior = from_covariance(plants[0].initial_mean[order], plants[0].initial_covariance[order][:, order])
         x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), prior)
@@ -125,7 +125,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @predicts
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
-        """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
+        """Resample if the effective number is too small, and then move each particle's Gaussian by each mode's law."""
         key, choice_key, noise_key = self.keys_of_prediction(state.key)
         chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
         particles = jax.tree.map(lambda leaf: leaf[chosen], self.get_particles(state))
@@ -166,9 +166,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return jax.vmap(condition_on_draw)(x, draw_normals(key, numbers, self.drawn, self.particles))
 
     def _move_particle(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
-        """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
+        """Return the law of f(x) + w of one particle; f is affine in the states that have a variance."""
         order = np.array(self.order)
-        # Of a linear plant the drawn states may have a variance still; of others they are known.
+        # A linear plant may have drawn states that still have a variance. With other plants they are known.
         noise, known_count = factor_noise_covariance(plant, u), 0 if self._is_linear([plant]) else self.drawn
 
         def move(x: jax.Array) -> jax.Array:
@@ -186,12 +186,12 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @corrects
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
-        """Draw mode and drawn states from a law q that knows z, weigh by p(z) p / q, and condition the rest on z."""
+        """Draw mode and drawn states from a law q that uses z, weigh by p(z) p / q, and condition the rest on z."""
         z = jnp.asarray(z)
         key, proposal_key = self.keys_of_correction(state.key, z)
         weighed = self.weigh_particles(self.get_particles(state), law=None, numbers=None, key=proposal_key, z=z, k=k)
         log_likelihood = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
-        # All weights zero: the row is not used.
+        # If all weights become zero, the row is not used.
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
         is_used = (self.uses_empty_rows | ~jnp.all(jnp.isnan(z))) & (log_likelihood > -jnp.inf)
@@ -223,7 +223,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
     def _find_atoms_by_mode(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
-        """Return z with each mode's atoms (Gaussians of its mixture), and with one Gaussian in their place."""
+        """Return z with each mode's atoms, the Gaussians of its mixture, and with one Gaussian that replaces them."""
         gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
         return ReceivedByMode(
             z=z,
@@ -240,7 +240,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return tuple(i for i, place in enumerate(self.order) if place in angles)
 
     def _measure(self, sensors: Sequence[AbstractSensor], mode: jax.Array, x: jax.Array) -> jax.Array:
-        """Return h(x) of the mode's sensor, of x with the drawn states first."""
+        """Return h(x) by the sensor of this mode, for a state x that has the drawn states first."""
         position = self._in_plants_order(x)
         if len(sensors) == 1:
             return sensors[0].measure(position)
@@ -305,9 +305,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def _linearised_posterior(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, mode: jax.Array, x: Gaussian
     ) -> tuple[Gaussian, jax.Array]:
-        """Return x given z in this mode, and the log density of z, of z = gain h(x) + n.
+        """Return x given z = gain h(x) + n in this mode, and the log density of z.
 
-        h is linearised at the mean, in all states; n is one Gaussian in place of the atoms.
+        h is linearised at the mean of x in all states. n is one Gaussian that replaces the atoms.
         """
         gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
         y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
@@ -368,7 +368,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> ReceivedSums:
-        """Return sums over particles (B,), modes and the channel's atoms of innovations less that of a reference."""
+        """Return sums over particles (B,), modes and atoms of the innovations less the reference innovation."""
         base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
         return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
 
@@ -388,8 +388,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return sum_clouds_for_covariance(weight, particles, sums, self._angles_in_order())
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
-        """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
-        plants_order, weight = np.argsort(self.order), sums.first.weight  # the inverse permutation
+        """Return mean and covariance over particles and modes; the mean of an angle is the mean direction."""
+        plants_order, weight = np.argsort(self.order), sums.first.weight  # sums have the drawn states first
         mean = sums.first.mean(self._angles_in_order())
         modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
         return Estimate(mean[plants_order], (second / weight)[plants_order][:, plants_order], self.claim, modes)

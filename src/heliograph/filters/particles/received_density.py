@@ -40,9 +40,9 @@ class ReceivedAtoms(Module):
         return expected
 
     def log_densities(self, y: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
-        """Return log p(z | y) of the components of z (m,) that arrived, for each y (N, p); -inf where y is no number.
+        """Return log p(z | y) of the components of z (m,) that arrived, for each y (N, p); -inf where y is not finite.
 
-        p is the sum over the atoms a of weight_a N(z; gain_a y + offset_a, noise_a). `angles`: components of z.
+        p is the sum over the atoms a of weight_a N(z; gain_a y + offset_a, noise_a). `angles` are those among z.
         """
 
         def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
@@ -57,9 +57,9 @@ class ReceivedAtoms(Module):
         return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
     def moments(self) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean gain (m, p), mean offset (m,), and the noise's covariance about it (m, m).
+        """Return the mean gain (m, p), the mean offset (m,), and the noise's covariance (m, m) of one Gaussian.
 
-        One Gaussian in place of the atoms: the spread of their offsets counts as noise.
+        It replaces the atoms. The spread of their offsets counts as noise.
         """
         weight, offset = jnp.asarray(self.weight), jnp.asarray(self.offset)
         mean = weight @ offset
@@ -71,14 +71,15 @@ class ReceivedAtoms(Module):
 def _log_density_of_atom(expected: jax.Array, noise: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
     """Return log N(z; expected, noise) of the components of z (m,) that arrived, for each expectation (N, m).
 
-    `noise`: a covariance; `angles`: components of z; LOG_TURN: log 2 pi. -inf where what is expected is no number.
+    `noise` is a covariance (m, m), and `angles` are the components of z that are angles. The result is -inf where an
+    expectation is not finite. LOG_TURN is log 2 pi.
     """
     present = ~jnp.isnan(z)
-    # z - E z, 0 for what did not arrive and for an E z that is no number.
+    # z - E z, and 0 for what did not arrive and where E z is not finite.
     valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
     value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
     value = jnp.where(valid[:, None] & present, value, 0.0)
-    # Whitened by the factor of the noise; what did not arrive has variance 1.
+    # The noise's factor whitens z - E z. What did not arrive gets the variance 1.
     factor = jnp.linalg.cholesky(jnp.where(present[:, None] & present, noise, jnp.eye(len(z))))
     whitened = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
     log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
@@ -96,9 +97,9 @@ class ReceivedDensity(Module):
     atoms: ReceivedAtoms
 
     def given_arrivals(self, z: jax.Array) -> tuple[ReceivedAtoms, jax.Array]:
-        """Return the atoms, and the chance (M,), of the smallest set of arrivals that holds all that arrived, by mode.
+        """Return the atoms in each mode, and the chance (M,), of the smallest set that holds all that arrived.
 
-        Atoms: the Gaussians whose mixture is what arrives, by mode and set of arrivals.
+        Atoms are the Gaussians whose mixture is what arrives. There are some for each mode and each set of arrivals.
         """
         pattern = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
         atoms: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, pattern], self.atoms)
@@ -139,7 +140,7 @@ def find_received_density(
 
 
 def _list_atoms(sensor: AbstractSensor, outcome: ArrivalOutcome) -> list[AffineComponent]:
-    """Return the atoms of one set of arrivals; raise unless each has noise in all that arrives.
+    """Return the atoms of one set of arrivals; raise ValueError unless each has noise in all that arrives.
 
     An atom is one Gaussian of what arrives, given the signal: gain, offset, noise covariance and weight.
     """
@@ -160,7 +161,7 @@ def _list_atoms(sensor: AbstractSensor, outcome: ArrivalOutcome) -> list[AffineC
 def _check_noise(covariance: np.ndarray) -> None:
     """Raise ValueError unless every combination of what arrives has noise.
 
-    CERTAIN: 1e-14, the eigenvalue of the noise's correlations up to which a combination has no noise.
+    A combination has no noise if its eigenvalue of the noise's correlations is at most CERTAIN, 1e-14.
     """
     deviation = np.sqrt(np.diagonal(covariance))
     unit = np.where(deviation > 0, deviation, 1.0)
@@ -171,9 +172,9 @@ def _check_noise(covariance: np.ndarray) -> None:
 
 
 def _stack_atoms(atoms: Sequence[AffineComponent], count: int) -> ReceivedAtoms:
-    """Stack atoms into arrays of `count`, the missing ones of weight zero.
+    """Stack atoms, the Gaussians of what arrives, into arrays of length `count`.
 
-    An atom is one Gaussian of what arrives. Weights are divided by their sum.
+    Atoms of weight 0 fill up the arrays. The weights are divided by their sum.
     """
     padded = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
     fields = zip(*padded, strict=True)

@@ -21,32 +21,31 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
 
 
 def resample_concrete_weights(weight: np.ndarray, start: float) -> np.ndarray:
-    """Resample known weights (N,) of any sum like `resample_systematically`, in a time that does not grow by log N.
+    """Resample known weights (N,) of any sum as `resample_systematically` does, without a search for each draw.
 
-    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; of draw j the
-    index is the count of particles drawn for lower j alone. `start` in [0, 1): the one random number of systematic
-    resampling.
+    `start` in [0, 1) is the one random number of systematic resampling. With the distribution function C, draw j is
+    the particle i with N C_(i-1) < start + j <= N C_i. So it is the number of particles i with N C_i < start + j.
     """
     count, ends = len(weight), np.cumsum(weight)
     ends *= count / ends[-1]
     ends += 1 - start
     count_below = np.minimum(ends.astype(np.int64), count)
-    count_below[-1] = count  # whatever rounding says
+    count_below[-1] = count  # the last particle ends at C = 1, which rounding may miss
     return np.cumsum(np.bincount(count_below)[:count])
 
 
 def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
     """Draw standard normal numbers (B, size) for the particles that `numbers` (B,) lists; for all `particles` if None.
 
-    A number is a function of the key and of its index among all numbers, so that particles draw the same together or
-    one by one. Fewer than MANY (10,000) numbers in all are those of `jax.random.normal(key, (particles, size))`. More
-    are of single precision, two from each 64 random bits: 2^23 values, at most 5.3, in half of the time; native code
-    and XLA agree on them to single precision. STEP: 2^-22, between two of the uniform numbers.
+    A number depends on the key and on its index among all numbers, so that particles draw the same together or one by
+    one. Fewer than MANY (10,000) numbers in all are those of `jax.random.normal(key, (particles, size))`. More have
+    single precision, and are made two from each 64 random bits, in half of the time. They have 2^23 values, up to 5.3.
+    Native code and XLA agree on them to single precision. STEP, 2^-22, is the distance of two uniform numbers.
     """
     if size * particles < MANY:
         smallest = np.nextafter(-1.0, 0.0)
         uniform = jnp.maximum(smallest, 2 * draw_uniforms(key, numbers, size, particles) + smallest)
-        # Uniform on (-1, 1), of which the inverse error function makes normal numbers.
+        # The inverse error function turns uniform numbers on (-1, 1) into normal ones.
         return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
     words = draw_random_bits(key, numbers, -(-size // 2), particles)
     words_of_32_bits = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
@@ -58,7 +57,7 @@ def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles
 
 def draw_uniforms(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
     """Draw numbers of [0, 1), (B, size), for particles: those of `jax.random.uniform(key, (particles, size))`."""
-    # 52 random bits as the mantissa of a number of [1, 2), less 1.
+    # 52 random bits are the mantissa of a number in [1, 2), from which 1 is subtracted.
     mantissa = draw_random_bits(key, numbers, size, particles) >> np.uint64(12)
     return jax.lax.bitcast_convert_type(mantissa | np.float64(1.0).view(np.uint64), jnp.float64) - 1.0
 
@@ -67,7 +66,7 @@ def draw_random_bits(key: jax.Array, numbers: jax.Array | None, size: int, parti
     """Draw `size` words of 64 bits, (B, size), for each of the particles of these numbers (B,), or for all."""
     if numbers is None:
         return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
-    # The index of each word among those of all particles, which is folded into the key: two halves of 32 bits.
+    # Each word's index among the words of all particles is folded into the key, which gives two halves of 32 bits.
     positions = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
     fold_positions = jax.vmap(jax.vmap(partial(jax.random.fold_in, key)))  # over particles and words
     halves = fold_positions(positions).astype(jnp.uint64)
@@ -80,9 +79,9 @@ def effective_number(weight: jax.Array) -> jax.Array:
 
 
 def fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
-    """Return the key made of another one and of the bits of a measurement.
+    """Return a new key from a key and the bits of a measurement, with 0 in place of a missing number.
 
-    So the same filter draws otherwise after other data; a missing number counts as 0.
+    So the same filter draws other numbers after other data.
     """
     bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
     for word in bits.ravel():

@@ -84,16 +84,16 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def init(self) -> StateParticles:
         """Draw the particles from the law of x_0.
 
-        Their log weights are 0 (equal); `moved`: whether a step was predicted.
+        All log weights are 0. `moved` is False until a step is predicted.
         """
         key, start_key = self.start_keys()
         x = self.draw_start(start_key, jnp.arange(self.particles))
         return self.make_state(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def make_state(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
-        """Return the state of particles (N, n) with these log weights, whose noises were all drawn.
+        """Return the state of particles (N, n) with these log weights, after all noises were drawn.
 
-        `law`: of the last move, from which z may still draw again under the optimal proposal; here without spread.
+        `law` is that of the last move, from which the optimal proposal may draw again. Here it has no spread left.
         """
         n = position.shape[1]
         law = MoveLaw(position, jnp.zeros((n, n)), jnp.zeros_like(position)) if self.optimal else None
@@ -121,9 +121,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     @predicts
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
-        """Resample where the effective number is too small, then move each particle with a noise of its own.
+        """Resample if the effective number is too small, and then move each particle with a noise of its own.
 
-        `law`: of that move, which a proposal that knows z uses; None where it does not.
+        `law` is the law of that move, from which an optimal proposal draws again. It is None for the prior proposal.
         """
         key, choice_key, noise_key = self.keys_of_prediction(state.key)
         chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
@@ -158,12 +158,11 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u)
 
     def _find_law_of_move(self, plant: AbstractPlant, moved: jax.Array, law: MoveLaw, u: jax.Array) -> MoveLaw:
-        """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
+        """Return the law of x+ of each particle, from which the optimal proposal draws again with z.
 
-        So a first measurement that is far more precise than x_0 leaves more than few of the particles.
-
-        `law`: of the move (center, root of the noise's covariance, draws), from which z may draw again; `moved`: not
-        the first step.
+        `law` is that of the particle's move: center, root of the noise's covariance, and draws. At the first step
+        (`moved` is False) of a linear plant it is replaced by the law of A x_0 + w, with x_0 random too. Else a
+        measurement that is far more precise than x_0 would leave only few of the particles.
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return law
@@ -177,9 +176,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     @corrects
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
-        """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z.
+        """Weight each particle by the density of z; under the optimal proposal each is first drawn again with z.
 
-        A row that no particle explains is not used. `law`: of the last move, for drawing anew.
+        `state.law` is the law of the last move, from which is drawn. A row that no particle explains is not used.
         """
         z = jnp.asarray(z)
         key, proposal_key = self.keys_of_correction(state.key, z)
@@ -199,10 +198,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def weigh_particles(
         self, position: jax.Array, law: MoveLaw | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> WeighedParticles:
-        """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
+        """Weigh particles (B, n) by z, after they are drawn again with z if the `law` of their move is given.
 
-        `predicted` (B, p): h(x), what they expected before z was known. `correction`: log of the law of the move over
-        that of the draw. `numbers`: of the particles, None for all.
+        `predicted` (B, p) is h(x) before z was known. `correction` is the log of the move's density over that of the
+        draw. `numbers` are those of the particles, None for all.
         """
         sensor, atoms = at(self.sensor, k), self.find_received_atoms(z, k)
         predicted = signal = jax.vmap(sensor.measure)(position)
@@ -222,9 +221,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
-        """Return first and second sums of how far innovations of particles (B,) and atoms are from that of a reference.
+        """Return first and second sums of the innovations of particles (B,) and atoms, less a reference innovation.
 
-        Atoms: the Gaussians whose mixture the channel is; `predicted`: what particles expect of z.
+        Atoms are the Gaussians whose mixture is the channel. `predicted` holds what particles expect of z.
         """
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         joint_weight, difference = expected.find_innovations(weight, *predicted)
@@ -238,9 +237,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
         k: Step,
         density: jax.Array,
     ) -> Innovation:
-        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood.
+        """Return z - E z over particles and atoms, the covariance of z, and the log-likelihood.
 
-        `received`: first and second sums of innovations about that of the `reference` particle; `density`: log p(z).
+        `received` holds first and second sums of innovations about that of the `reference` particle. `density` is
+        log p(z).
         """
         first_sums_of_innovations, second_sums_of_innovations = received
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)

@@ -43,8 +43,8 @@ class LinkOfBits(Module):
     def find_probabilities(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
         """Return the probability of each combination of bit error rates, given the mode that was told as z[flag].
 
-        `flag`: output at which the mode is told, None without modes; `weights` (modes, combinations): their
-        probabilities in each mode. All modes count alike where none was told.
+        `self.flag` is the output that tells the mode, or None without modes. `self.weights` (modes, combinations) are
+        the probabilities in each mode. If z[flag] is NaN, all modes are equally likely.
         """
         weights = jnp.asarray(self.weights)
         if self.flag is None:
@@ -88,15 +88,15 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
 
 
 def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
-    """Return the channel in each mode of its chain, without the output that tells the mode; none where none is told.
+    """Return the channel in each mode of its chain, without the output that tells the mode.
 
-    A channel of words (numbers sent in bits) may tell the mode of its only chain with an output of its own, a
-    `ModeOutput`, the last one.
+    Words are numbers that are sent in bits. A channel of words may tell the mode of its only chain by its last output,
+    a `ModeOutput`. If it does not, the list is empty.
     """
     outputs = channel.in_parallel
     mode_outputs = [output for output in outputs if isinstance(output, ModeOutput)]
     chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
-    # One flag, of the only chain, and last.
+    # There must be one such output, for the only chain, in the last place.
     is_told = len(mode_outputs) == 1 and set(chains) == {mode_outputs[0].memory.identity}
     if not is_told or outputs[-1] is not mode_outputs[0] or len(outputs) < 2:
         return []
@@ -113,7 +113,7 @@ def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
 def _fix_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
     """Return a map in one mode of its chain.
 
-    A link without modes is kept, with the links within it fixed.
+    In a link that has no modes itself, the links inside it are fixed.
     """
     if isinstance(link, Modes):
         return link.given(mode)
@@ -174,7 +174,7 @@ def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
 
 
 def _multiply_likelihoods(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:
-    """Return the product of likelihoods entry by entry; ones of this shape if there are none."""
+    """Return the product of all factors entry by entry, or ones of this shape if there are no factors."""
     product = jnp.ones(shape) if not factors else factors[0]
     for factor in factors[1:]:
         product = product * factor

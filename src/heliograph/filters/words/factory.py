@@ -42,7 +42,8 @@ class WordAlphabet(NamedTuple):
 def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
     """Return the words of an encoder, or of a sensor that reports multiples of its resolution.
 
-    A word is a number rounded to steps, sent in bits. `bits` 0: of a sensor's resolution, without an end of the range.
+    A word is a number that is rounded to steps and sent in bits. The words of a sensor's resolution have `bits` 0,
+    since their range has no end.
     """
     m = len(sensor.outputs)
     rounded = find_rounded_noises(sensor)
@@ -68,10 +69,10 @@ def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
 
 
 def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the second moments of the words that arrive as numbers about their centres, modes averaged over.
+    """Return the second moments of the arriving words as numbers about their centres, averaged over modes.
 
-    A word is a number sent in bits, its centre the middle of the range. Outputs that tell a mode are no words; moments
-    are those given that the words arrive.
+    A word is a number that is sent in bits, and its centre is the middle of the range. An output that tells a mode is
+    no word, and is left out. The moments are conditional on the words' arrival.
     """
     word_links = [output for output in channel.in_parallel if not isinstance(output, ModeOutput)]
     link = word_links[0] if len(word_links) == 1 else Stack(word_links)

@@ -54,8 +54,8 @@ Smooth = Callable[[jax.Array, jax.Array], LikelihoodStep]
 def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return Q(a) = P(t > a) and phi(a) of a >= 0, with one exponential and one reciprocal, to 5e-16 of themselves.
 
-    With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is a polynomial in c, from -1 to 1.
-    POWERS: its coefficients; CENTRE: K, 3.75.
+    With x = a / root 2 and c = (x - K) / (x + K), which is between -1 and 1, (1 + 2 x) e^(x^2) erfc x is a polynomial
+    in c. POWERS holds its coefficients, from the constant on, and CENTRE is K, 3.75.
 
     Source: Shepherd and Laframboise, Chebyshev approximation of (1 + 2 x) exp(x^2) erfc x (1981), in powers of c.
     """
@@ -83,9 +83,10 @@ def step_without_dither(a: jax.Array, width: jax.Array) -> LikelihoodStep:
 
 
 def smooth_step_by_uniform(a: jax.Array, width: jax.Array) -> LikelihoodStep:
-    """Return a step by a uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, Q and phi.
+    """Return a likelihood that rises from 0 to 1 at a, smoothed by a uniform dither of width D.
 
-    A step is a likelihood that rises from 0 to 1 at a; t is standard normal, Q its tail, phi its density.
+    t is standard normal, with the tail Q and the density phi. The moments of a smoothed step are differences between
+    a - D / 2 and a + D / 2, divided by D, of I(a) = E max(t - a, 0) = phi(a) - a Q(a), of Q and of phi.
     """
     low, high = a - width / 2, a + width / 2
     (q_low, p_low), (q_high, p_high) = (signed_tail_and_density(x) for x in (low, high))

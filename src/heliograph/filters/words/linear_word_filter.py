@@ -77,8 +77,9 @@ class LinearWordsFilter(AbstractWrapper):
     def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
         """Return q - c - E[g] d of the received words q and dithers d, with E[g] of the mode that was told.
 
-        c: the words' centres; a dither was added before rounding, and is taken off times the mean gain. `flag`: index
-        of the number that tells the mode, None without modes.
+        c are the words' centres. A dither was added before rounding, so the mean gain times the dither is subtracted.
+        `self.flag` is the index of the number that tells the mode, or None without modes. If that number is NaN, the
+        result of dithered words is NaN.
         """
         about_centres = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
@@ -148,9 +149,9 @@ def build_behind_words(
 
 
 def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) -> None:
-    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already.
+    """Raise ValueError if the dither's error has no known law, or if the sensor rounds already.
 
-    The law of a dither's error is not known where a gain depends on the past (`fades_with_memory`).
+    Behind gains that depend on the past (`fades_with_memory`), a "stochastic" or "subtracted" dither has none.
     """
     if encoder.dither in ("stochastic", "subtracted") and fades_with_memory:
         expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
@@ -167,10 +168,10 @@ def _claim_despite_overload(overload: Overload) -> Claim:
 
 
 def _add_rounding_noise(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
-    """Return the sensor of y - c, c the centre of the words, whose noise has the error of rounding to words.
+    """Return the sensor with the error of rounding y to words as a part of its noise, about the words' centre.
 
-    `gaussian`: y is Gaussian, so that the error's variance is known, not bounded; `matters`: its second moment enters
-    the claim, as behind a random gain.
+    If `gaussian`, y is Gaussian, and the error's variance is known and not only bounded. If `matters`, the error's
+    second moment enters the claim, as it does behind a random gain.
     """
     m = len(sensor.outputs)
     step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
@@ -192,11 +193,10 @@ def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
 
 
 def _mean_gains(channel: Channel) -> np.ndarray:
-    """Return E[g] of each output of a channel of the numbers that words stand for: the row sums of E[G].
+    """Return E[g] (m,) of each output of the channel of the numbers that words stand for.
 
-    Each output carries one word, so that its row has one gain.
+    Each output carries one word, so that its row of E[G] has one entry that is not 0, and the row's sum is E[g].
     """
-    # `channel`: the channel of the values that words stand for.
     gains_by_step = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(channel)]
     if any(not np.array_equal(gains, gains_by_step[0]) for gains in gains_by_step):
         raise fail("channel of words whose dither is taken off", "the same mean gains at every step", "others")
@@ -206,7 +206,7 @@ def _mean_gains(channel: Channel) -> np.ndarray:
 def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:
     """Return whether what the sensor measures is Gaussian before any data.
 
-    So it is where the initial law and all noises of plant and sensor are Gaussian.
+    It is Gaussian if the initial law and all noises of plant and sensor are.
     """
     laws: list[object] = [first(plant).deviation]
     laws += [step.noise for step in unstack(plant)] + [step.noise for step in unstack(sensor)]

@@ -130,10 +130,10 @@ def _sum_blocks(
 
 
 def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
-    """Return the likelihoods of the bits from number `count` on (bits, 2), filled up with bits that are surely zero.
+    """Return the likelihoods (bits, 2) of the bits from index `count` on, filled up with bits that are certainly 0.
 
-    `pairs` (bits, 2): likelihoods that a bit was sent as 0 and as 1, the lowest first. `count` is known at run time
-    only: shifts of 1, 2, 4, ... are made as its binary digits say.
+    `pairs` (bits, 2) holds the likelihoods that each bit was sent as 0 and as 1, the lowest bit first. `count` is known
+    only at run time, so there is a shift by 1, 2, 4, ... for each of its binary digits that is 1.
     """
     shifted, quotient, shift = pairs, count, 1
     while shift < len(pairs):
@@ -147,8 +147,8 @@ def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
 def sum_overloads(pair: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
     """Return the sums over y beyond both ends of the range, where all bits are zeros or ones.
 
-    `pair` (bits, 2): likelihoods of each bit's 0 and 1; t = (y - mean) / deviation; an overload begins half a step
-    beyond an end.
+    `pair` (bits, 2) holds the likelihoods of each bit's 0 and 1. t is (y - mean) / deviation. An overload begins half a
+    step beyond an end of the range.
     """
     ends = jnp.array([0.0, 2.0**grid.bits - 1])
     outwards = jnp.array([-1.0, 1.0])

@@ -58,7 +58,8 @@ class Overload(NamedTuple):
     def describe(self, node: str, filter: str) -> str:
         """Return a line that says how often words are overloaded, and what that may do to the claim of a filter.
 
-        A word is overloaded if its number lies beyond the range; `bound`: share of the rms error.
+        A word is overloaded if its number lies beyond the range. `self.bound` bounds its effect, as a share of the rms
+        error.
 
         Args:
             node: name of the sender's node.
@@ -138,9 +139,9 @@ def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
 def _find_models_of_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
-    """Return motion, sensing and link at a step; those of step 0 where nothing varies.
+    """Return the motion, the sensing and the link at step k.
 
-    `links`: moments of the link at each step, None where there is none.
+    `links` holds the link's moments at each step, or is None if there is no link.
     """
     link = None if links is None else links[k]
     return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), link
@@ -164,7 +165,8 @@ def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
 def _find_sensing(sensor: LinearSensor) -> Sensing:
     """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error.
 
-    y = C x + noise, c the centre of the words. Rounding error: what the noise's covariance has beside the sensor's own.
+    y = C x + noise, and c is the centre of the words. v is the sensor's own noise. The covariance of the rounding error
+    is that of the whole noise less Cov v.
     """
     law = sensor.noise
     assert isinstance(law, RoundedNoise)
@@ -247,8 +249,8 @@ def _bound_error(
 def refuse_overload(overload: Overload) -> None:
     """Raise ValueError where words are overloaded more often than once in a thousand steps.
 
-    A word is overloaded if its number lies beyond the range. MOST: 1e-3; `bound`: share of the rms error, infinite if
-    there is none.
+    A word is overloaded if its number lies beyond the range. MOST is 1e-3. `overload.bound` is the bound of the error
+    that overloads make, as a share of the rms error. It is infinite if there is no bound.
     """
     largest = float(np.max(overload.probability))
     if largest > MOST:

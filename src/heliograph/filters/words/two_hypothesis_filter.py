@@ -87,8 +87,8 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         def append_measured(x: Gaussian) -> Gaussian:
             """Return the joint law of the state x and the signal that is measured, under one hypothesis.
 
-            A hypothesis: that the last words were right in their leading bits, or not. `base`: the filter of one
-            Gaussian; k: the step.
+            A hypothesis says that the last words were right in their leading bits, or that they were not. `base` is the
+            filter of one Gaussian, and k the step.
             """
             signal = base.predict_signal(x, k)
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
@@ -117,13 +117,12 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self.base, step.map_states(_merge_hypotheses), self.base)
 
     def _split_by_answer(self, hypothesis: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
-        """Condition one hypothesis on word i, and on each answer to whether its leading bits are right: yes, no.
+        """Condition one hypothesis on word i, and on each answer to the question whether its leading bits are right.
 
-        Returns the hypothesis given each answer (2, ...), and the probabilities of word and answer (2,). A
-        hypothesis: that the last words were right, or not.
-
-        LEADING: 3 bits; SURE: 1e-10, the share of probability below which an answer is impossible. `row`: of y_i, in
-        the root of the law of state and signal.
+        A hypothesis says that the last words were right, or that they were not. Returns the hypothesis given each
+        answer (yes, no) (2, ...), and the probabilities of word and answer (2,). There are LEADING (3) leading bits. An
+        answer with a share of the probability below SURE, 1e-10, counts as impossible. `row` is that of y_i in the root
+        of the law of state and signal.
         """
         row = hypothesis.root[len(self.states) + i]
         prior = self.base.find_signal_prior(hypothesis, i)
@@ -132,7 +131,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         is_possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
 
         def impose(is_possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-            """Return the hypothesis with these moments of y_i, as it is where the answer is impossible."""
+            """Return the hypothesis with these moments of y_i, or unchanged if the answer is impossible."""
             shift, ratio = jnp.where(is_possible, shift, 0.0), jnp.where(is_possible, ratio, 1.0)
             return impose_moments_of_combination(hypothesis, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
 
@@ -162,10 +161,10 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         four_parts = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
 
         def merge_chosen(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
-            """Merge the chosen of the four parts; return their probability too. Without any, merge all.
+            """Merge the chosen parts to one Gaussian, and return their probability; if they have none, merge all parts.
 
-            The parts: two hypotheses on the words before, times two answers on this one; `mass`: their probabilities
-            (2, 2), `total` the sum.
+            There are four parts: two hypotheses on the words before, times two answers on this word. `mass` (2, 2)
+            holds their probabilities, and `total` is the sum.
             """
             chosen_mass = jnp.where(chosen, mass, 0.0).ravel()
             probability = jnp.sum(chosen_mass)

@@ -170,10 +170,10 @@ class WordFilter(AbstractGaussianStateFilter):
         )
 
     def _find_effect_of_word(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
-        """Return what the received word of y_i says of it: log probability, shift of the mean, ratio of variances.
+        """Return what the received word says of y_i: log probability, shift of the mean, ratio of the variances.
 
-        `certain`: no bit can flip, so that y_i lies in the word's cell; else likelihoods of bits are summed over all
-        words.
+        If `self.certain`, no bit can flip, and y_i lies in the word's cell. Else the likelihoods of the bits are summed
+        over all words.
         """
         grid = self._word_grid(i, words)
         if self.certain:
@@ -238,10 +238,10 @@ class ReceivedWords(NamedTuple):
 
 
 def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
-    """Return presence, number and dither of the first copy that came; zeros of none.
+    """Return presence, number and dither of the first copy that arrived, or False and zeros if none did.
 
-    Copies are tuples of these three. They are passed from the last to the first, so that the first one that came
-    stays.
+    Each copy is a tuple of these three. The loop goes from the last copy to the first, so that the first one that
+    arrived overwrites all others.
     """
     some_is_present, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
     for is_present, own_number, own_dither in reversed(copies):

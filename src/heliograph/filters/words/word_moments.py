@@ -36,13 +36,13 @@ LEAST = 1e-3  # width, in deviations, of the dither by which edges are smoothed:
 def sum_by_edges(
     t: jax.Array, jumps: jax.Array, at_zero: jax.Array, width: jax.Array, smooth: Smooth
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] of a likelihood L(t), t standard normal, constant but for jumps at edges.
+    """Return M = E L, E[t L] and E[t^2 L] of a likelihood L(t) that is constant but for jumps, with t standard normal.
 
-    M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t) over
-    the edges t, Q and phi the normal tail and density.
+    The jump J at an edge is L above it less L below it. With the normal tail Q and density phi, sums over the edges t
+    give M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t).
+    `at_zero` is L(0). `width` is that of the dither that smooths the edges, in deviations, and is at least LEAST.
 
-    `jumps`: J, L above each edge less L below it. `at_zero`: L(0). `width`: of the dither that smooths the edges, in
-    deviations, LEAST at least. Shapes: t (edges,), jumps (..., edges), at_zero (...), of several likelihoods at once.
+    Shapes: t (edges,), jumps (..., edges), at_zero (...), for several likelihoods at once.
     """
     sign = jnp.where(t < 0, -1.0, 1.0)
     smoothed_step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
@@ -118,16 +118,16 @@ def sum_words_near_prior(
 ) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
 
-    L is the likelihood of the word that y is rounded to, t = (y - mean) / deviation. WINDOW blocks of 2^BLOCK words;
-    REACH: 8.5 deviations, beyond which there is no probability. `pairs`: likelihoods of each bit's 0 and 1, for each
-    combination of error rates, of the probability `weights`; `grid`: all words.
+    L is the likelihood of the word to which y is rounded, and t = (y - mean) / deviation. Beyond REACH, 8.5 deviations,
+    there is no probability, so that WINDOW blocks of 2^BLOCK words are summed. `pairs` holds the likelihoods of each
+    bit's 0 and 1 for each combination of error rates, with the probabilities `weights`. `grid` has all words.
     """
     count = WINDOW * 2**BLOCK
     lowest = prior.mean - REACH * prior.deviation
     start = jnp.floor((lowest - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK  # of the block that holds it
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
     sums = sum_neighbouring_words(pairs, weights, start, blocks=WINDOW, grid=grid, prior=prior, dither=dither)
-    # The word that was received, where it is none of these.
+    # The received word is added if it is not among these.
     is_outside = (received < start) | (received >= start + count)
     likelihood = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
     return sums.plus(sum_one_word(likelihood * is_outside, received, grid, prior, dither))
@@ -136,10 +136,10 @@ def sum_words_near_prior(
 def sum_one_word(
     likelihood: jax.Array, index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] of a likelihood that is this number in the cell of one word, 0 elsewhere.
+    """Return the sums M, E[t L], E[t^2 L] of an L that is `likelihood` in the cell of one word, and 0 elsewhere.
 
-    t = (y - mean) / deviation; BEYOND_ALL: 40 deviations, in place of infinity. SMOOTH: the form of the edges by kind
-    of dither.
+    t = (y - mean) / deviation. BEYOND_ALL, 40 deviations, stands for infinity. SMOOTH holds the form of the edges for
+    each kind of dither.
     """
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
@@ -147,7 +147,7 @@ def sum_one_word(
         is_lower, is_upper = jnp.array([True, False]), jnp.array([False, True])
         t = jnp.where(is_lower & (index <= 0), -BEYOND_ALL, t)
         t = jnp.where(is_upper & (index >= 2.0**grid.bits - 1), BEYOND_ALL, t)
-    # Up at the lower edge and down at the upper one; L(0) counts if 0 lies between.
+    # L jumps up at the lower edge and down at the upper one. L(0) is not 0 only if 0 lies between them.
     jumps = likelihood[..., None] * jnp.array([1.0, -1.0])
     at_zero = likelihood * ((t[0] < 0) & (t[1] >= 0))
     return sum_by_edges(t, jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
@@ -162,9 +162,9 @@ class WordEffect(NamedTuple):
 
 
 def find_effect_from_sums(sums: LikelihoodSums) -> WordEffect:
-    """Return the moments from the sums; log M is -inf where it is less than the smallest number.
+    """Return log M, and the mean and variance of t, from the sums M = E L, E[t L], E[t^2 L] of a likelihood L.
 
-    Sums M = E L, E[t L], E[t^2 L] of a likelihood L give log M, the mean of t, and its variance.
+    log M is -inf if M is below the smallest normal number.
     """
     is_possible = sums.mass > np.finfo(float).tiny
     mass = jnp.where(is_possible, sums.mass, 1.0)
@@ -185,16 +185,16 @@ def remove_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
 
 
 def find_effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
-    """Return what the word of number `index` does to y, where no bit can have flipped.
+    """Return what the word of number `index` says of y, if no bit can have flipped.
 
-    ADDED: variance of a dither, in squared steps, 0 for one that is taken off. FINE: least width of a step that is not
-    small; FAR: deviations from which edges have no digits.
+    ADDED holds the variance of a dither in squared steps, 0 for a dither that is subtracted again. Steps of at least
+    FINE deviations are not small. From FAR deviations on the sums over edges have no digits.
     """
     wider, variance_ratio = widen_by_dither(prior, grid, dither)
     by_cell = remove_dither(_cut_to_cell(index, grid, wider), variance_ratio)
     if not ADDED[dither]:
         return by_cell
-    # A dither of steps that are not small: the edges are smooth, but far away only cells have digits.
+    # If steps are not small, a dither smooths the edges of the cell. Far away only the cell itself has digits.
     away = jnp.abs((grid.low + index * grid.step - prior.mean) / prior.deviation)
     width = grid.step / prior.deviation
     by_smooth_edges = find_effect_from_sums(sum_one_word(jnp.ones(()), index, grid, prior, dither))
@@ -228,8 +228,8 @@ def _sum_wide_words(
 ) -> WordEffect:
     """Return the effect of a received word on y by a sum over the words within the prior's reach, 8.5 deviations.
 
-    `pairs`: likelihoods of each bit's 0 and 1, for each combination of error rates, of the probability `weights`;
-    `grid`: all words; `prior`: of y; `dither`: of the encoder.
+    `pairs` holds the likelihoods of each bit's 0 and 1 for each combination of error rates, with the probabilities
+    `weights`. `grid` has all words, `prior` is the law of y, and `dither` the kind of the encoder's dither.
     """
     return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
 
@@ -239,8 +239,8 @@ def _sum_fine_words(
 ) -> WordEffect:
     """Return the effect of a received word on y by a sum over cells of several words, and over all beyond the range.
 
-    The dither's variance widens the prior, and is removed after. `pairs`: likelihoods of each bit's 0 and 1, for each
-    combination of error rates, of the probability `weights`; `grid`: all words.
+    The dither's variance widens the prior, and is removed afterwards. `pairs` holds the likelihoods of each bit's 0 and
+    1 for each combination of error rates, with the probabilities `weights`. `grid` has all words.
     """
     wider, variance_ratio = widen_by_dither(prior, grid, dither)
     sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
@@ -252,20 +252,20 @@ def _sum_fine_words(
 def find_effect_of_bits(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return what the received bits of a word do to y: log probability, shift of its mean, ratio of its variances.
+    """Return what the received bits of a word say of y: log probability, shift of its mean, ratio of its variances.
 
-    Words of few bits are all summed; else those within the prior's reach, or cells of several where they are finer than
-    FINE deviations.
+    Words of few bits are all summed. Of others those within the prior's reach are summed, or cells of several words if
+    a step is finer than FINE deviations.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
-        weights: probabilities of the combinations, (..., combinations) of several likelihoods at once.
-        received: number of the word that came.
+        weights: probabilities of the combinations, (..., combinations) for several likelihoods at once.
+        received: number of the received word.
         grid: the words.
         prior: of y.
         dither: of the encoder.
     """
-    # Few bits: all words are cheap to sum, and leave no error.
+    # The sum over all words of few bits is cheap and exact.
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))

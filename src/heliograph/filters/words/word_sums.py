@@ -37,7 +37,7 @@ class SignalPrior(NamedTuple):
 
 
 def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
-    """Return the likelihoods of words by their numbers, the products of those of their bits; 0 of what is no word.
+    """Return the likelihoods of words by their numbers, products over their bits; 0 for a number beyond all words.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit, the lowest first, (bits, 2).
@@ -55,7 +55,7 @@ def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
 def tabulate_likelihoods(pair: jax.Array) -> jax.Array:
     """Return the likelihoods of all words, the product of those of their bits (2^bits,).
 
-    `pair` (bits, 2): likelihoods of a zero and a one of each bit, the lowest first.
+    `pair` (bits, 2) holds the likelihoods of a zero and a one for each bit, the lowest bit first.
     """
     table = jnp.ones(1)
     for bit in range(len(pair)):

@@ -30,9 +30,9 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build_limited(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter of a plant without limits, and put limits around it where the plant has some.
+        """Make the filter of the plant without limits, and wrap it in the plant's limits if there are some.
 
-        `make`: the function that makes the filter; `parameters`: its signature.
+        `make` is the function that makes the filter, and `parameters` its signature.
         """
         bound = parameters.bind(*args, **kwargs)
         plant = bound.arguments.get("plant")
@@ -93,14 +93,13 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build_with_told_numbers(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z.
+        """Make the filter, wrapped in a `ToldFilter` if the channel reports numbers, such as its gain, with each z.
 
-        `make`: the function that makes the filter; `parameters`: its signature. A channel may report numbers, such as
-        its gain, with each z.
+        `make` is the function that makes the filter, and `parameters` its signature.
         """
         arguments = parameters.bind(*args, **kwargs).arguments
         channel = arguments.get("channel")
-        # What is no channel reports nothing, and is for `make` to refuse.
+        # An argument that is no channel reports nothing, and `make` refuses it.
         is_channel = isinstance(first(channel), AbstractRandomAffine)
         reports_numbers = is_channel and len(separate_told_numbers(first(channel)).numbers) > 0
         if not reports_numbers:

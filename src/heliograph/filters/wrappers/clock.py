@@ -87,10 +87,11 @@ class ClockFilter(AbstractWrapper):
     def init(self) -> ClockBelief:
         """Return the belief before any data.
 
-        `silence`: steps since each component arrived; `observed`: whether a clock's offset was observable.
+        `silence` counts the steps since each component arrived. `observed` says whether each clock's offset has been
+        observable.
         """
         start = self.base.init()
-        # No component counts before it arrives, as after n steps of silence; and no clock has been observed.
+        # After n steps of silence a component does not count: so it is for all components before they arrive.
         silence = jnp.full(self.received, len(self.states))
         observed = jnp.zeros(len(self.offsets), dtype=bool)
         return ClockBelief(gaussian=start, inputs=jnp.zeros(len(self.inputs)), silence=silence, observed=observed)
@@ -99,8 +100,7 @@ class ClockFilter(AbstractWrapper):
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
         """Predict plant and clocks over step k.
 
-        `silence`: steps since each component arrived, one more now. `observed`: which clocks' offsets were
-        observable.
+        `silence` counts the steps since each component arrived, one more after this step. `observed` does not change.
         """
         predicted = self.base.predict(state.gaussian, u, k)
         return ClockBelief(
@@ -134,9 +134,9 @@ class ClockFilter(AbstractWrapper):
         return belief, gaussian_innovation(z, expected, total)
 
     def _mask_estimated(self, observed: jax.Array) -> jax.Array:
-        """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not (n,).
+        """Return a mask (n,) that is 0 for offset and drift of unobserved clocks, and 1 for all other states.
 
-        `offsets`: index of each clock's offset in the state; its drift is the next one.
+        `self.offsets` holds the index of each clock's offset in the state. Its drift is the next state.
         """
         mask = jnp.ones(len(self.states))
         for i, offset in enumerate(self.offsets):
@@ -145,19 +145,18 @@ class ClockFilter(AbstractWrapper):
         return mask
 
     def _test_observable(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Test whether each clock is observable (clocks,).
+        """Return whether each clock is observable (clocks,).
 
-        It is where dy/dt, the derivative by its offset, is significant against the uncertainty of the state, and where
-        the derivatives by the offset are linearly independent of those by the other states.
-
-        SIGNIFICANT: 9 variances; SHARE: 1e-3, the least independent share. `offsets`: index of each clock's offset o.
+        A clock with the offset o is observable on two conditions. The square of dy/do must be above SIGNIFICANT (9)
+        times its variance by the uncertainty of the state. And the derivatives by o must have at least the share SHARE,
+        1e-3, that is linearly independent of those by the other states.
         """
         jacobian = jax.jacfwd(observe)
         slopes, curvature = jacobian(state.gaussian.mean), jax.jacfwd(jacobian)(state.gaussian.mean)
         independent_share = self._independent_shares(state, observe, k)
         observable = []
         for i, offset in enumerate(self.offsets):
-            # Variance of dy/do of each received component: dy/do is to first order linear in the state.
+            # dy/do of each received component is linear in the state to first order, which gives its variance.
             gradient = curvature[:, offset]
             variance = jnp.einsum("ri,ij,rj->r", gradient, state.gaussian.covariance, gradient)
             is_significant = jnp.any(slopes[:, offset] ** 2 > SIGNIFICANT * variance)
@@ -175,10 +174,10 @@ class ClockFilter(AbstractWrapper):
         def move_and_give_gramian_part(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            """Move one step on; the output is the step's term of O'O, O the observability matrix (C; C F; C F F; ...).
+            """Move one step on, and return the step's term of O'O with the observability matrix O = (C; C F; ...).
 
-            `carry`: the state at a later step, and its derivatives by the present state; `observe`: the outputs of a
-            state. `state.inputs` are taken to stay.
+            `carry` holds the state at a later step, and its derivatives by the present state. `observe` returns the
+            outputs of a state. The inputs are assumed to stay at `state.inputs`.
             """
             x, slopes_by_present = carry
             rows = jax.jacfwd(observe)(x) @ slopes_by_present
@@ -190,10 +189,10 @@ class ClockFilter(AbstractWrapper):
 
 
 def _compute_unexplained_share(gramian: jax.Array, column: int) -> jax.Array:
-    """Return 1 - r' R^+ r, the share of one column of O that the others leave unexplained; 0 of a column of zeros.
+    """Return 1 - r' R^+ r, the share of one column of O that the others leave unexplained; 0 for a column of zeros.
 
-    R are the correlations (cosines) of the other columns, r those of this column with them; `gramian`: O'O, O a
-    matrix of outputs' derivatives. RANK: 1e-12, the share of the largest eigenvalue below which a direction is none.
+    O is a matrix of outputs' derivatives, and `gramian` is O'O. R are the correlations (cosines) of the other columns,
+    and r those of this column with them. Eigenvalues of R below the share RANK, 1e-12, of the largest count as zero.
     """
     lengths = jnp.sqrt(jnp.diagonal(gramian))
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)

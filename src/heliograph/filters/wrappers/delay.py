@@ -55,7 +55,7 @@ class PartFilter(AbstractWrapper):
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Plan the larger filter, and keep the rows of its plan that belong to the first n states.
 
-        A plan has the filter's matrices for these inputs; its projection takes the plan's mean to states.
+        A plan holds the filter's matrices for these inputs. Its projection maps the plan's mean to the states.
         """
         plan, n = self.base.planned(inputs), len(self.states)
         if not isinstance(plan, PlannedFilter):
@@ -66,11 +66,11 @@ class PartFilter(AbstractWrapper):
 
 
 def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
-    """Restrict a filter to its first states, as those of the plant in a system enlarged by `with_past`.
+    """Restrict a filter to its first states, which are those of the plant in a system enlarged by `with_past`.
 
     Args:
         filter: the filter of the larger system.
-        states: how many of its states are estimated, counted from the first.
+        states: number of its first states that are estimated.
 
     Claim: that of `filter`.
 
@@ -112,7 +112,7 @@ class RelayLinesFilter(AbstractWrapper):
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """Move the plant, send the sensor's signal, and receive it at one relay after another.
 
-        `lines`: where each relay's line, what it received in the last steps, lies in the state.
+        A relay's line holds what it received in the last steps. `self.lines` says where it lies in the state.
         """
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
@@ -172,10 +172,9 @@ def enlarge_by_relays(
 
 
 def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
-    """Enlarge the plant by the line of a relay: what it received 0 to `steps` steps ago, `size` numbers each.
+    """Enlarge the plant by a relay's line: the `size` numbers that it received 0, 1, ..., `steps` steps ago.
 
-    At each step the line shifts its numbers to the next place, without noise; its first place is left for what is
-    received.
+    At each step the numbers move to the next place, without noise. The first place becomes free for what is received.
     """
     length = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
@@ -187,10 +186,9 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
 def relayed_filter(plant: AnyPlant, channel: RelayedLinks, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
     """Build the filter behind relays from `base`, the filter of all lines.
 
-    `lines`: where each relay's line lies in the state of `base`; a line holds what a relay received in the last steps.
+    A line holds what a relay received in the last steps. `lines` says where each lies in the state of `base`.
     """
-    # Only the moments under known probabilities make the filter optimal.
-    # Links from stage to stage; the last one is in the filter itself.
+    # `links` lead from stage to stage; the last link is in `base` itself. Only with known probabilities is it optimal.
     links = tuple(second_order(place_on_delay_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
@@ -235,7 +233,7 @@ class LateFilter(AbstractWrapper):
     def predict(self, state: LateState, u: ArrayLike = (), k: Step = 0) -> LateState:
         """Predict over step k - delay, with the input of that step.
 
-        `inputs`: those of the last `delay` steps, which the past still needs; before step 0 nothing is predicted.
+        `state.inputs` holds the last `delay` inputs, which are still to be used. Before step 0 nothing is predicted.
         """
         inputs = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])  # of steps k - delay to k
         sent_at = jnp.asarray(k) - self.delay
@@ -249,9 +247,9 @@ class LateFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
-        """Correct with what was sent at step k - delay; values received before the first signal say nothing.
+        """Correct with what was sent at step k - delay.
 
-        The state stays as it is then, with log-likelihood 0.
+        Before the first signal arrives, the state does not change and the log-likelihood is 0.
         """
         sent_at = jnp.asarray(k) - self.delay
         after, innovation = self.base.correct(state.base, z, jnp.maximum(sent_at, 0))
@@ -279,7 +277,7 @@ class LateFilter(AbstractWrapper):
 
 
 def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
-    """Put a filter behind a link with a constant delay: it filters the past and predicts to the present.
+    """Return a filter behind a link with a constant delay, which filters the past and predicts to the present.
 
     Args:
         filter: a filter made for the link without delay.
@@ -316,7 +314,7 @@ class KnownDelayFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the channel of the received delay, the last number of z; without a delay nothing is used."""
+        """Correct by the channel of the received delay, the last number of z; without a delay z is not used."""
         z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
         is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
@@ -324,7 +322,7 @@ class KnownDelayFilter(AbstractWrapper):
         base = eqx.tree_at(lambda filter: filter.channel, self.base, channel)
         after, innovation = base.correct(state, z, k)
         after = jax.tree.map(lambda new, old: jnp.where(is_known, new, old), after, state)
-        # The delay itself is a component of z too, of which the innovation tells nothing.
+        # The delay is a component of z too. Its innovation is 0, or NaN without a delay.
         delay_innovation, covariance = append_flag(innovation.covariance, delay)
         log_likelihood = jnp.where(is_known, innovation.log_likelihood, 0.0)
         weight = None if innovation.weight is None else jnp.append(innovation.weight, jnp.nan)
@@ -338,7 +336,7 @@ Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
     """Build a filter for a link that may be late from `make`, which builds one for a link without delay.
 
-    With time stamps, and where the delay is random, past signals are states of the filter; a constant delay needs none.
+    If there are time stamps or the delay is random, past signals become states. A constant delay needs no such states.
     """
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
@@ -348,7 +346,7 @@ def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, ma
         return LateFilter(make(plant, sensor, channel.link), channel.past)
     if isinstance(start, RelayedLinks):
         return _build_behind_relays(plant, sensor, channel, make)
-    # Past signals as states, of which only the plant's n are estimated.
+    # The filter has past signals as states, but only the plant's n states are estimated.
     return PartFilter(make(*with_past(plant, sensor, channel)), n)
 
 
@@ -382,10 +380,10 @@ def deliver_line_as_current(channel: Channel) -> Channel:
 
 
 def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel as if nothing were late: the present signal stands on every place of its delay line."""
+    """Return the channel as if nothing were late: the present signal is in every place of its delay line."""
     check_maps("channel", [channel])
     if isinstance(channel, RelayedLinks):
-        # First repeat the signal on all places, then take it from the line as the channel does.
+        # Each stage has a delay line of its own.
         return Series([_deliver_at_once(stage) for stage in channel.stages])
     repeat = known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1)))
     return Series([repeat, place_on_delay_line(channel)])

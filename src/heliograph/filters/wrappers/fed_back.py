@@ -70,12 +70,12 @@ class PredictionFilter(AbstractWrapper):
 
 
 def prediction_of(filter: AbstractFilter) -> PredictionFilter:
-    """Return the one-step prediction of a filter as its estimate: at step k it does not use z_k.
+    """Return a filter whose estimate is the one-step prediction of another: at step k it does not use z_k.
 
     Claim: that of `filter`, a `GaussianFilter`.
 
     Args:
-        filter: whose prediction is the estimate.
+        filter: the filter whose prediction becomes the estimate.
 
     Raises:
         ValueError: a filter that is not Gaussian.
@@ -117,7 +117,10 @@ class FedBackFilter(AbstractWrapper):
     def predict_reference(
         self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step
     ) -> Float[jax.Array, " m"]:
-        """Return the reference r that is subtracted from y at step k, from the estimate before and the input over k."""
+        """Return the reference r that the sender subtracts from y at step k, the predicted y.
+
+        It is predicted from the estimate `known` before the step, and the input u over it.
+        """
         return predict_signal(at(self.base.plant, k), at(self.base.sensor, k), known, u)
 
     @in_float64
@@ -138,7 +141,7 @@ class FedBackFilter(AbstractWrapper):
         plant, sensor = at(base.plant, k), at(base.sensor, k)
         initial_power = second_moments_at_start(base.plant, base)
         y = find_signal_moments(plant, sensor, base.transform, state.gaussian, initial_power)
-        # What is sent is y - r: of another mean and second moment, and the same covariance.
+        # What is sent is y - r. It has another mean and second moment than y, but the same covariance.
         mean = y.mean - state.reference
         sent = y._replace(mean=mean, second=y.covariance + jnp.outer(mean, mean))
         after, innovation = correct_signal(sent, at(base.channel, k), base.rule, jnp.asarray(z))

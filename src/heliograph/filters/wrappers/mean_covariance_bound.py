@@ -48,18 +48,18 @@ class ToldNumbersByMode(NamedTuple):
 def mean_error_bound(
     filter: AbstractFilter, steps: int, inputs: "Float[ArrayLike, 'steps inputs'] | None" = None
 ) -> Float[np.ndarray, "steps n n"]:
-    """Bound the mean over all that may be told of a filter's covariance, at each step and before any data.
+    """Bound the mean of a filter's covariance over all numbers that messages may tell, at each step, before any data.
 
-    What is left of a covariance P after a message with numbers a, f(P, a), is concave and increasing in P. So
-    V+ = E f(V, a) over numbers that are drawn anew each step is at least E P+, and at most what the filter of the law
-    alone claims. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, b_ij = P(i before | j now).
-    Means over gains with a density are sums over Gauss's nodes. A message is taken to arrive at each step.
+    A message with the numbers a leaves f(P, a) of a covariance P, which is concave and increasing in P. If the numbers
+    are drawn anew each step, V+ = E f(V, a) is at least E P+, and at most what a filter claims that knows only their
+    law. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, with b_ij = P(i before | j now).
+    Means over gains with a density are sums over Gauss's nodes. A message is assumed to arrive at each step.
 
     Args:
         filter: a `linear_filter` behind a link that tells gains, readings of gains, or numbers of finitely many values
             or of one gain's law.
-        steps: how many.
-        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+        steps: number of steps.
+        inputs: rows (steps, inputs); by default there are none, as for a filter without inputs.
 
     Claim: "upper".
 
@@ -101,8 +101,8 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
         ) -> tuple[LinearBelief, jax.Array]:
             """Return the prediction in one mode, and the mean covariance after the message, sum_a p(a) f(P, a).
 
-            `covariance`: before the step; `numbers` (count, told): the messages a that the mode may bring, `weights`
-            their probabilities. Closed over: the `filter`, its `state`, input `u_k` and number k of the step.
+            `covariance` is that before the step. `numbers` (count, told) are the messages a that the mode may bring,
+            with the probabilities p(a) in `weights`. u_k is the input of step k.
             """
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
@@ -124,7 +124,7 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
 
 
 def _correct_covariance(filter: ToldFilter, prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
-    """Return f(P, a): the covariance P of `prior` after a message with the numbers a; its values do not matter."""
+    """Return f(P, a), the covariance of `prior` after a message with the numbers a; measured values do not matter."""
     z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
     after, _ = filter.correct(prior, z, k)
     covariance: jax.Array = after.gaussian.covariance
@@ -165,9 +165,9 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
 
 
 def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
-    """Return numbers that are drawn anew at each step, with their probabilities.
+    """Return values (nodes, told) of numbers that are drawn anew at each step, with their probabilities (nodes,).
 
-    Numbers are told with each message: a reading of a gain, one gain itself, or one of finitely many values.
+    Each message tells a reading of a gain, one gain itself, or one of finitely many values.
     """
     if isinstance(memory, FreshReading):
         return reading_quadrature(memory.law, float(memory.variance))

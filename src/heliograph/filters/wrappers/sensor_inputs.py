@@ -86,9 +86,9 @@ class FilterOfInputs(AbstractWrapper):
         return self.base.attitude
 
     def make_filter_under(self, u: Array, k: Step) -> AbstractFilter:
-        """Return the filter within, of the sensor that the inputs u (inputs,) give at step k.
+        """Return the inner filter with the sensor that the inputs u (inputs,) give at step k.
 
-        `self.inputs`: their names, of which the sensor takes its own.
+        `self.inputs` are the names of the inputs, and the sensor selects those that it needs.
         """
         sensor = at(self.sensor, k).under(self.inputs, u)
         filter: AbstractFilter = eqx.tree_at(lambda filter: filter.sensor, self.base, sensor)

@@ -69,7 +69,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct the prediction, its mean held within the limits; the likelihood of z is that given the limits."""
+        """Correct the prediction with its mean moved into the limits; the likelihood of z is given the limits."""
         after, innovation = self.base.correct(self.hold(state), z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_within_after = self._log_probability_within(after)
@@ -92,9 +92,9 @@ class LimitedFilter(AbstractSizedFilter):
         return state if _holds_particles(state) else self._hold_means(state)
 
     def condition_on_limits(self, state: PyTree, without: int | None = None) -> PyTree:
-        """Return the state of the filter within, given that the plant's state lies within the limits.
+        """Return the state of the inner filter, given that the plant's state lies within the limits.
 
-        `without`: index of a state of which the limits are left out; None for none.
+        `without` is the index of a state whose limits are left out, or None.
         """
         others = self if without is None else replace(self, limits=tuple(x for x in self.limits if x[0] != without))
         return others._condition_with_log_probability(state)[1]
@@ -133,11 +133,12 @@ class LimitedFilter(AbstractSizedFilter):
     def _hold_means(self, state: PyTree) -> PyTree:
         """Return a filter's state with the means of its Gaussians held within the limits.
 
-        Within a wrapped state its inner states are held. Particles stay: they are conditioned on the limits instead.
+        In the state of a wrapper the inner states are held. Particles do not change here: they are conditioned on the
+        limits elsewhere.
         """
         if isinstance(state, StateUnderInputs):
             return state._replace(base=self._hold_means(state.base))
-        if hasattr(state, "believed"):  # of a gate that may give in to its rival
+        if hasattr(state, "believed"):  # the state of a gate, with its rival
             return state._replace(believed=self._hold_means(state.believed), rival=self._hold_means(state.rival))
         if _holds_particles(state):
             return state
@@ -161,7 +162,7 @@ class LimitedFilter(AbstractSizedFilter):
         if isinstance(state, StateUnderInputs):
             log_mass, inner = self._condition_with_log_probability(state.base)
             return log_mass, state._replace(base=inner)
-        if hasattr(state, "believed"):  # of a gate that may give in to its rival
+        if hasattr(state, "believed"):  # the state of a gate, with its rival
             log_mass, inner = self._condition_with_log_probability(state.believed)
             return log_mass, state._replace(believed=inner)
         if isinstance(state, particles.StateParticles):
@@ -224,9 +225,9 @@ def without_limits(plant: AnyPlant) -> AnyPlant:
 
 
 def build_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
-    """Return the filter of the plant with limits, from that of the plant without."""
+    """Return the filter of a plant with limits from `base`, the filter of the plant without limits."""
     start = first(plant)
-    # Each with the state's index, low end and high end.
+    # A limit has the state's index, the low end and the high end.
     limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)
     claim: Claim = weakest([base.claim, "nominal"])
     limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))

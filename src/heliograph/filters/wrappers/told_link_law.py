@@ -87,22 +87,23 @@ class ToldFilter(AbstractWrapper):
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct by the filter of the law that the numbers of the message give.
 
-        `numbers`: what the message tells of the link, such as its gain; `values`: what was measured.
+        A message z has `values` that were measured, and `numbers` that tell of the link, such as its gain.
         """
         values, numbers = self._split_message(jnp.asarray(z))
         filter, is_law = self._make_filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
-        # Numbers that give no law make the state NaN, so that the message is refused where it came in.
+        # Numbers that give no law make the state NaN, by which the caller knows that it must refuse the message.
         is_message = ~jnp.all(jnp.isnan(values))
         after = _spoil_state(after, ~is_law & is_message)
         return after, self._place_innovation(innovation)
 
     def expect(self, state: PyTree, k: Step = 0) -> Innovation:
-        """Return minus what is expected to arrive at step k, with its covariance, before a message tells anything.
+        """Return minus the values that are expected at step k, with their covariance, before a message tells anything.
 
-        Of the link by the law of its numbers, or of typical ones where that is unknown (`knows_law_of_numbers`).
+        The link is described by the law of its numbers, or by typical numbers if that law is unknown
+        (`knows_law_of_numbers`).
         """
-        # An expectation is minus the innovation of a measurement of zeros.
+        # A measurement of zeros has the innovation 0 - E z.
         filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
         _, innovation = filter.correct(state, jnp.zeros(len(self.values)), k)
         return self._place_innovation(innovation)
@@ -123,7 +124,7 @@ class ToldFilter(AbstractWrapper):
     def _place_innovation(self, innovation: Innovation) -> Innovation:
         """Return the innovation of the values at their rows of z.
 
-        What is told is no measurement: like what did not arrive it is NaN in the innovation, and counts for no test.
+        Told numbers are not measured. They have the innovation NaN, like missing values, so that no test uses them.
         """
         received, rows = len(self.values) + len(self.numbers), np.array(self.values)
         value = jnp.full(received, jnp.nan).at[rows].set(innovation.value)
@@ -135,9 +136,9 @@ class ToldFilter(AbstractWrapper):
         return Innovation(value, covariance, innovation.log_likelihood, weight)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter of the law that was told.
+        """Return the smoother step of the filter that the told numbers give.
 
-        A message has values measured and numbers that tell the link's law.
+        A message has values that were measured, and numbers that tell the link's law.
         """
         values, numbers = self._split_message(jnp.asarray(step.z))
         filter, _ = self._make_filter_given(numbers, step.k)
@@ -157,7 +158,7 @@ class ToldFilter(AbstractWrapper):
     def knows_gain(self) -> bool:
         """True if no gain is random given what is told, so that innovations of a Gaussian world are independent.
 
-        ROUNDING: 1e-12, the share of squared gains below which a spread is rounding. It is judged with typical numbers.
+        It is decided with typical numbers. A spread up to the share ROUNDING, 1e-12, of squared gains is rounding.
         """
         link = believe_typical(first(self.link))
         if link.remembers:
@@ -186,10 +187,10 @@ class ToldFilter(AbstractWrapper):
         )
 
     def _split_message(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return values and numbers of a message; no value (NaN) where a number is missing that it needs.
+        """Return the values and the numbers of a message; a value is NaN if a number that it needs is missing.
 
-        Numbers tell the link's law, on which each value depends as `list_told_numbers_of_outputs` says (values,
-        numbers). `_may_be_missing`: which numbers are not needed.
+        Numbers tell the link's law. `list_told_numbers_of_outputs` (values, numbers) says on which numbers each value
+        depends. `self._may_be_missing` is True for the numbers that are not needed.
         """
         numbers = z[np.array(self.numbers)]
         is_known = ~jnp.isnan(numbers) | self._may_be_missing
@@ -214,9 +215,9 @@ class ToldFilter(AbstractWrapper):
 
 
 def _spoil_state(state: PyTree, is_refused: jax.Array) -> PyTree:
-    """Return a state with all its real numbers NaN where it `is_refused`, else as it is.
+    """Return the state, with NaN for all its real numbers if it `is_refused`.
 
-    A NaN state says that the message gave no law of the link.
+    A state of NaN says that the message gave no law of the link.
     """
 
     def spoil(leaf: jax.Array) -> jax.Array:

@@ -70,9 +70,10 @@ class Rician(AbstractLaw):
         return np.asarray(np.sqrt(squared) * float(self.scale))
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """Return the logarithm of the gain's density (Rice's law) but for a constant.
+        """Return the logarithm of the gain's density (Rice's law), up to a constant.
 
-        log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)), x = g sight / scale^2, sight the direct path's gain.
+        It is log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)) with x = g sight / scale^2. `sight` is the gain of
+        the direct path.
         """
         sight, scale = jnp.asarray(self.sight), jnp.asarray(self.scale)
         bessel = jax.scipy.special.i0e(g * sight / scale**2)
@@ -87,9 +88,9 @@ class Rician(AbstractLaw):
 def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
     """Return the Laguerre function L_v(-x) = 1F1(-v; 1; -x) of order v = `twice_order` / 2 >= 0 at -x <= 0.
 
-    By (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). Whole orders are polynomials, from L_0 = 1. The others start
-    from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x)
-    I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. `previous` is L_(v-1), `current` L_v.
+    The recursion is (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). L grows with v, so the difference loses no digits.
+    Whole orders start from L_0 = 1. The others start from L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and
+    L_(1/2)(-x) = e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). `previous` is L_(v-1), and `current` is L_v.
     """
     if twice_order % 2:
         bessel = scipy_for(x).special
@@ -126,7 +127,7 @@ class Nakagami(AbstractLaw):
         return plain(ratio * (self.power / self.shape) ** (order / 2))
 
     def quantile(self, probability: Vector) -> np.ndarray:
-        """Return the gains below which the law has these probabilities: roots of the quantiles of g^2, a gamma law."""
+        """Return the gains g at which the distribution function has these values; g^2 has a gamma law."""
         m, power = float(self.shape), float(self.power)
         squares = scipy.special.gammaincinv(m, probability) * power / m
         return np.asarray(np.sqrt(squares))
@@ -137,9 +138,10 @@ class Nakagami(AbstractLaw):
         return (2 * m - 1) * jnp.log(g) - m * jnp.square(g) / self.power
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: from 0 to a gain that it passes by less than e^-36.
+        """Return the interval from 0 to a gain that is exceeded with a probability of at most e^-36.
 
-        A gamma variable of shape m, as m g^2 / power, is above m + sqrt(2 m t) + t by at most e^-t; t = NATS, 36.
+        m g^2 / power is a gamma variable of shape m. It exceeds m + sqrt(2 m t) + t with a probability of at most e^-t,
+        and t is NATS, 36.
         """
         xp = library(self.shape, self.power)
         largest = self.shape + xp.sqrt(2 * NATS * self.shape) + NATS

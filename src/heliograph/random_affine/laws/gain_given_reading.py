@@ -34,7 +34,7 @@ class GainLawGivenReading(AbstractLaw):
         raise fail("a gain given its reading", "a law that can be sampled", "mean and variance alone")
 
     def moment(self, order: int) -> jax.Array:
-        """Return E[g^order | a] of the gain g given its reading a, from mean and variance: up to the second."""
+        """Return E[g^order | a] of the gain g given its reading a, for orders 0, 1 and 2, from mean and variance."""
         if order > 2:
             raise fail("moments of a gain given its reading", "at most order 2", order)
         powers = jnp.stack([jnp.ones(()), jnp.asarray(self.mean), self.variance + jnp.square(self.mean)])
@@ -103,12 +103,12 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def log_density(t: jax.Array) -> jax.Array:
-        """Return log p(t | a) but for a constant: the law's density in t, and the reading's, a = g + e.
+        """Return log p(t | a) up to a constant, for the gain g = e^t (`logarithmic` law) or g = t^4 (any other law).
 
-        The gain is g = e^t of a `logarithmic` law, else t^4; `deviation`: of e.
+        It is the law's log density in t plus the log density of the reading a = g + e, where e has this `deviation`.
         """
         g = to_gain(t)
-        log_slope = t if law.logarithmic else 3 * jnp.log(t)  # of g by t, but for a constant
+        log_slope = t if law.logarithmic else 3 * jnp.log(t)  # log of dg/dt, up to a constant
         return law.log_density(g) + log_slope - jnp.square((a - g) / deviation) / 2
 
     # All gains that may count: those of the law, those near the reading, and all between.
@@ -132,11 +132,11 @@ LogDensity = Callable[[jax.Array], jax.Array]
 
 
 def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return where a density with one mode in [low, high] is largest: at the best of GRID points, ZOOMS times finer."""
+    """Return where a density with one mode in [low, high] is largest, by ZOOMS grids of GRID points, each finer."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the neighbours of the best point of a grid between these ends; `steps`: its points from 0 to 1."""
+        """Return the neighbours of the best point of a grid between these ends; `steps` are its points from 0 to 1."""
         left, right = ends
         points = left + (right - left) * steps
         best = jnp.argmax(jax.vmap(log_density)(points))
@@ -159,9 +159,9 @@ def _find_density_edge(log_density: LogDensity, outer: jax.Array, mode: jax.Arra
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the cell of a grid in which the density rises above `least`: its outer end and its inner one.
+        """Return the outer and the inner end of the grid's cell in which the density rises above `least`.
 
-        `steps`: the grid's points, from 0 at the outer end to 1 at the inner one, where the density is above.
+        `steps` are the grid's points from 0 at the outer end to 1 at the inner end, where the density is above `least`.
         """
         outside, inside = ends
         points = outside + (inside - outside) * steps
@@ -205,11 +205,11 @@ def gain_quadrature(
 def reading_quadrature(
     law: AbstractLaw, variance: float
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
-    """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum (quadrature).
+    """Return readings a = g + e (nodes, 1) and weights (nodes,): a mean over readings is a weighted sum over them.
 
     Args:
-        law: of the gain g, as `gain_quadrature` takes it.
-        variance: of e, positive.
+        law: law of the gain g, as `gain_quadrature` takes it.
+        variance: positive variance of e.
     """
     gains, weights = gain_quadrature(law)
     nodes, node_weights = np.polynomial.hermite_e.hermegauss(ERRORS)  # of a standard normal error

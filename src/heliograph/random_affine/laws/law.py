@@ -166,9 +166,10 @@ class Discrete(AbstractLaw):
         return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
 
     def covers(self, own: AbstractLaw) -> bool:
-        """Decide whether all that another law may be is possible under this one: same values, probabilities in reach.
+        """Return whether all that another law may be is possible under this one.
 
-        The radius is how far each probability may be off.
+        It must have the same values, and its probabilities with their radii must lie within this law's radii. A radius
+        is how far a probability may be off. A law of another kind must be the same law.
         """
         if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
             return are_same(self, own)
@@ -181,8 +182,8 @@ class Discrete(AbstractLaw):
     def worst(self, payoff: ArrayLike) -> float:
         """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
-        |dp_i| is at most the radius. Start with every probability at its lower end and give the mass that is left to
-        the largest payoffs first (the fractional knapsack, which solves this linear programme).
+        |dp_i| is at most the radius. Every probability begins at its lower end, and the mass that is left goes to the
+        largest payoffs first. This is the fractional knapsack, which solves the linear programme.
         """
         gain = array("payoff", payoff, self.values.shape)
         low = np.maximum(self.probabilities - self.radius, 0.0)
@@ -287,7 +288,7 @@ class GivenMoments(AbstractLaw):
     moments: Vector
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
-        """Hold E[g], E[g^2], ..., refused unless their Hankel matrix is that of some distribution."""
+        """Hold E[g], E[g^2], ...; raise ValueError unless some distribution may have these moments."""
         self.moments = array("gain moments", moments, (None,))
         if is_traced(self.moments):  # numbers that are not known yet cannot be checked
             return

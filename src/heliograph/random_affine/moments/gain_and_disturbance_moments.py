@@ -36,15 +36,13 @@ class DisturbedGain(NamedTuple):
         """Return the matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A, for H (m, c).
 
         They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
-        eigenvalues; as many as its rank, so none where nothing is random.
+        eigenvalues. There are as many as the covariance's rank, and none if nothing is random.
 
         Shapes: (rank, m, c).
         """
         m, c = self.mean.shape
         root_moments = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
-        unit = np.where(
-            root_moments > 0, root_moments, 1.0
-        )  # each entry in units of its own: rounding is relative to these
+        unit = np.where(root_moments > 0, root_moments, 1.0)  # rounding is relative to the size of each entry
         values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c) / np.outer(unit, unit))
         is_positive = values > ROUNDING * max(1.0, float(np.max(values, initial=0.0)))
         factors: np.ndarray = (unit[:, None] * np.sqrt(values[is_positive]) * vectors[:, is_positive]).T.reshape(
@@ -53,9 +51,10 @@ class DisturbedGain(NamedTuple):
         return factors
 
     def then(self, other: "DisturbedGain") -> "DisturbedGain":
-        """Return the moments of this map and one after it: [G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2].
+        """Return the moments of this map [G1, N1] followed by another [G2, N2]: H = [G2 G1, G2 N1, N2].
 
-        G takes the signal, N the disturbances; those of the other map, as many as I is long, are passed on.
+        G acts on the signal, and N on the disturbances. H = [G2, N2] diag([G1, N1], I), where I passes on the
+        disturbances of the other map.
         """
         identity = np.eye(other.disturbances)
         passed_on = DisturbedGain(identity, np.multiply.outer(identity, identity), inputs=0)
@@ -65,15 +64,15 @@ class DisturbedGain(NamedTuple):
 
 
 def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> np.ndarray:
-    """Return a root N (m, rank) of a noise's covariance, N N' = covariance, each column of a sum that is not negative.
+    """Return a root N (m, rank) of a noise's covariance, N N' = covariance; no column has a negative sum.
 
-    A worst-case disturbance d makes N d of the noise, which must include its mean.
+    A worst-case disturbance d stands for the noise N d. Some d must give the noise's mean.
 
     Raises:
         ValueError: a mean of the noise that N cannot make.
     """
     unit = standard_deviations(covariance)
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # correlations do not depend on units
     is_positive = values > ROUNDING * np.max(values, initial=0.0)
     root: np.ndarray = unit[:, None] * np.sqrt(values[is_positive]) * vectors[:, is_positive]
     root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
@@ -86,9 +85,10 @@ def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m
 
 
 def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray) -> DisturbedGain:
-    """Return the joint moments of H = [g A, N] of a hop: `gain` A, `root` N of its noise, `moments` E[g] and E[g^2].
+    """Return E[H] and E[H_ab H_ij] of a hop's H = [g A, N], with `gain` A, `root` N and `moments` (E[g], E[g^2]).
 
-    With H = g S + F, S = [A, 0] and F = [0, N]: E[H_ab H_ij] = E[g^2] S S + E[g] (S F + F S) + F F, at ab and ij.
+    With S = [A, 0] and F = [0, N], H = g S + F. So E[H_ab H_ij] is
+    E[g^2] S_ab S_ij + E[g] (S_ab F_ij + F_ab S_ij) + F_ab F_ij.
     """
     scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
@@ -103,7 +103,7 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
 def mix_gains(gains: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
     """Return the moments of a map drawn from `gains` with `weights`: sum_i w_i E_i and sum_i w_i E_i[H_ab H_ij].
 
-    The first `inputs` columns of H take the signal; the noises of each part stand behind, in columns of their own.
+    The first `inputs` columns of H take the signal. Then each part has columns of its own for its noises.
     """
     in_joint_columns = [_place_columns(gain, inputs, gains, i) for i, gain in enumerate(gains)]
     mean = np.tensordot(weights, [gain.mean for gain in in_joint_columns], axes=1)
@@ -112,9 +112,9 @@ def mix_gains(gains: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts
 
 
 def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGain], index: int) -> DisturbedGain:
-    """Return the same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn.
+    """Return the same map in the joint columns of `parts`: the `shared` columns first, then those of each part.
 
-    `index`: which of the parts the map is; in the columns of the others it is zero.
+    The map is the part with this `index`, and is zero in the columns of the other parts.
     """
     private_widths = [part.mean.shape[1] - shared for part in parts]
     start = shared + sum(private_widths[:index])
@@ -129,8 +129,8 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
 def stack_on_shared_inputs(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
     """Return the moments E[H] and E[H_ab H_ij] of independent maps one above the other, with common first inputs.
 
-    The first `shared` columns of each map take these; its other columns are its own noises'.
-    Between rows of two maps E[H_ab H_ij] is the product of the means.
+    The first `shared` columns of each map take the common inputs. Its other columns belong to its own noises. For rows
+    of two different maps E[H_ab H_ij] is the product of the means.
     """
     placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]
     mean = np.concatenate([gain.mean for gain in placed])

@@ -16,7 +16,7 @@ Interval = tuple[Entries, Entries]
 def multiply_matrices(second: Interval, first: Interval) -> Interval:
     """Return the interval (lowest, highest) of each entry of a matrix product, from those of its factors.
 
-    By centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1).
+    With centres C and radii R, the product has the centre C2 C1 and the radius |C2| R1 + R2 (|C1| + R1).
     """
     low1, high1 = first
     low2, high2 = second
@@ -28,11 +28,12 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
 
 
 def multiply_interval_polynomials(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
-    """Return the interval product of two polynomials: ends of the products of ends, summed over equal monomials.
+    """Return the interval product of two homogeneous polynomials of degrees `first` and `second`.
 
-    Homogeneous ones, of degree `first` and `second` in so many variables.
+    For each pair of monomials the least and the largest product of their ends is taken. These are summed over pairs
+    that give the same monomial.
 
-    Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
+    Shapes: a (ends, n), b (ends, m) with two ends, or (n,), (m,) for certain coefficients.
     """
     table = product_table(variables, first, second)
     size = (count_monomials(variables, first + second),)

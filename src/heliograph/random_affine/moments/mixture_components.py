@@ -29,16 +29,16 @@ class AffineComponent(NamedTuple):
     noise: Array
 
     def then(self, other: "AffineComponent") -> "AffineComponent":
-        """Return this map x and a map y after it as one: G_y (G_x s + c_x + n_x) + c_y + n_y.
+        """Return this map x followed by a map y, which takes s to G_y (G_x s + c_x + n_x) + c_y + n_y.
 
-        c are offsets and n noises, given by their covariances; the probability of both is the product of the weights.
+        c are offsets, and n noises with given covariances. The weight is the product of both weights.
         """
         weight, gain, offset, noise = other
         covariance = gain @ self.noise @ gain.T + noise
         return AffineComponent(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, covariance)
 
     def above(self, other: "AffineComponent") -> "AffineComponent":
-        """Return this map above an independent one of the same input: with the product of their probabilities."""
+        """Return this map stacked above an independent one of the same input; their probabilities are multiplied."""
         gain = _concatenate_first_axis(self.gain, other.gain)
         offset = _concatenate_first_axis(self.offset, other.offset)
         noise = block_diagonal([self.noise, other.noise])
@@ -62,14 +62,14 @@ class NoiseAtom(NamedTuple):
 
 
 def combine_atoms(atoms_by_part: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
-    """Return every atom (a possible value with its probability) of each independent part, joined with all others'.
+    """Return all combinations of one atom of each independent part, joined; an atom is a value and its probability.
 
     Raises:
         ValueError: more combinations than COMPONENT_LIMIT.
     """
 
     def pairs(a: list[Atom], b: list[Atom]) -> list[Atom]:
-        """Return every atom of a joined with every atom of b; raise ValueError of more than COMPONENT_LIMIT."""
+        """Return every atom of a joined with every atom of b; raise ValueError if there are too many."""
         if len(a) * len(b) > COMPONENT_LIMIT:
             raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
         return [join(x, y) for x in a for y in b]
@@ -102,15 +102,15 @@ class SignalNoise(NamedTuple):
 
 
 def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
-    """Return the components of several noises one above the other, as many branches each as the one with most has.
+    """Return the components of several noises one above the other, all with the largest number of branches.
 
-    A branch is a Gaussian law of which a component is a mixture; those that are added have the probability 0.
+    A component is a mixture of Gaussian branches. Branches that are added have the probability 0.
     """
     xp, largest_count = library(parts), max(law.mean.shape[1] for law in parts)
-    padding_values = (-np.inf, 0.0, 1.0)  # of the logarithm of the probability, the mean and the variance
+    padding_values = (-np.inf, 0.0, 1.0)  # log of the probability 0, mean 0 and variance 1
 
     def padded(law: GaussianBranches) -> list[Array]:
-        """Return the arrays of a law with branches of no probability, up to the largest number."""
+        """Return the arrays of a law, with branches of probability 0 appended up to the largest number."""
         more = ((0, 0), (0, largest_count - law.mean.shape[1]))
         return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, padding_values, strict=True)]
 

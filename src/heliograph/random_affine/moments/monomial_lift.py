@@ -58,10 +58,10 @@ class Lift(AbstractMapWrapper):
         return state, jnp.asarray(symmetric_power(h, self.degree))
 
     def moments(self, order: int) -> JointMoments:
-        """Return the moments of this order of the lifted map, out of those of order degree x order of the map.
+        """Return the moments of this order of the lifted map, from the moments of order degree * order of the map.
 
-        A monomial of degree degree x order is a product of `order` lifted inputs in several ways: each gets an equal
-        share of its coefficient.
+        A monomial of degree degree * order may be the product of `order` lifted inputs in several ways. Each way gets
+        an equal share of its coefficient.
         """
         check_forgets("moments of a map", self)
         inner = self.base.moments(order * self.degree).matrix
@@ -85,7 +85,7 @@ class Lift(AbstractMapWrapper):
 def _find_product_positions(variables: int, degree: int, order: int) -> np.ndarray:
     """Return the position of each product of `order` monomials of `degree` among the monomials of degree * order.
 
-    The products are listed as `list_exponents` lists the powers of the monomials of `degree`.
+    Products are in the order in which `list_exponents` lists the powers of the monomials of `degree`.
     """
     factors = list_exponents(variables, degree)
     position_of_product = position(variables, degree * order)

@@ -28,9 +28,10 @@ Numbers = Any  # NumPy's or JAX's, or a list of such
 
 @cache
 def list_exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
-    """Return the exponents of all monomials of total degree `degree`, of which degree 1 gives y_1, ..., y_p, 1.
+    """Return the exponents of all monomials of total degree `degree` in (y_1, ..., y_p, 1).
 
-    The last of the `variables` is the constant 1, so that monomials of lower degree in y are among these.
+    There are p + 1 = `variables`. The last is the constant 1, so that monomials of a lower degree in y are among these.
+    The monomials of degree 1 are y_1, ..., y_p, 1 in this order.
     """
     monomials = []
     for choice in combinations_with_replacement(range(variables), degree):
@@ -54,9 +55,9 @@ def count_monomials(variables: int, degree: int) -> int:
 
 @cache_arrays
 def factor_variables(variables: int, degree: int) -> np.ndarray:
-    """Return the numbers of the variables that each monomial multiplies, as y_0 y_0 y_2: (monomials, degree).
+    """Return the indices of the variables that each monomial multiplies (monomials, degree): 0, 0, 2 for y_0 y_0 y_2.
 
-    Monomials, and variables in each, in the order of `list_exponents`.
+    The monomials, and the variables in each, are in the order of `list_exponents`.
     """
     choices = combinations_with_replacement(range(variables), degree)
     all_variables = np.fromiter((variable for choice in choices for variable in choice), np.int64)
@@ -66,14 +67,14 @@ def factor_variables(variables: int, degree: int) -> np.ndarray:
 def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
     """Return the position of each monomial in `list_exponents`, from the variables (..., degree) that it multiplies.
 
-    These may be in any order. Sorted, s_1 <= s_2 <= ..., the monomial stands behind those that, for some t, have the
-    same variables before the t-th, and a smaller t-th.
+    The variables may be in any order, and are sorted: s_1 <= s_2 <= ... The monomials before it in the list have, for
+    some t, the same variables before the t-th, and a smaller t-th variable. These are counted for each t.
     """
     ordered = np.sort(chosen, axis=-1)
     previous = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
     rank = np.zeros(chosen.shape[:-1], dtype=np.int64)
     for t in range(chosen.shape[-1]):
-        # counts[n]: monomials that the variables from the t-th on can be, among the last n variables.
+        # counts[n]: number of monomials of the remaining degree in the last n variables.
         variables_left = chosen.shape[-1] - t
         counts = np.array([count_monomials(n, variables_left) for n in range(variables + 1)])
         rank += counts[variables - previous[..., t]] - counts[variables - previous[..., t + 1]]
@@ -90,7 +91,7 @@ def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
 def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
     """Return the values of all monomials of (y, 1) of total degree `degree`, for y of shape (p,).
 
-    NumPy's where y is, else JAX's.
+    They are a NumPy array if y is one, else a JAX array.
     """
     values: list[Numbers] = [*y, 1.0]
     terms = []
@@ -108,7 +109,7 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
 def _tabulate_quotient_positions(variables: int, degree: int) -> np.ndarray:
     """Return at [i, c] the position, among monomials of degree - 1, of monomial i divided by variable c.
 
-    One past the end if it has no c: a place for a zero.
+    If monomial i does not contain c, the position is one past the end, where the caller puts a zero.
     """
     lower = position(variables, degree - 1)
     table = np.full((count_monomials(variables, degree), variables), len(lower), dtype=np.int64)
@@ -129,10 +130,10 @@ def _find_dividing_variable(variables: int, degree: int) -> tuple[np.ndarray, np
 
 
 def symmetric_power(h: Numbers, degree: int) -> Numbers:
-    """Return Sym^k(H): coefficients of the monomials of H Y in the monomials of Y.
+    """Return Sym^k(H), k = `degree`: row a has the coefficients of the monomial a of Z = H Y in the monomials of Y.
 
-    H (m + 1, p + 1) takes Y = (y, 1) to Z = (z, 1). Row a, a monomial z_i z_j ..., is a product of linear forms, built
-    degree by degree: S_k[a, g] = sum_c H[i, c] S_{k-1}[a / z_i, g / y_c], for any z_i in a. On NumPy and on JAX arrays.
+    H (m + 1, p + 1) takes Y = (y, 1) to Z = (z, 1). A monomial z_i z_j ... is a product of linear forms in Y, and is
+    built degree by degree: S_k[a, g] = sum_c H[i, c] S_{k-1}[a / z_i, g / y_c], for any z_i in a.
 
     Shapes: (m + 1, p + 1) -> (C(m + k, k), C(p + k, k)).
     """
@@ -148,7 +149,7 @@ def symmetric_power(h: Numbers, degree: int) -> Numbers:
 
 
 def _append_zero_column(a: Numbers) -> Numbers:
-    """Return the matrix with a column of zeros behind the others, by NumPy or JAX, whichever it is of."""
+    """Return the matrix with a last column of zeros appended, as an array of NumPy or JAX as it is itself."""
     if isinstance(a, np.ndarray):
         return np.pad(a, ((0, 0), (0, 1)))
     import jax.numpy as jnp
@@ -160,7 +161,7 @@ def _append_zero_column(a: Numbers) -> Numbers:
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """Return at (i, j) the position, among monomials of degree first + second, of the product of monomials i and j.
 
-    Monomial i is of degree `first`, j of degree `second`.
+    Monomial i has the degree `first`, and j has the degree `second`.
     """
     a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
@@ -176,7 +177,7 @@ def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variab
 
 
 def multiply_by_linear_form(polynomial: dict[Exponents, Numbers], row: Numbers) -> dict[Exponents, Numbers]:
-    """Return the coefficients, by exponents of u, of the polynomial p(u) times sum_j row_j u_j."""
+    """Return the polynomial p(u) times sum_j row_j u_j; polynomials are coefficients by exponents of u."""
     product: dict[Exponents, Numbers] = {}
     nonzero = [j for j, entry in enumerate(row) if not is_zero(entry)]
     for a, coefficient in polynomial.items():
@@ -194,10 +195,10 @@ def degrees(dimension: int, order: int) -> np.ndarray:
 
 @cache_arrays
 def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b).
+    """Return the terms of (y + n)^a = sum_b C(a, b) n^(a-b) y^b: the places of a, of b and of a - b, and C(a, b).
 
-    For all monomials a of (y, 1) of this order, y of `dimension`. Places are among these: b and a - b are times powers
-    of 1.
+    There is a term for each monomial a of (y, 1) of this order and each b <= a. y has `dimension` numbers. Places are
+    those among these monomials, where b and a - b are filled up by powers of 1.
     """
     position_of, terms = position(dimension + 1, order), []
     for row, powers in enumerate(list_exponents(dimension + 1, order)):
@@ -232,8 +233,8 @@ class JointMoments(Module):
 
     @property
     def second(self) -> Float[jax.Array | np.ndarray, "m m p+1 p+1"]:
-        """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); order 2."""
-        # Where the monomials z_i z_j and Y_a Y_b stand in the matrix.
+        """T with E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and in (a, b)."""
+        # Rows of z_i z_j and columns of Y_a Y_b in the matrix of order 2.
         rows = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
         columns = product_table(self.inputs + 1, first=1, second=1)
         shares = np.where(np.eye(self.inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b is at (a, b) and (b, a)
@@ -241,7 +242,7 @@ class JointMoments(Module):
         return tensor
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
-        """Return E[Sym^order(H)] of a lower order: times powers of 1, its monomials are among those of `self.order`."""
+        """Return E[Sym^order(H)] of a lower order: times powers of 1 its monomials are among those of `self.order`."""
         positions = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
         matrix: jax.Array | np.ndarray = self.matrix[positions]
         return matrix
@@ -265,7 +266,7 @@ def times_one(variables: int, low: int, high: int) -> np.ndarray:
 
 
 def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
-    """Return a map's method `moments` (`own_method`), which may give a matrix alone, as one that gives `JointMoments`.
+    """Return a method `moments` that returns `JointMoments`, where a map's `own_method` may return only a matrix.
 
     Raises:
         ValueError: a matrix whose shape is not that of the map's monomials.
@@ -273,7 +274,7 @@ def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], 
 
     @wraps(own_method)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from what the map's own method returns: they or a matrix."""
+        """Return the moments of this order, from the `JointMoments` or the matrix that the map's own method returns."""
         result = own_method(channel, order)
         if isinstance(result, JointMoments):
             return result

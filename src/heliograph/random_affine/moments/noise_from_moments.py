@@ -48,7 +48,7 @@ class NoiseMoments(AbstractNoise):
     covariance: Square
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
-        """Hold E[n], E[n^2], ..., refused unless some distribution has them; mean and variance follow."""
+        """Hold E[n], E[n^2], ..., mean and variance; raise ValueError unless some distribution has these moments."""
         self.moments = array("noise moments", moments, (None,))
         if len(self.moments) < 2:
             raise fail("noise moments", "at least E[n] and E[n^2]", f"{len(self.moments)} of them")
@@ -62,7 +62,7 @@ class NoiseMoments(AbstractNoise):
         raise fail("simulating a noise known by its moments only", "a law that can be sampled", "NoiseMoments")
 
     def moment(self, powers: Exponents) -> Number:
-        """Return the given E[n^order]; `powers`: the order alone, since the noise has one component."""
+        """Return the given E[n^order]; `powers` is (order,), since the noise has one component."""
         (order,) = powers
         if order == 0:
             return 1.0

@@ -48,7 +48,7 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
 @push_moments.register
 def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
-    """Return E of all monomials of (z, 1) of this order, z = g A y + n, from those of (y, 1), the `moments`.
+    """Return the means of all monomials of (z, 1), z = g A y + n, from the `moments`, those of (y, 1).
 
     E[z^a] = sum_{b <= a} C(a, b) E[n^(a-b)] E[g^|b|] E[(A y)^b].
     """
@@ -76,9 +76,10 @@ def _push_through_mixture(channel: Mixture, order: int, moments: Array1) -> Arra
 
 
 def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> Array1:
-    """Return E of all monomials of (z, 1), z = A y + b, from those of (y, 1), with H = [[A, b], [0, 1]] `homogeneous`.
+    """Return the means of all monomials of (z, 1), z = A y + b, from the `moments`, those of (y, 1).
 
-    Of even order they are entries of Sym(H) E[Y Y'] Sym(H)', Y the monomials of half the order: fewer numbers.
+    `homogeneous` is H = [[A, b], [0, 1]]. At an even order they are entries of Sym(H) E[Y Y'] Sym(H)', with Y the
+    monomials of half the order. This takes fewer products.
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
     """
@@ -138,7 +139,7 @@ def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array
 
 
 def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
-    """Return the moments; raise ValueError unless they are as many as (y, 1) has monomials of this order, y the input.
+    """Return the moments; raise ValueError unless there is one for each monomial of (y, 1), y the channel's input.
 
     The channel must have no memory.
     """
@@ -151,9 +152,9 @@ def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) ->
 
 @cache_arrays
 def _choose_product_places(variables: int, degree: int) -> np.ndarray:
-    """Return for each monomial of degree 2 k one place (flattened) in the table of products of two of degree k.
+    """Return for each monomial of degree 2 k one place in the flattened table of products of monomials of degree k.
 
-    Of several products that give the same monomial, the last.
+    If several products give the same monomial, it is the place of the last one.
     """
     table = product_table(variables, degree, degree).reshape(-1)
     product_positions = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)

@@ -29,8 +29,9 @@ class QuadraticMap(Module):
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Return a matrix above the second moment of z under every possible law, at W = E (y, 1)(y, 1)'.
 
-        The entries are within radius : |W| of center : W; their row sums on the diagonal dominate any such difference
-        (Gershgorin), in a unit of each component's own. Rows and columns of components not `present` are zero.
+        The entries of the second moment are within radius : |W| of center : W. By Gershgorin's theorem a diagonal of
+        the row sums of radius : |W| is above any such difference. Rows are scaled by a unit for each component. Rows
+        and columns of components that are not `present` are zero.
         """
         both_present = present[:, None] & present[None, :]
         center = self.evaluate_center(second_moment, present)
@@ -76,7 +77,7 @@ def scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
 
 
 def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
-    """Return the map of a block of outputs as one of all `outputs`: the block from `start` on, zero elsewhere."""
+    """Return the map of a block of outputs, from `start` on, as a map of all `outputs` that is zero elsewhere."""
     margin = (start, outputs - start - block.center.shape[0])
     widths = [margin, margin, (0, 0), (0, 0)]
     center = library(block.center).pad(block.center, widths)

@@ -67,10 +67,10 @@ class SecondOrder(Module):
 def describe_second_moments(
     mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
 ) -> SecondOrder:
-    """Return second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise.
+    """Return the second moments of z = G y + n from E[(G, n)] and four maps; `nominal` is split into gain and noise.
 
-    The maps take W = E (y, 1)(y, 1)' to a second moment: of z about its nominal mean (spread), of the mean's own shift,
-    of G y (power), and the spread under the nominal law. `uncertain`: whether several laws are possible.
+    Each map takes W = E (y, 1)(y, 1)' to a second moment: that of z about its nominal mean (`spread`), that of the
+    mean's shift, that of G y (`power`), and the spread under the `nominal` law. `uncertain`: several laws are possible.
     """
     gain, noise = split_off_noise(nominal.center)
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
@@ -79,14 +79,14 @@ def describe_second_moments(
 def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
 
-    spread (m, m, p + 1, p + 1): [i, j] is the covariance of the rows i and j of (A, n), the last entry that of n.
-    Where A and n are correlated nothing is split: the covariances as they are, and columns of zero.
+    spread (m, m, p + 1, p + 1) has the covariance of the rows i and j of (A, n) at [i, j], with that of n last. If A
+    and n are correlated, nothing is split: the covariances are returned as they are, with columns of zeros.
     """
     xp, covariance = library(spread), spread[..., -1, -1]
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
     at_noise = np.zeros(spread.shape[-2:])
     at_noise[-1, -1] = 1.0
-    # `at_noise` is 1 where a spread has the covariance of n.
+    # `at_noise` is 1 at the entry of the covariance of n.
     split = xp.where(uncorrelated, covariance, 0.0)
     noise = _pad_columns(columns_of(split))  # m columns, some of them zero if the covariance has fewer
     return spread - split[..., None, None] * at_noise, noise
@@ -101,7 +101,7 @@ def _pad_columns(noise: WeightedColumns) -> WeightedColumns:
 def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
     """Return the covariances of (A, n) from those of a random gain A alone and the columns of Cov n.
 
-    The inverse of `split_off_noise`: Cov n, columns times weights times columns', is added at the constant 1.
+    This is the inverse of `split_off_noise`. Cov n is columns diag(weights) columns', and is added at the constant 1.
     """
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
@@ -110,9 +110,9 @@ def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
-    """Return whether z depends on y through more than a known gain: through a random or an uncertain one.
+    """Return whether z depends on y by a random or uncertain gain, and not only by a known one.
 
-    Of a law traced by JAX no number can be looked at: it does unless the channel says that its gain is known.
+    A law that JAX traces has no numbers to look at. It counts as random unless the channel says that its gain is known.
     """
     if described.uncertain or is_traced(described.spread):
         return described.uncertain or not channel.has_known_gain
@@ -121,12 +121,12 @@ def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bo
 
 
 def has_known_mean(described: SecondOrder) -> bool:
-    """Return whether E[G] and E[n] are the same under every possible law, to rounding; False for traced parameters."""
+    """Return whether E[G] and E[n] are equal under all possible laws, up to rounding; False for traced parameters."""
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
     largest_gain = np.max(np.abs(described.mean_gain), initial=0.0)
     largest_offset = np.max(np.abs(described.offset), initial=0.0)
-    size = largest_gain**2 + largest_offset**2  # squared, as the shift of the mean is: a second moment
+    size = largest_gain**2 + largest_offset**2  # the shift of the mean is a second moment, so its size is squared
     largest = max(np.max(np.abs(bound), initial=0.0) for bound in (described.shift.center, described.shift.radius))
     return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
 
@@ -177,13 +177,13 @@ class MomentBounds(NamedTuple):
 def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     """Return E[(G, n)] under the nominal law, and maps that bound second moments of z = G y + n under all laws.
 
-    The maps take W = E[(y, 1) (y, 1)'] to a matrix above the spread E[((G, n) - nominal mean) W (...)'], the shift (the
-    same of the law's mean) and the power E[G y y' G'], which leaves out the last row and column of W. They are exact
-    where the law is known.
+    The maps take W = E[(y, 1) (y, 1)'] to matrices above three moments: the spread E[((G, n) - nominal mean) W (...)'],
+    the shift (the same with the law's mean in place of (G, n)), and the power E[G y y' G']. They are exact if the law
+    is known.
     """
-    # Corners are the extreme ones of the possible laws; None if they are too many.
+    # Corners are the extreme possible laws; None if there are too many.
     corners = count_corners(channel)
-    # A single corner: nothing is uncertain.
+    # With a single corner nothing is uncertain.
     if corners == 1:
         return _take_known_moments(channel)
     entries = (channel.inputs + 1) ** 2
@@ -244,13 +244,13 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
 
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
-    """Return a spread in which that of known gains is zero, where a difference of moments leaves rounding.
+    """Return the spread with exact zeros for known gains, where a difference of moments leaves rounding.
 
-    The spread (m, m, p + 1, p + 1): the covariance of the entries of (G, n), z = G y + n, at [i, j, a, b].
+    The spread (m, m, p + 1, p + 1) has at [i, j, a, b] the covariance of entries (i, a) and (j, b) of (G, n).
     """
     is_random = ~channel.known_gains
     gain_varies = np.outer(is_random, np.ones(channel.inputs))
-    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # the noise always
+    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # noise always varies
     without_rounding: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return without_rounding
 
@@ -295,9 +295,9 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
 
 
 def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
-    """Return mean and spread of a map z = G y + n of known law: of independent maps from those of each alone.
+    """Return mean and spread of a map z = G y + n of known law; those of a stack or sum come from its parts.
 
-    The mean is E[(G, n)] (m, p + 1), the spread [i, j, a, b] the covariance of its entries (i, a) and (j, b).
+    The mean is E[(G, n)] (m, p + 1). The spread has at [i, j, a, b] the covariance of entries (i, a) and (j, b).
     """
     if not isinstance(channel, Superposed | Stack):
         moments = channel.moments(2)
@@ -306,7 +306,7 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
     means, spreads = zip(*(_compute_mean_and_spread(affine) for affine in channel.maps), strict=True)
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_spreads(spreads)
-    # Spreads of a sum add up, and that of its noise.
+    # In a sum the spreads of the parts and of its own noise add up.
     mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * _make_power_of_constant(size)
     spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), axes=2) + noise
@@ -314,7 +314,7 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
 
 
 def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
-    """Return Cov(z | y) of a channel of known gain: its noise's; of a stack or a sum from those of its maps."""
+    """Return Cov(z | y) of a channel of known gain, that of its noise; for a stack or sum it comes from its maps."""
     covariance: Matrix
     if isinstance(channel, Stack):
         covariance = block_diagonal([_noise_covariance(affine) for affine in channel.maps])
@@ -326,9 +326,9 @@ def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.nda
 
 
 def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
-    """Return the spreads of independent maps side by side, as diagonal blocks of that of all outputs.
+    """Return the spread of all outputs of independent maps of one y, with the maps' spreads as diagonal blocks.
 
-    A spread (m, m, p + 1, p + 1) is the covariance of the entries of (G, n), z = G y + n; y is the same for all maps.
+    A spread (m, m, p + 1, p + 1) is the covariance of the entries of (G, n) with z = G y + n.
     """
     outputs_by_map, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
     outputs = sum(outputs_by_map)
@@ -386,9 +386,9 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
-    """Return the weighted sum of second-moment maps, each put at the places in (y, 1) of what its part takes.
+    """Return the weighted sum of second-moment maps, each at the places in (y, 1) of the inputs that its part takes.
 
-    `weighted`: by the number of a part (a map that the channel sums), its second-moment map and its weight.
+    `weighted` holds the second-moment map and its weight by the number of the part, a map that the channel sums.
     """
     scaled = {i: scale_map(moment_map, weight) for i, (moment_map, weight) in weighted.items()}
     center = channel.sum_in_places({i: moment_map.center for i, moment_map in scaled.items()}, axes=2)

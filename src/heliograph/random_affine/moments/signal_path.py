@@ -40,9 +40,9 @@ class ChannelPosition(NamedTuple):
         return list(zip(maps, at, strict=True))
 
     def select_components(self, places: Sequence[int]) -> "ChannelPosition":
-        """Return the position at a map that takes the components of y at these places: its signal has these alone.
+        """Return the position at a map that takes only the components of y at these places.
 
-        The last entry of E (y, 1)(y, 1)', of the constant, stays.
+        The signal then has the rows and columns of E (y, 1)(y, 1)' of these components and of the constant.
         """
         if self.signal is None:
             return self
@@ -53,8 +53,8 @@ class ChannelPosition(NamedTuple):
     def on_delay_line(self, times: int) -> "ChannelPosition":
         """Return the position at a map of the line (y_k, y_{k-1}, ...) of so many signals.
 
-        Each has the moments of the present one. What they have between them is left out (zero): a delay chooses one
-        signal, so no two meet.
+        Each signal has the moments of the present one. The moments between two signals are set to zero: a delay selects
+        one signal, so that they are never used.
         """
         if self.signal is None:
             return self

@@ -19,9 +19,10 @@ PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from di
 
 
 def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the spread about the nominal mean H0, shift of the mean, and power, all of one possible law.
+    """Return the tensors of one possible law: spread about the nominal mean H0, shift of the mean, and power.
 
-    Maps of (y, 1)(y, 1)', for (G, n) of z = G y + n: of second moments of (G, n) - H0, of its mean - H0, and of G y.
+    Applied to (y, 1)(y, 1)' they give second moments of parts of z = G y + n: the spread that of ((G, n) - H0)(y, 1),
+    the shift that of (E(G, n) - H0)(y, 1), and the power that of G y. `mean` is H0.
     """
     second_moment = moments.second
     law_mean = moments.mean[:-1]
@@ -33,14 +34,14 @@ def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor,
 
 
 def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
-    """Return one map above all of the (law, m, m, p + 1, p + 1) tensors, such as the spreads under corner laws v.
+    """Return one map above all tensors (law, m, m, p + 1, p + 1), such as the spreads under the corner laws v.
 
-    Where y enters as s_v M y y' M' under every law, and one noise matrix is above all others, the map of the largest
-    s_v and that noise; else the middle of the range of each entry, with half the range as radius.
+    If y enters as s_v M y y' M' under every law, and one noise matrix is above all others, it is the map of the largest
+    s_v and of that noise. Else it has the middle of each entry's range as center, and half the range as radius.
     """
     xp = library(tensors)
     low, high = tensors.min(axis=0), tensors.max(axis=0)
-    dominating, is_above_all = _find_dominating_tensor(tensors, mean)  # of the largest s_v and noise
+    dominating, is_above_all = _find_dominating_tensor(tensors, mean)  # the tensor of the largest s_v and noise
     center = xp.where(is_above_all, dominating, (low + high) / 2)
     radius = xp.where(is_above_all, 0.0, (high - low) / 2)
     return QuadraticMap(center, radius)
@@ -78,9 +79,9 @@ def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.n
 
 
 def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
-    """Return the s_v (law,) of least squares in gains_v = s_v `shape`, and how far each entry is off it.
+    """Fit gains_v = s_v `shape` by least squares; return the s_v (law,), and the absolute error of each entry.
 
-    `gains` (law, m, m, p, p): a tensor of each law v.
+    `gains` (law, m, m, p, p) has a tensor for each law v.
     """
     xp = library(gains, shape)
     squared_norm = xp.sum(shape**2)
@@ -90,13 +91,14 @@ def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
 
 
 def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
-    """Return N_max, the covariance of the largest trace among N_v (law, m, m), and whether all N_max - N_v >= 0.
+    """Return N_max, the covariance of the largest trace among N_v (law, m, m), and whether it is above all N_v.
 
-    `>= 0`: positive semidefinite, to PROPORTIONAL_TOLERANCE; if any N_v is above all others it is N_max.
+    It is above if all N_max - N_v are positive semidefinite up to PROPORTIONAL_TOLERANCE. If any N_v is above all
+    others, it has the largest trace.
     """
     xp = library(noises)
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
-    # Judged in units in which N_max has ones on its diagonal, so that the tolerance is relative.
+    # In units in which N_max has ones on its diagonal, the tolerance is relative.
     unit = xp.sqrt(xp.diagonal(largest))
     unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
     units = unit[:, None] * unit

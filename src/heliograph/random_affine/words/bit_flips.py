@@ -57,12 +57,12 @@ class Flips(AbstractRandomAffine):
         return Discrete(1 - 2 * self.error.values, self.error.probabilities)
 
     def about_centre(self, power: Float[np.ndarray, " words"]) -> AbstractRandomAffine:
-        """Return the random affine map of q - c, words less their centre: gain g, and noise of variance U (1 - E g^2).
+        """Return the random affine map of words less their centre: gain g, and noise of variance U (1 - E g^2).
 
-        Where each word draws a gain of its own, it is a stack of one map a word.
+        If each word draws a gain of its own, it is a stack of one map for each word.
 
         Args:
-            power: U of each word, its variance were all its values equally likely.
+            power: U of each word, the variance that it would have if all its values were equally likely.
         """
         lost_share = 1 - float(self.gain.moment(2))
         if self.per_message or self.dimension == 1 or isinstance(self.error, Constant):
@@ -112,9 +112,9 @@ class BitFlips(AbstractRandomAffine):
         return self.outputs
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw p, of the message or of each word, and the bits that flip: return the diagonal H, -1 at these, else 1.
+        """Draw p for the message or for each word, and the bits that flip; return H, diagonal with -1 at these, else 1.
 
-        Each word is `bits` numbers -1 or 1, and `beside` numbers behind them that never flip; the constant 1 is last.
+        Each word has `bits` numbers -1 or 1, and then `beside` numbers that never flip. The constant 1 is last.
         """
         rate_key, bit_key = jax.random.split(key)
         if self.per_message:
@@ -166,7 +166,7 @@ def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: 
 
 
 def _read_error_rate(rate: object) -> Constant | Discrete:
-    """Return the law of a hop's error rate, the probability that a bit is flipped: a number, or finitely many."""
+    """Return the law of a hop's error rate, the probability of a flipped bit: a number or finitely many values."""
     expected = "one number from 0 to 0.5 for all bits of the word, or a Discrete law of such numbers"
     if isinstance(rate, Discrete):
         values = np.asarray(rate.values)

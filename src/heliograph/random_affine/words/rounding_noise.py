@@ -70,8 +70,8 @@ class RoundedNoise(AbstractNoise):
         gaussian: bool = False,
         matters: bool = False,
     ):
-        """Hold the law of v, and step D, half range, centre and dither of the rounding; flags as in the class."""
-        # The sensor's noise; step D of the rounding, half of its range and its centre, by component; its dither.
+        """Hold the law of the sensor's noise v (`source`), the rounding, and the flags that the class describes."""
+        # By component: the step D of the rounding, half of its range, and its centre.
         self.source, self.step, self.half, self.centre = source, step, half, centre
         self.dither, self.gaussian, self.matters = dither, gaussian, matters
 
@@ -99,10 +99,10 @@ class RoundedNoise(AbstractNoise):
 
     @property
     def is_exact(self) -> bool:
-        """True if Var e, of the rounding's error e, is known, and e has mean 0 whatever the state is.
+        """True if the rounding's error e has a known variance, and the mean 0 for every state.
 
-        By the dither; `gaussian`: y is, so that its moments give Var e; `matters`: the second moment of the rounded
-        signal enters what is claimed.
+        This depends on the dither. If `gaussian`, y is Gaussian, and its moments give Var e. If `matters`, the second
+        moment of the rounded signal enters the claim. Without a dither the noise v itself must act as one.
         """
         match self.dither:
             case "triangular":
@@ -124,16 +124,16 @@ class RoundedNoise(AbstractNoise):
         if not isinstance(self.source, Gaussian):
             return False
         step = np.asarray(self.step)
-        # The covariance in steps; DITHERLESS is 1, less rounding.
+        # The covariance in units of steps. DITHERLESS is 1 less rounding.
         unit = np.asarray(self.source.covariance) / (step[..., :, None] * step[..., None, :])
         return bool(np.all(np.linalg.eigvalsh(unit)[..., 0] >= DITHERLESS))
 
     def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
-        """Return v + e, the sensor's noise and the error of rounding, beside a Gaussian signal of these moments.
+        """Return the law of v + e, the sensor's noise plus the rounding error, for a Gaussian signal of these moments.
 
-        The variance of e, in steps squared: E f(1 - f) by its series, f the place of y between two steps; else the
-        largest whatever y is (`variances_in_steps`). `covariance` has that of e with the dither, which is taken off
-        again if subtracted.
+        For a known signal the variance of e in squared steps is E f (1 - f), with f the place of y between two steps.
+        Else it is the largest for any y (`variances_in_steps`). `covariance` includes the dither, even one that is
+        subtracted again.
         """
         variances_in_steps = LARGEST[self.dither]
         if self.dither not in ("stochastic", "subtracted") or not self.gaussian:
@@ -145,12 +145,11 @@ class RoundedNoise(AbstractNoise):
         return SignalNoise(self._with_error(error * self.step**2), covariance)
 
     def _bound_rounding(self, mean: Vector, variances: Vector) -> jax.Array:
-        """Return an upper bound of E f (1 - f), f in [0, 1] the place of y between two words, D apart, y of N(m, s^2).
+        """Return an upper bound of E f (1 - f), with f in [0, 1] the place of y ~ N(m, s^2) between two words.
 
-        Dithered rounding has the variance D^2 f (1 - f). With the lowest word `low`
-
+        Words are D apart, and dithered rounding has the variance D^2 f (1 - f). With the lowest word `low`,
         E f (1 - f) = 1/6 - sum_k exp(-2 pi^2 k^2 s^2 / D^2) cos(2 pi k (m - low) / D) / (pi k)^2. The series is cut
-        after K = TERMS, and the bound of its tail is added: sum_{k > K} 1 / (pi k)^2 <= 1 / (pi^2 K).
+        after K = TERMS terms, and a bound of its tail is added, by sum_{k > K} 1 / (pi k)^2 <= 1 / (pi^2 K).
         """
         k = np.arange(1, TERMS + 1)[:, None]
         relative_variance = jnp.asarray(variances) / jnp.asarray(self.step) ** 2
@@ -196,10 +195,10 @@ class RoundedNoise(AbstractNoise):
         return self.source.sample(key) - jnp.asarray(self.centre)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return the mean or second moment of the components that the powers choose; higher ones depend on the signal.
+        """Return the mean or second moment of the components that the powers select.
 
         Raises:
-            ValueError: a third or higher moment.
+            ValueError: a third or higher moment, which would depend on the signal.
         """
         if sum(powers) > 2:
             raise fail("noise of a rounded measurement", "a filter of means and covariances (linear_filter)", "another")
