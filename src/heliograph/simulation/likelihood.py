@@ -24,7 +24,8 @@ def log_likelihood(
 ) -> Scalar:
     """Return log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
 
-    Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere.
+    It is exact for the Kalman filter of a linear Gaussian system. For other filters it is nominal, but a fit can still
+    maximise it.
     `jax.grad` passes through it, with respect to any array of the filter, in the precision of the trace
     (`jax.enable_x64`). Many rows are taken in chunks side by side, as by `filter.run`.
 
@@ -46,7 +47,7 @@ def log_likelihood(
     if is_traced(arguments):
         return _sum_traced(*arguments)
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
-    if total is not None:  # it could be done in chunks
+    if total is not None:  # None: the filter cannot be run in chunks
         return float(total)
     return float(compute_once(_sum_log_likelihoods, _sum_by_xla, arguments))
 
@@ -60,7 +61,10 @@ def _sum_log_likelihoods(
 
 
 def _sum_traced(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    """Return `_sum_log_likelihoods` within a trace, with derivatives by the filter's own way where it has one."""
+    """Return `_sum_log_likelihoods` within a trace.
+
+    A filter with a score recursion (`has_score_recursion`) computes the derivatives by it.
+    """
     if not filter.has_score_recursion:
         return _sum_log_likelihoods(filter, z, u)
     linear: Any = filter  # a `LinearFilter`
