@@ -137,8 +137,9 @@ def _yield_deviations(
 ) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
     """Yield the name and the standard deviation (radians) of each angle of a filter that claims this covariance."""
     used = filter.angles_used()
-    has_deviations = used is not None and filter.claim != "none"
-    for i in used.states if used is not None and has_deviations else ():
+    if used is None or filter.claim == "none":
+        return
+    for i in used.states:
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
 
 
