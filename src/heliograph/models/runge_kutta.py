@@ -38,7 +38,7 @@ class RungeKuttaStep(DriftAndStepLength):
         h = dt / self.substeps
 
         def take_substep(_: object, x: jax.Array) -> jax.Array:
-            """Return the state x after one shorter step of length h: Runge and Kutta's fourth order, inputs held."""
+            """Return the state x after a shorter step of length h, by the fourth-order Runge-Kutta rule."""
             k1 = as_real(self.drift(x, inputs))
             k2 = as_real(self.drift(x + h / 2 * k1, inputs))
             k3 = as_real(self.drift(x + h / 2 * k2, inputs))

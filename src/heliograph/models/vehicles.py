@@ -94,9 +94,9 @@ class NoiseTimesStep(StepLength):
 
 
 def sine_ratio(angle: jax.Array) -> jax.Array:
-    """Return sin(a) / a, 1 at 0; below NEAR, a small angle in radians, by its series."""
+    """Return sin(a) / a for an angle in radians, which is 1 at 0; below NEAR it comes from the series 1 - a^2 / 6."""
     is_small = jnp.abs(angle) < NEAR
-    safe_angle = jnp.where(is_small, 1.0, angle)  # so that the quotient that is not taken has derivatives, too
+    safe_angle = jnp.where(is_small, 1.0, angle)  # the quotient that is not taken must have finite derivatives too
     return jnp.where(is_small, 1 - angle**2 / 6, jnp.sin(safe_angle) / safe_angle)
 
 
