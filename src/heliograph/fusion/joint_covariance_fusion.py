@@ -60,7 +60,11 @@ class AbstractInformedFusion(AbstractFusion):
         return ()
 
     def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
-        """Fuse the nodes' means after a step: return the next state, and fused mean and covariance."""
+        """Return the present estimates fused with the best weights for their joint covariance.
+
+        `happened.errors`: bias and joint covariance of the nodes' errors. If `self.with_mean`, the plant's mean before
+        any data is one more estimate.
+        """
         raise unwritten(self, "fuse_step")
 
     def _refuse_without_joint(self) -> ValueError:
