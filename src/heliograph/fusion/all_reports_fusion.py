@@ -84,7 +84,7 @@ class AllReports(AbstractInformedFusion):
         return make_initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
 
     def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
-        """Return the next state, and the fused mean and covariance, by predicting all errors and correcting with reports.
+        """Return the next state, and the fused mean and covariance, by predicting all errors and using the reports.
 
         `means` (nodes, n): the estimates that the nodes sent, NaN for one that did not arrive.
         """

@@ -83,7 +83,7 @@ class SplitIntersection(AbstractIntersection):
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
         def improve_shares(_: int, shares: jax.Array) -> jax.Array:
-            """Return the best shares for the weights that are best for the present ones; no share is below LEAST, 1e-12.
+            """Return the best shares for the weights that are best for the present ones, none below LEAST (1e-12).
 
             The bound of the joint covariance divides the `unknown` part of each estimate by its share.
             """

@@ -59,9 +59,9 @@ class LinearizedNoise(DriftAndStepLength):
     state: Array
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the noise covariance Q (n, n) of a step, by the drift's Jacobian at the fixed state `self.state`.
+        """Return the noise covariance Q (n, n) of a step, from the drift's Jacobian at the fixed state `self.state`.
 
-        The inputs u are those of the drift and, where no number is given, the step's length.
+        u holds the inputs of the drift, and the step's length if no number was given for it.
         """
         inputs_of_drift, dt = self.split(u)
         jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, inputs_of_drift)))(jnp.asarray(self.state))

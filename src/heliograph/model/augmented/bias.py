@@ -134,9 +134,10 @@ class DrivenTransition(Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
+        """Return the next state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
 
-        E is `self.coupling`, by which the biases drive the plant; u_b are the inputs at `self.places`, which move them.
+        E is `self.coupling`, through which the biases drive the plant. u_b are the inputs at `self.places`, which move
+        the biases.
         """
         n = len(self.plant.states)
         state, biases = x[:n], x[n:]
@@ -221,11 +222,7 @@ class BiasedMeasurement(Module):
     states: int = eqx.field(static=True)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Return the next state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
-
-        E is `self.coupling`, through which the biases drive the plant. u_b are the inputs at `self.places`, which move
-        the biases.
-        """
+        """Return the expected outputs h(x) + D b, with D = `self.loading` and x, b the two parts of the argument."""
         return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
