@@ -79,29 +79,28 @@ class Disturbances:
     def shocks(self, false: float = FALSE) -> list[Shock]:
         """List the breaks of states and the outliers of outputs in the order of their rows.
 
-        Every residual is a test. One that is too large makes its neighbours large too, a break those of outputs and
-        an outlier those of states: of rows side by side, that whose residual is largest stands for all.
+        Each residual is a test. A break also makes residuals of outputs large, an outlier also those of states, and
+        both those of neighbouring rows. Of such neighbours the row with the largest residual stands for all.
 
         Args:
             false: probability of any shock where the model is right; 0.01 by default.
 
         Raises:
-            ValueError: what is no probability.
+            ValueError: `false` is no probability.
         """
         level = float(scalar("false", false, 0, 1))
         residuals = np.concatenate([self.output_residuals, self.state_residuals], axis=1)
         size = np.nan_to_num(np.abs(residuals))
-        # Both sides of each residual that is a number: the probabilities are shared by all these tests
-        # (Bonferroni).
+        # Each finite residual is tested on both sides, and the tests share the probability (Bonferroni).
         tests = 2 * np.isfinite(residuals).sum()
         p = np.minimum(tests * ndtr(-size), 1.0)
         rows = _find_peaks(size.max(axis=1), is_candidate=p.min(axis=1) < level)
         return [self._make_shock(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
 
     def _make_shock(self, row: int, residuals: np.ndarray, p: np.ndarray, index: int) -> Shock:
-        """Return the shock of a row, by one of its residuals (first those of outputs, then of states) and its p-value.
+        """Return the shock of a row, described by the residual with this index and its p-value.
 
-        `residuals` and `p`: all of the row, of which that with this index is the shock's.
+        `residuals` and `p`: all of the row, first those of outputs and then those of states.
         """
         kind: Literal["break", "outlier"] = "outlier" if index < len(self.outputs) else "break"
         return Shock(
@@ -179,9 +178,9 @@ def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSe
 
 
 def _is_received_unchanged(predicted: Forecast) -> bool:
-    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged.
+    """Return whether what arrives is predicted as what is measured, as if the channel hands it on unchanged.
 
-    EQUAL: the largest relative difference, that of rounding.
+    EQUAL: the largest relative difference that counts as rounding.
     """
     measured, received = predicted.outputs, predicted.received
     if measured is None or received is None or measured.mean.shape != received.mean.shape:
@@ -243,11 +242,10 @@ def _smooth_noises(
 
 
 def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return means (steps, size) and their deviations, NaN where the variance is none but rounding.
+    """Return means (steps, size) and their standard deviations, both NaN where the variance is only rounding.
 
-    `covariance`: (steps, size, size).
-
-    ROUNDING: share of the largest variance over the steps, up to which it is none.
+    `covariance`: (steps, size, size). A variance up to the share ROUNDING of the largest over the steps counts as
+    rounding.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     largest = np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
@@ -256,7 +254,7 @@ def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.nd
 
 
 def _find_peaks(size: np.ndarray, is_candidate: np.ndarray) -> list[int]:
-    """Return of each run of candidate rows, which lie side by side, the row at which the size is largest."""
+    """Return, for each run of neighbouring candidate rows, the row with the largest size."""
     rows = np.flatnonzero(is_candidate)
     if not len(rows):
         return []

@@ -107,12 +107,12 @@ class Backtest:
     scores: tuple[Score, ...]
 
     def of(self, node: str, filter: str, name: str, horizon: int) -> Score:
-        """Return the score of one number at one horizon: of what is received first, else of the state.
+        """Return the score of one number at one horizon; a received number comes before a state of the same name.
 
         Args:
-            node: of the filter, "fused" of a central one.
-            filter: its name.
-            name: of a received number or a state.
+            node: node of the filter, "fused" for a central one.
+            filter: name of the filter.
+            name: name of a received number or a state.
             horizon: rows ahead.
 
         Raises:
@@ -123,7 +123,7 @@ class Backtest:
         if not scores:
             known = ", ".join(dict.fromkeys(f"{score.node}/{score.filter} {score.name}" for score in self.scores))
             raise fail("score", f"one of {known} at {list(self.horizons)}", f"{node}/{filter} {name} at {horizon}")
-        return scores[-1]  # of a state and a received number of one name the latter, which comes later
+        return scores[-1]  # received numbers come after states
 
     def to_pandas(self) -> "pd.DataFrame":
         """Return a table with a row for each score, and columns of means and their standard errors.
@@ -195,10 +195,10 @@ def backtest(
 
 
 def _call_refit(refit: Refit, rows: int, network: Network) -> Network:
-    """Return the network as it is known from so many first rows, by the user's function `refit`.
+    """Return the network as the user's function `refit` knows it from the first `rows` rows.
 
     Raises:
-        ValueError: no network, or one of other nodes and filters.
+        ValueError: no network, or one with other nodes and filters.
     """
     fitted = instance(f"refit from {rows} rows", refit(rows), Network, "a Network")
     if (fitted.names, set(fitted.places)) != (network.names, set(network.places)):
@@ -207,7 +207,7 @@ def _call_refit(refit: Refit, rows: int, network: Network) -> Network:
 
 
 def _find_start_of_forecasts(network: Network, record: Record, *data: Any) -> Origin:
-    """Return where a network's forecasts start; it is run over the data where the record is not its own."""
+    """Return where a network's forecasts start; if the record is not its own, it is run over the data first."""
     origin = record.origin
     if not isinstance(origin, Origin) or origin.model is not network:
         origin = run(network, *data).origin
@@ -222,9 +222,9 @@ def list_single_filters(network: Network) -> set[tuple[str, str]]:
 
 
 def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
-    """Return the measurements that a filter receives (steps, received), of a central one those of all nodes."""
+    """Return the measurements that a filter receives (steps, received); a central one receives those of all nodes."""
     z = record.measurements.get(target.node)
-    if z is None:  # of a central filter, all nodes' numbers; one that receives nothing has no columns
+    if z is None:  # a central filter
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
     return z if target.outlook.filter.received else z[:, :0]
 
@@ -339,12 +339,12 @@ def roll_forecasts(
 ) -> tuple[Moments, Moments | None]:
     """Return forecasts from each row at each horizon: of the states, and of what would arrive.
 
-    Their moments (rows, horizons, K, ...) have variances in the place of covariances.
-    Inputs ahead are those of the rows; behind the last one it stays.
+    Their moments (rows, horizons, K, ...) have variances instead of covariances. Inputs ahead are those of the later
+    rows; after the last row its inputs stay.
     """
     longest = horizons[-1]
     padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
-    # Of each row the inputs of the rows after it, (rows, longest, inputs).
+    # For each row, the inputs of the rows after it: (rows, longest, inputs).
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
     arguments = outlook, z, u, windows, np.asarray(horizons) - 1
     rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
@@ -368,7 +368,7 @@ def _forecast_from_each_row(
     filter, length = outlook.filter, windows.shape[1]
 
     def select(moments: Moments | None) -> PyTree:
-        """Return the moments at `places`, the horizons among all rows ahead, with variances in place of covariances."""
+        """Return the moments at `places` (the horizons among all rows ahead), with variances instead of covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
@@ -377,13 +377,13 @@ def _forecast_from_each_row(
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the filter's state after row k, and the moments that it forecasts from there.
 
-        `filter`: that of `outlook`, which predicts; `window`: inputs of the `length` rows ahead.
+        The row holds k, the measurements, the inputs, and `window`, the inputs of the `length` rows ahead.
         """
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
         ahead = window, k + 1 + jnp.arange(length)
         _, (states, _, received) = jax.lax.scan(lambda s, row: outlook.predict_step(s, *row), after, ahead)
-        moments_alone = states and states._replace(laws=None)  # states are scored by these also where they have limits
+        moments_alone = states and states._replace(laws=None)  # states are scored by moments even if they have limits
         return after, (select(moments_alone), select(received))
 
     start = jax.tree.map(jnp.asarray, filter.init())

@@ -39,8 +39,8 @@ Forecasts: TypeAlias = dict[str, dict[str, Forecast]]  # by node and filter
 def forecast(source: Sources, horizons: Horizons, inputs: Inputs = None) -> Forecast | Forecasts:
     """Forecast states, what sensors would measure, and what would arrive, from what has arrived so far.
 
-    Each filter predicts from its last state as if nothing arrived any more; `source` stays as it is. Modes and
-    particles are predicted as mixtures. The claim is the filter's own: a filter that is exact is so ahead.
+    Each filter predicts from its last state as if nothing more arrived; `source` is not changed. Modes and particles
+    are predicted as mixtures. The claim is that of the filter: an exact filter is exact ahead too.
 
     Args:
         source: what `filter.run`, `hg.run`, a `Stream` or a `Timeline` is: anything with an `origin`. A list of such
@@ -67,7 +67,7 @@ def forecast(source: Sources, horizons: Horizons, inputs: Inputs = None) -> Fore
 
 
 def forecast_from_origin(origin: Origin, horizons: Horizons, inputs: Inputs) -> Forecasts:
-    """Return the forecast of each estimate of an origin, by node and filter; a single filter is called "".
+    """Return the forecast of each estimate of an origin, by node and filter; a single filter has the names "".
 
     `horizons` and `inputs` are those of `forecast`.
     """
@@ -92,10 +92,10 @@ class ForecastTarget(NamedTuple):
 
 
 def find_target(origin: Origin, node: str | None, filter: str | None) -> ForecastTarget:
-    """Return the estimate of this node and filter, or the only one where they are None.
+    """Return the estimate of this node and filter; a None matches any, but only one estimate may match.
 
     Raises:
-        ValueError: none, or several of them.
+        ValueError: no estimate matches, or several do.
     """
     targets = list_targets(origin)
     matching = [target for target in targets if node in (None, target.node) and filter in (None, target.filter)]
@@ -159,16 +159,17 @@ def _take_stacked_state(stacked: PyTree, place: int, several: bool) -> PyTree:
 
 
 def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
-    """Return a filter that only predicts, at a fused estimate; its claim stays where plant and angles allow.
+    """Return a filter that only predicts, and its state at a fused estimate.
 
-    A claim says how far the covariance holds; it is lowered to nominal where a prediction is approximate.
+    It has the claim of the estimate, lowered to "nominal" if the prediction is approximate: if the plant is not linear
+    or has angles.
     """
     plant = first(network.plant)
     is_exact = isinstance(plant, LinearPlant) and not plant.circular
     claim = estimate.claim if is_exact or estimate.claim == "none" else weakest([estimate.claim, "nominal"])
     filter = open_loop_filter(network.plant)
     with_claim = replace(filter, claim=claim)
-    # `replace` does not take `kept` along, and the filter is frozen.
+    # `replace` does not copy `kept`, and the filter is frozen.
     object.__setattr__(with_claim, "kept", filter.kept)
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     if claim == "none":
@@ -181,10 +182,7 @@ _factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covaria
 
 
 def _find_sensor(network: Network, node: str) -> AnySensor | None:
-    """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary.
-
-    FUSED: the name under which estimates of all nodes together stand.
-    """
+    """Return the sensor of a node, or for FUSED (all nodes together) the joint one; None without constant sensors."""
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None
@@ -197,14 +195,14 @@ def _find_sensor(network: Network, node: str) -> AnySensor | None:
 
 
 def _name_received(network: Network, node: str) -> tuple[str, ...]:
-    """Return the names of the numbers that a node receives, or if it is "fused" those of all nodes."""
+    """Return the names of the numbers that a node receives; for FUSED, those of all nodes as NODE_NUMBER."""
     if node != FUSED:
         return network.nodes[node].received_names
     return tuple(f"{name}_{number}" for name in network.names for number in network.nodes[name].received_names)
 
 
 def check_steps_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
-    """Raise ValueError where what varies over time ends before `count` steps ahead of `step`."""
+    """Raise ValueError if what varies over time ends earlier than `count` steps after `step`."""
     last_step = int(np.max(step))
     if filter.horizon is not None and last_step + count > filter.horizon:
         covered = max(filter.horizon - last_step, 0)

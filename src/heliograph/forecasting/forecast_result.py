@@ -92,7 +92,7 @@ class Prediction:
         return self.quantile((1 - p) / 2), self.quantile((1 + p) / 2)
 
     def below(self, values: ArrayLike) -> Float[np.ndarray, "horizons m"]:
-        """Return the probability that each number lies below a value: one for all, (m,), or (horizons, m).
+        """Return the probability that each number lies below its value; values are (), (m,) or (horizons, m).
 
         Raises:
             ValueError: values of another shape.
@@ -107,7 +107,7 @@ class Prediction:
         """Return the prediction with each of its arrays replaced by what `change` makes of it.
 
         Args:
-            change: function of an array and of its number of axes behind that of horizons.
+            change: function of an array and of its number of axes after the axis of horizons.
         """
         return replace(
             self,
@@ -124,15 +124,15 @@ class Prediction:
         below, least, most = map(self._find_part_probabilities, (np.clip(values, low, high), low, high))
         inside = most - least
         share = np.where(inside > 0, (below - least) / np.where(inside > 0, inside, 1.0), below)
-        # Nothing is beyond the limits, also of a part that is as good as certain to be there.
+        # No probability is beyond the limits, even if a part is almost certainly there.
         share = np.where((values <= low)[..., None, :], 0.0, np.where((values > high)[..., None, :], 1.0, share))
         total: np.ndarray = np.sum(self.weights * share, axis=-2)
         return total
 
     def _find_part_probabilities(self, values: np.ndarray) -> np.ndarray:
-        """Return P(part k < value) (horizons, K, m) without regard to limits.
+        """Return P(part k < value) (horizons, K, m), without regard to limits.
 
-        A part without variance is its mean, which counts half at the value itself.
+        A part without variance is its mean, which counts half if it equals the value.
         """
         distance = values[..., None, :] - self.part_means
         deviation = np.sqrt(self.part_variances)
@@ -172,10 +172,10 @@ class Forecast:
         """Return the forecast at some of its horizons.
 
         Args:
-            rows: which, (horizons,) of true and false.
+            rows: flags (horizons,), True for the horizons to keep.
 
         Raises:
-            ValueError: another number of them.
+            ValueError: another number of flags.
         """
         mask = np.asarray(rows)
         if mask.shape != self.steps.shape or mask.dtype.kind != "b":
@@ -201,7 +201,7 @@ class Forecast:
     def _map_arrays(self, change: Callable[[np.ndarray, int], np.ndarray]) -> "Forecast":
         """Return the forecast with each of its arrays replaced by what `change` makes of it.
 
-        `change`: function of an array and of its number of axes behind that of horizons.
+        `change`: function of an array and of its number of axes after the axis of horizons.
         """
         states, outputs, received = (
             prediction and prediction.map_arrays(change) for prediction in (self.states, self.outputs, self.received)
@@ -210,7 +210,7 @@ class Forecast:
         return replace(self, time=change(self.time, 0), states=states, outputs=outputs, received=received)
 
     def named(self, name: str) -> tuple[Prediction, int]:
-        """Return the prediction that has a number of this name, states first, and its place there.
+        """Return the prediction that has a number of this name, looking at states first, and the number's place in it.
 
         Raises:
             ValueError: no state, output or received number of this name.

@@ -83,9 +83,9 @@ def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, in
 
 
 def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
-    """Return how many steps ahead each horizon is (horizons,): numbers of steps, spans of time, or dates.
+    """Return how many steps ahead each horizon is (horizons,), from numbers of steps, spans of time, or dates.
 
-    A whole number stands for each step up to it.
+    A single whole number stands for each step up to it.
     """
     if is_whole(horizons):
         return np.arange(1.0, _require_step_count(horizons) + 1)
@@ -118,20 +118,20 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
 
 
 def _count_months(origin: Origin, horizon: object) -> int | None:
-    """Return how many months of the calendar a date, or a span of months or years, lies ahead; None of all else."""
+    """Return how many calendar months ahead a date, or a span of months or years, is; None for anything else."""
     if isinstance(horizon, np.timedelta64):
         unit, size = np.datetime_data(horizon)
         return int(horizon.astype(np.int64)) * size * MONTHS[unit] if unit in MONTHS else None
     if not isinstance(horizon, datetime | np.datetime64):
         return None
-    seconds = _convert_to_seconds(origin, horizon)  # refuses a date that is not after the data
+    seconds = _convert_to_seconds(origin, horizon)  # raises if the date is not after the data
     assert seconds is not None
     date, end = check_dates("horizons", [horizon]), _find_end_of_data(origin, horizon)
     return int((date[0].astype("datetime64[M]") - end.astype("datetime64[M]")).astype(int))
 
 
 def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
-    """Return how far ahead each horizon is in the unit of dt (horizons,); spans of time and dates in seconds.
+    """Return how far ahead each horizon is (horizons,), in the unit of dt; spans of time and dates give seconds.
 
     A single whole number stands for each step of the usual size up to it.
     """
@@ -147,10 +147,7 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 
 def _require_step_count(value: object) -> int:
-    """Return a count of steps ahead; raise if there are too many.
-
-    LONGEST: a million steps.
-    """
+    """Return a number of steps ahead; raise ValueError if it is above LONGEST, a million."""
     count = check_count("horizons", value)
     if count > LONGEST:
         raise fail("horizons", f"at most {LONGEST:,} steps", count)
@@ -158,7 +155,7 @@ def _require_step_count(value: object) -> int:
 
 
 def _list_horizons(horizons: object) -> list[object]:
-    """Return horizons as a list; a single time or date as a list of one."""
+    """Return horizons as a list; a single time or date gives a list of one."""
     if isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64):
         return [horizons]
     values = list(cast(Iterable[object], horizons)) if rank("horizons", horizons) == 1 else []
@@ -190,22 +187,22 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
 
 
 def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
-    """Return a span of time in seconds; raise of one that is missing, has no unit, or is of months or years."""
+    """Return a span of time in seconds; raise ValueError if it is missing, has no unit, or is of months or years."""
     if isinstance(span, timedelta):
         return span.total_seconds()
     unit, size = np.datetime_data(span)
     if unit == "generic" or unit in MONTHS or np.isnat(span):
         raise fail("horizons", "spans of weeks or shorter units: a month has no length in seconds", show_value(span))
-    # As Python's integers: NumPy's would overflow.
+    # Compute with Python's integers, since NumPy's would overflow.
     seconds = float(np.array(1, f"timedelta64[{unit}]") / np.timedelta64(1, "s"))
     return int(span.astype(np.int64)) * size * seconds
 
 
 def _find_end_of_data(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
-    """Return the date at which the data end, of several sources all of them.
+    """Return the date at which the data end, which must be the same for all sources.
 
     Raises:
-        ValueError: data without dates, or sources that end at different ones.
+        ValueError: data without dates, or sources that end at different dates.
     """
     ends = np.unique(np.asarray(origin.time))
     if ends.dtype.kind != "M":
@@ -253,9 +250,9 @@ def _complete_inputs(
 
 
 def check_inputs_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
-    """Raise ValueError at inputs ahead for which a function of the models returns what it must not.
+    """Raise ValueError if a function of the models returns an invalid value for the inputs ahead.
 
-    `names`: of the inputs; `step`: that of the last row, of several plants for each.
+    `names`: names of the inputs. `step`: number of the last row, or one for each plant.
     """
     count, width = ahead.u.shape[-2:]
     if width:

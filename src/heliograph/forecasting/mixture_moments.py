@@ -40,13 +40,13 @@ class Moments(NamedTuple):
 
 
 def spread_over_branches(weights: Array, means: Array, variances: Array, branches: GaussianBranches) -> MarginalLaws:
-    """Return the laws of numbers to which a noise is added that is a mixture of Gaussians: all pairs of both.
+    """Return the laws of numbers plus a noise that is a mixture of Gaussians: one part for each pair of parts.
 
     Args:
-        weights: of the parts that the numbers have without the noise (K,).
-        means: of each number in each part (K, m), with the mean of the noise.
-        variances: of each number in each part, without the noise (K, m).
-        branches: of the noise about its mean, (m, J) each.
+        weights: weights (K,) of the parts of the numbers without the noise.
+        means: means (K, m) of each number in each part, with the mean of the noise.
+        variances: variances (K, m) of each number in each part, without the noise.
+        branches: log shares, means and variances (m, J) of the noise's Gaussians, about its mean.
     """
     share, mean, variance = (jnp.asarray(one).T for one in branches)  # (J, m)
     pairs = (len(weights) * len(share), means.shape[-1])

@@ -65,15 +65,16 @@ class MultistepPredictor(Module):
     received_noise: ReceivedNoise | OverTime | None
 
     def compute_state_moments(self, state: PyTree) -> Moments:
-        """Return the moments of the states as a mixture: the filter's own if it has one, else of one part.
+        """Return the moments of the states as a mixture: the filter's own if it has one, else with one part.
 
-        Covariances are zero where the filter claims nothing. Of states with limits they are those within the limits.
+        Covariances are zero if the filter claims nothing. For states with limits, the moments are those within the
+        limits.
         """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
             return self._read_moments(filter, state)
         moments = self._read_moments(filter.base, filter.condition_on_limits(state))
-        # Each limited state given the limits of the others: the Gaussians that are cut to its own.
+        # The law of each limited state: Gaussians given the limits of other states, which are then cut to its own.
         means, variances = moments.means, jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         for place, *_ in filter.limits:
             beside = self._read_moments(filter.base, filter.condition_on_limits(filter.hold(state), without=place))
@@ -83,7 +84,7 @@ class MultistepPredictor(Module):
         return moments._replace(laws=MarginalLaws(weights=weights, means=means, variances=variances))
 
     def compute_moments_before_limits(self, state: PyTree) -> Moments:
-        """Return the moments of the states without regard to their limits, but for the parts' weights."""
+        """Return the moments of the states without regard to their limits, except for the weights of the parts."""
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
             return self._read_moments(filter, state)
@@ -91,7 +92,7 @@ class MultistepPredictor(Module):
         return self._read_moments(filter.base, filter.hold(state))._replace(weights=weights)
 
     def _read_moments(self, filter: AbstractFilter, state: PyTree) -> Moments:
-        """Return the moments of the states as the state of a filter has them."""
+        """Return the moments of the states, as the filter's state holds them."""
         if isinstance(state, HasComponents):
             weights, parts = state.components
             parts = take_leading(parts, len(self.filter.states))
@@ -142,11 +143,11 @@ class MultistepPredictor(Module):
             learned_noise = sensor.noise.columns.through(jnp.diag(deviations))
 
         def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return mean and covariance of the outputs, from those of the states, one component of the mixture.
+            """Return mean and covariance of the outputs from those of the states, for one component of the mixture.
 
-            By the plant and the sensor of step k, and the rule by which moments pass a function that is not linear
-            (`self.transform`). `initial_moments`: second moments of the plant's initial law; `learned_noise`: the
-            sensor's noise as the filter has learned it, None where it does not.
+            They use the plant and the sensor of step k, and the rule by which moments pass a nonlinear function
+            (`self.transform`). `initial_moments`: second moments of the plant's initial law. `learned_noise`: the
+            sensor's noise as the filter has learned it, or None.
             """
             states_law = from_covariance(mean, covariance)
             signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_moments, learned_noise)
@@ -164,13 +165,13 @@ class MultistepPredictor(Module):
     def _find_output_laws(
         self, states: Moments, outputs: Moments, noise: AbstractNoise, deviations: jax.Array | None
     ) -> MarginalLaws | None:
-        """Return the law of each output where the sensor's noise is a mixture of Gaussians; None where it is Gaussian.
+        """Return the law of each output if the sensor's noise is a mixture of Gaussians; None if it is Gaussian.
 
         Args:
             states: moments of the states.
             outputs: moments of the outputs, with the noise.
-            noise: that of the step.
-            deviations: how much wider it is than was said (m,), where the filter learns it; else None.
+            noise: the sensor's noise at this step.
+            deviations: factors (m,) of its deviations, if the filter learns them; else None.
         """
         branches = noise.branches()
         if not has_branches(branches):
@@ -205,11 +206,11 @@ class MultistepPredictor(Module):
         return moments._replace(laws=laws)
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
-        """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
+        """Return the state predicted over step k, and the moments of states, outputs and received numbers there."""
         prior = self.filter.predict(state, u, k)
         states = self.compute_state_moments(prior)
         outputs = self.predict_measured(prior, states, u, k)
-        # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
+        # With an unknown start the outputs are received as they are, since no innovation can be formed.
         received = outputs if isinstance(prior, Diffuse) else self.predict_received(prior, outputs, k)
         return prior, (states, outputs, received)
 
@@ -227,7 +228,7 @@ def _measure_in_each_mode(filter: MultipleModelFilter, prior: PyTree, k: jax.Arr
 
 
 def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
-    """Return the moments of the outputs of a state of which not all is known: some variances are infinite."""
+    """Return the moments of the outputs if part of the state is unknown; some variances are then infinite."""
     covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
     noise = jnp.asarray(sensor.noise.covariance)
     mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
@@ -235,14 +236,14 @@ def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
 
 
 def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
-    """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
+    """Return the innovation of z = 0 at step k, which is minus the expected z, with the covariance of what arrives."""
     filter, prior = _condition_on_limits(filter, prior)
     if isinstance(filter, FilterOfInputs):
         return _expect(filter.make_filter_under(prior.u, k), prior.base, k)
-    if isinstance(filter, ToldFilter):  # part of z says which law of noise holds: zeros would say one
+    if isinstance(filter, ToldFilter):  # part of z tells the law of noise, so that z = 0 would tell a wrong one
         return filter.expect(prior, k)
     _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
-    if isinstance(filter, RobustFilter):  # whose law of noise may have no variance
+    if isinstance(filter, RobustFilter):  # its law of noise may have no variance
         has_none = jnp.asarray(at(filter.noise, k).least_degrees) <= 2
         return replace(innovation, covariance=mark_unknown(jnp.asarray(innovation.covariance), has_none))
     return innovation
@@ -303,7 +304,8 @@ def predict_moments(
 ) -> tuple[Moments | None, ...]:
     """Return the moments of states, outputs and what arrives at each row ahead (rows, K, ...).
 
-    By native code where it supports the filter. `state`: that of the filter at `step`; `u`: inputs (rows, inputs).
+    Native code computes them if it supports the filter. `state`: the filter's state at `step`. `u`: inputs
+    (rows, inputs).
     """
     arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
     moments: tuple[Moments | None, ...] = compute_once(_predict_moments, _by_xla, arguments)
@@ -336,7 +338,7 @@ def predict_moments_of_each(
 def _predict_moments(outlook: MultistepPredictor, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
     """Return the moments of states, outputs and what arrives at each step ahead (steps, K, ...).
 
-    From a state at `step`, under inputs `u` (steps, inputs).
+    They start from a state at `step`, under inputs `u` (steps, inputs).
     """
 
     def predict_row(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
@@ -357,9 +359,9 @@ _by_xla, _each_by_xla = quickly_compiled(_predict_moments), quickly_compiled(_pr
 
 
 def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Claim:
-    """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most.
+    """Return the claim of predicted outputs: that of the states for a linear sensor, else "nominal" at most.
 
-    A claim says how far the covariance holds: by a sensor that is not linear, or by angles, it is approximate.
+    With a nonlinear sensor, or with angles, the covariance is approximate.
     """
     sensor = first(outlook.sensor)
     is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
@@ -367,10 +369,10 @@ def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Cl
 
 
 def find_received_claim(filter: AbstractFilter) -> Claim:
-    """Return the claim of what is predicted to arrive: the filter's, but nominal by numbers that are only typical.
+    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if typical numbers stand for unknown.
 
-    ToldFilter: some of the numbers that arrive say the law of noise. What they will be is not known ahead; typical
-    ones are put for them unless their own law is known.
+    A ToldFilter receives numbers that tell the law of noise. They are not known ahead, so typical ones replace them
+    unless their own law is known.
     """
     base = filter
     while isinstance(base, LimitedFilter | FilterOfInputs):

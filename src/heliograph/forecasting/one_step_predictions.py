@@ -35,12 +35,12 @@ def predict_rows(
     z: Float[ArrayLike, "steps received"],
     u: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> Forecast:
-    """Predict each row given those before it: states, outputs and what arrives, at rows where nothing arrived too.
+    """Predict each row given earlier ones: states, outputs and what arrives, also at rows where nothing arrived.
 
     Args:
         filter: a filter.
         z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
-        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+        u: inputs (steps, inputs) that led to each row; by default a filter without inputs is assumed.
 
     Returns:
         A forecast one step ahead whose horizons are the rows: `received.mean[k]` is E[z_k | z_0 ... z_(k-1)].
@@ -59,9 +59,9 @@ def predict_rows(
 
 
 def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | None = None) -> Forecasts:
-    """Predict each row of a recording given those before it, by each filter that ran over it.
+    """Predict each row of a recording given earlier ones, by each filter that ran over it.
 
-    What a fusion of estimates would predict is not here: it has no state of its own that is predicted.
+    A fusion of estimates is left out, since it has no state of its own to predict.
 
     Args:
         record: what `hg.run` returned.
@@ -72,7 +72,7 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
         makes columns of it.
 
     Raises:
-        ValueError: a record of a file or a simulation, which does not know its filters; inputs of another shape.
+        ValueError: a record from a file or a simulation, which does not know its filters; inputs of another shape.
 
     Source: the prediction step of the filter.
     """
@@ -110,7 +110,7 @@ def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, na
 
 
 def _predict_each_row(outlook: MultistepPredictor, z: jax.Array, u: jax.Array) -> PyTree:
-    """Return the moments that a filter predicts for each row of a recording from those before it, (rows, K, ...)."""
+    """Return the moments (rows, K, ...) that a filter predicts for each row of a recording from the earlier rows."""
 
     def predict_and_correct(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the state after a row, and the moments that were predicted for it."""

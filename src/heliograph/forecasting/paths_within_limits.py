@@ -16,15 +16,15 @@ class StateLimits(Module):
     limits: PlacedLimits = eqx.field(static=True)
 
     def hold(self, x: jax.Array) -> jax.Array:
-        """Return a state (n,) whose limited components are held at the limits that they are beyond."""
+        """Return a state (n,) with its limited components clipped to their limits."""
         for place, low, high in self.limits:
             x = x.at[place].set(jnp.clip(x[place], low, high))
         return x
 
     def mirror(self, x: jax.Array) -> jax.Array:
-        """Return a state (n,) whose limited components lie as far within the limits as they were beyond them.
+        """Return a state (n,) with limited components beyond a limit mirrored at it.
 
-        So noise that is symmetric has, at a limit, the law that it has given that it does not lead beyond.
+        At a limit, symmetric noise then has the law that it has given that it does not lead beyond the limit.
         """
         for place, low, high in self.limits:
             value = x[place]

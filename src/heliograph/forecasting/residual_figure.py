@@ -34,9 +34,10 @@ class ResidualQuantiles(NamedTuple):
 
 
 def compare_with_normal_quantiles(e: np.ndarray) -> ResidualQuantiles:
-    """Return the quantiles of residuals (steps,), NaN where none came: the i-th of n is Beta(i, n + 1 - i) in law.
+    """Return residuals (steps,) without NaN in order, beside normal quantiles, with a band for each.
 
-    The band leaves OUTSIDE beyond each side; `ndtri` is the quantile function of the normal law.
+    The normal probability of the i-th of n residuals has the law Beta(i, n + 1 - i). The band leaves OUTSIDE beyond
+    each side.
     """
     sorted_residuals = np.sort(e[~np.isnan(e)])
     n = len(sorted_residuals)

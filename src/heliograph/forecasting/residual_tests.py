@@ -57,10 +57,9 @@ class Residuals:
     variance: Array
 
     def doubts(self) -> list[str]:
-        """List what speaks against the model, a line each, with the number of tests in mind.
+        """List what speaks against the model, one line each.
 
-        A p-value speaks against it below FALSE over the number of tests: FALSE is the probability of any wrong
-        doubt.
+        A p-value does if it is below FALSE divided by the number of tests. FALSE: the probability of any wrong doubt.
         """
         tests = {"correlated over time": self.ljung_box, "not normal": self.normality,
                  "of a variance that changes": self.variance}  # fmt: skip
@@ -190,7 +189,7 @@ def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
 
 
 def _compute_autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
-    """Return r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came, for each lag from 1 on (lags,)."""
+    """Return r_l = sum e_t e_(t+l) / sum e_t^2 (lags,) for lags from 1 on, over pairs that are not NaN."""
     e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
     sum_of_squares = np.nansum(e**2)
     if not sum_of_squares > 0:
@@ -199,9 +198,9 @@ def _compute_autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
-    """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, n_l pairs of lag l: chi-squared if all r_l are zero.
+    """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, which is chi-squared if all correlations r_l are zero.
 
-    NaN where fewer than LEAST residuals came.
+    n residuals are not NaN, and n_l pairs of them have lag l. The result is NaN for n below LEAST.
     """
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
@@ -212,9 +211,10 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
 
 
 def _test_normality(e: np.ndarray) -> float:
-    """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis of residuals (steps,).
+    """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, with S the skewness and K the kurtosis of residuals.
 
-    The number is chi-squared with 2 degrees of freedom if they are normal. NaN where fewer than LEAST came.
+    The number is chi-squared with 2 degrees of freedom if the n residuals that are not NaN are normal. The result is
+    NaN for n below LEAST.
     """
     e = e[~np.isnan(e)]
     n = len(e)
@@ -226,10 +226,10 @@ def _test_normality(e: np.ndarray) -> float:
 
 
 def _test_same_variance(e: np.ndarray) -> float:
-    """Return the two-sided p-value of the ratio of the sums of squares in the last and in the first third.
+    """Return the two-sided p-value of the ratio of the sums of squares in the last and the first third of residuals.
 
-    Of the residuals that came, h in a third: the ratio has the F law of h and h degrees of freedom if the variance
-    is one. NaN where h is less than half of LEAST.
+    With h residuals (not NaN) in a third, the ratio has the F law with h and h degrees of freedom if the variance is
+    the same. The result is NaN for h below half of LEAST.
     """
     e = e[~np.isnan(e)]
     h = len(e) // 3

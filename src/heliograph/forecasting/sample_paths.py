@@ -53,9 +53,9 @@ class Paths(NamedTuple):
         """Return whether a state or an output is beyond a level, at each time of each path (draws, times).
 
         Args:
-            name: of the state or output.
+            name: name of the state or output.
             level: the level.
-            above: whether beyond is above the level (default) or below it.
+            above: True (default) if beyond means above the level, False if below.
 
         Raises:
             ValueError: no such state or output, a level that is no number.
@@ -140,11 +140,10 @@ class ModeSwitching(NamedTuple):
     moved: Bool[Array, ""]
 
     def draw_next(self, key: jax.Array, mode: jax.Array, u: jax.Array, k: jax.Array, is_first: jax.Array) -> jax.Array:
-        """Return the mode of step k, drawn by the chain from that of the step before, or that one itself.
+        """Return the mode of step k, drawn by the chain from the mode of the previous step.
 
-        It stays at the first of all steps unless the chain has `moved` before. `u`: inputs of the step.
-
-        `moved`: whether the filter has predicted before; if not, its modes are already those of the first step.
+        `self.moved`: True if the filter has predicted before. If not, its modes are already those of the first step,
+        where the mode stays as it is. `u`: inputs of the step.
         """
         plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
         rows = transition_over(plant, u, jnp.asarray(channel.transition))
@@ -165,7 +164,7 @@ class ModeSwitching(NamedTuple):
 
 
 def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
-    """Return how the modes of plant and sensor move; None where these have none."""
+    """Return how the modes of plant and sensor move, or None if these have no modes."""
     filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
     if not memories((plant, sensor)):
         return None
@@ -261,7 +260,7 @@ def _draw_paths_from_states(
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from a state and a mode.
 
-        `u`: inputs of the rows; `step`: number of the first row.
+        From outside: `u`, inputs of the rows, and `step`, number of the first row.
         """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
         path: tuple[jax.Array, jax.Array]
@@ -275,7 +274,7 @@ def _draw_paths_from_states(
 def _draw_outputs(sensor: Any, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
     """Return what a sensor measures (m,) of a state x, with noise drawn from its law.
 
-    `learned`: deviations of the noise in units of its own (m,), where a filter learned them; else None.
+    `learned`: factors (m,) of the noise's deviations, if a filter learned them; else None.
     """
     law, noise = sensor.noise, sensor.noise.sample(key)
     if learned is not None:

@@ -32,7 +32,7 @@ def select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
         of_number = (slice(None), horizon, slice(None), number)
         return MixtureLaws(weights[of_number], means[of_number], variances[of_number])
     weights, means = np.asarray(moments.weights), np.asarray(moments.means)
-    variances = np.asarray(moments.covariances)  # of numbers by themselves, in the place of covariances
+    variances = np.asarray(moments.covariances)  # the field holds variances here, in place of covariances
     return MixtureLaws(weights[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
@@ -42,12 +42,12 @@ def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarra
 
 
 def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return the log density of what came (rows,), in nats: the larger the better.
+    """Return the log density (rows,) of the values, in nats; larger is better.
 
-    LOG_TURN: log(2 pi). The largest term is taken out of the sum, lest every exponential is 0.
+    The largest term is taken out of the sum, so that not every exponential is 0. LOG_TURN: log(2 pi).
     """
     squares = (values[:, None] - law.means) ** 2 / law.variances
-    with np.errstate(divide="ignore"):  # a part of no weight has no density
+    with np.errstate(divide="ignore"):  # a part may have weight 0
         log_weights = np.log(law.weights)
     log_terms = log_weights - (squares + np.log(law.variances) + LOG_TURN) / 2
     largest = log_terms.max(axis=1)
@@ -55,10 +55,10 @@ def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
 
 def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return the continuous ranked probability score (rows,), in the unit of what came: the smaller the better.
+    """Return the continuous ranked probability score (rows,), in the unit of the values z; smaller is better.
 
-    E|X - z| - E|X - X'| / 2 of independent X and X' of the law; of one Gaussian s (t (2 Phi(t) - 1) + 2 phi(t) -
-    pi^(-1/2)) with t = (z - m) / s.
+    It is E|X - z| - E|X - X'| / 2 for independent X and X' of the law. For one Gaussian it is
+    s (t (2 Phi(t) - 1) + 2 phi(t) - pi^(-1/2)) with t = (z - m) / s.
 
     Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
     """
@@ -72,7 +72,7 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
 
 def _compute_mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return E|Y| of a Gaussian Y of this mean and variance."""
+    """Return E|Y| = m (2 Phi(t) - 1) + 2 s phi(t) with t = m / s, for a Gaussian Y of mean m and deviation s."""
     deviation = np.sqrt(variance)
     t = mean / deviation
     return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * deviation * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))
@@ -86,12 +86,11 @@ class ScoreMean(NamedTuple):
 
 
 def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
-    """Return the mean of a series (rows,), NaN where nothing came, and its standard error.
+    """Return the mean of the values (rows,) that are not NaN, and its standard error; both NaN if there are none.
 
-    Forecasts from neighbouring rows share what happens in between, so errors of horizon h are correlated over h - 1
-    rows at least. Var = n^-2 sum_l w_l sum_t d_t d_{t+l} with Bartlett's weights over max(h - 1, 1.3 sqrt n) lags.
-
-    BANDWIDTH: that 1.3.
+    Forecasts from neighbouring rows share what happens in between, so errors at horizon h are correlated over at least
+    h - 1 rows. The squared error is n^-2 sum_l w_l sum_t d_t d_(t+l), with deviations d from the mean and Bartlett's
+    weights w over max(h - 1, 1.3 sqrt(n)) lags. BANDWIDTH: 1.3.
 
     Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
     """

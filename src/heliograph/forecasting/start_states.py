@@ -19,7 +19,7 @@ def find_origin(source: object) -> Origin:
     """Return where a forecast from a result or live object starts: its states, and the time of its last row.
 
     Raises:
-        ValueError: something without an origin, or a record whose filters' states were not kept.
+        ValueError: something without an origin, or a record without its filters' states.
     """
     origin = getattr(source, "origin", None)
     if not isinstance(origin, Origin):
@@ -31,7 +31,7 @@ def find_origin(source: object) -> Origin:
 
 
 def find_common_origin(source: Sources) -> Origin:
-    """Return where a forecast starts; of a list of sources their origins as one, with an axis over the sources.
+    """Return where a forecast starts; a list of sources gives one origin with an axis over the sources.
 
     Raises:
         ValueError: what `find_origin` refuses, an empty list, sources of other models or other steps.
@@ -68,7 +68,7 @@ def _stack_origins(origins: list[Origin]) -> Origin:
 
 
 def _check_like_first(name: str, head: Origin, origin: Origin) -> None:
-    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first one, `head`."""
+    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first origin, `head`."""
     if origin.model is not head.model:
         raise fail(name, "the filter or network of the source before it", "another one")
     if not np.array_equal([head.spacing, head.months], [origin.spacing, origin.months], equal_nan=True):
@@ -83,9 +83,9 @@ def _stack_trees(trees: list[PyTree]) -> PyTree:
 
 
 def _stack_estimates(estimates: list[Estimate]) -> Estimate:
-    """Return estimates of single plants as one of several plants, with the claim of the first that claims anything.
+    """Return estimates of single plants as one estimate of several, with the claim of the first that claims anything.
 
-    Of plants with another claim the covariances are NaN.
+    Covariances of estimates with another claim are NaN.
     """
     model = next((estimate for estimate in estimates if estimate.claim != "none"), estimates[0])
     unknown = np.full(np.shape(model.covariance), np.nan)

@@ -51,13 +51,16 @@ class Crossing:
         return float(1 - self.by[-1])
 
     def quantile(self, level: float) -> float:
-        """Return how far the time is by which it has been beyond with this probability; infinite if none is.
+        """Return the first time by which the number has been beyond the level with this probability, or infinity.
+
+        The time is how far ahead it is, in the unit of `self.steps`. Infinity means that no time reaches the
+        probability.
 
         Raises:
             ValueError: a level that is no probability between 0 and 1.
         """
         p = float(scalar("level of a quantile", level, 0, 1))
-        # `by`: probability to have been beyond by each of the `steps`.
+        # self.by: the probability to have been beyond by each of the times self.steps.
         reaching_steps = self.steps[self.by >= p]
         return float(reaching_steps[0]) if len(reaching_steps) else float("inf")
 

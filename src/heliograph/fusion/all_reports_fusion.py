@@ -84,9 +84,9 @@ class AllReports(AbstractInformedFusion):
         return make_initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
 
     def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
-        """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive.
+        """Return the next state, and the fused mean and covariance, by predicting all errors and using the reports.
 
-        `means` (nodes, n): the estimates sent. Return the next state, and the fused mean and covariance.
+        `means` (nodes, n): the estimates that the nodes sent, NaN for one that did not arrive.
         """
         nodes, n = means.shape
         prior = propagate_errors(state, happened, make_lossless_links(nodes, n))
@@ -102,12 +102,10 @@ def make_lossless_links(nodes: int, n: int) -> ReportModel:
 
 
 def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """Return the state before the first report, for so many `delays` and `received` numbers per report.
+    """Return the state before the first report, for `delays` past reports and `received` numbers in each report.
 
-    Every error is that of x_0 then, up to a constant; nothing has been sent.
-
-    `spill`: bound on the squared error by quantizers, None without. The state is (x, errors of the nodes, past
-    reports).
+    The state is (x, errors of the nodes, past reports). Every error is that of x_0 up to a constant, and nothing has
+    been sent. `spill`: a bound on the squared error by quantizers, or None without them.
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
@@ -131,9 +129,9 @@ class ReportMap(NamedTuple):
     transition: ErrorMap
 
     def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
-        """Move zeta by its step, and past reports by one place.
+        """Return each column after a step: zeta moved by its transition, and past reports by one place.
 
-        zeta = (x, errors of the nodes); a report is x - e_i, and the past ones follow, the latest first.
+        zeta = (x, errors e_i of the nodes). A report is x - e_i; past reports follow zeta, the latest first.
         """
         nodes, n, _ = self.transition.errors.shape
         zeta, past_reports = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
@@ -209,17 +207,17 @@ def correct_with_reports(
 def _compute_gain(
     x: Gaussian, output: Float[jax.Array, "M N"], past: PastReports, present: Bool[jax.Array, " M"]
 ) -> Float[jax.Array, "N M"]:
-    """Return the gain of what arrived, with quantizers' errors and rounding as noise of each report.
+    """Return the gain for what arrived, with the errors of quantizers and rounding as noise of each report.
 
-    x: state of the centre; `output`: reports by x; `past`: gain, offset, noise and quantizers' error of reports by age
-    and node.
+    x: state of the centre. `output`: matrix from x to the reports. `past`: gain, offset, noise and quantizers' error of
+    reports by age and node. `present`: which numbers arrived.
     """
     identity, shape = np.eye(past.noise.shape[-1]), past.offset.shape
     sizes_of_terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
-    # Rounding to segments, uniform within -+ error, has the variance error^2 / 3.
+    # The error of a quantizer is taken as uniform within +-error, with the variance error^2 / 3.
     quantizer_noise = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
     noise = past.noise + quantizer_noise + identity * noise_beside_repeated(sizes_of_terms)[..., None]
-    # What did not arrive has slopes of zero and a noise of its own.
+    # Numbers that did not arrive get slopes of zero and independent noise of variance 1.
     arrived = present.reshape(shape)
     noise = jnp.where(arrived[..., :, None] & arrived[..., None, :], noise, identity)
     slopes = jnp.where(present[:, None], output @ x.root, 0.0)
@@ -227,9 +225,9 @@ def _compute_gain(
 
 
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
-    """Return the estimate of x, with the covariance of its error or a bound on it.
+    """Return the estimate of x, with the covariance of its error or, with quantizers, a bound on it.
 
-    `spill`: bound on the squared error by quantizers, None without them.
+    `state.spill`: a bound on the squared error by quantizers, or None without them.
     """
     x = take_leading(state.gaussian, n)
     mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
@@ -260,14 +258,12 @@ def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: Rep
 def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
     """Return C of E[reports] = C s for the state s = (x, e_1, ..., e_nodes, what was sent 1, 2, ... steps before).
 
-    A report that was sent a steps before is its mean gain times x - e_i for a = 0, times what was sent then for a > 0.
-    The reports (ages, nodes, m) are one below the other.
-
-    e_i: error of node i's estimate x - e_i, which is what a node sends.
+    e_i is the error of node i's estimate x - e_i, which the node sends. A report of age a is its mean gain times what
+    was sent: x - e_i for a = 0, the entry of s for a > 0. Reports (ages, nodes, m) stand one below the other.
     """
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
-    # What was sent, as linear functions of s: x - e_i at this step, and what s holds of the steps before.
+    # What was sent, as linear functions of s: x - e_i at this step, and entries of s at earlier steps.
     sent_now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
     sent_now = np.pad(sent_now, ((0, 0), (0, length - n - size)))
     sent_before = np.eye(length - n - size, length, n + size)
@@ -276,10 +272,10 @@ def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N
 
 
 def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> WeightedColumns:
-    """Return the factors of K_i S_ij K_j', a column for each measurement; S_ij = 0 between nodes that share nothing.
+    """Return factors of the matrix with blocks K_i S_ij K_j', with one column for each measurement.
 
-    K_i: gain of node i; S_ij: covariance of what nodes i and j receive, (node, m, m) where they share nothing, else
-    (node, m, node, m).
+    K_i is the gain of node i, and S_ij the covariance of what nodes i and j receive. `noise` is (node, m, m) if nodes
+    share nothing, so that S_ij = 0 for i != j, and otherwise (node, m, node, m).
     """
     nodes, _, m = gain.shape
     if noise.ndim == 3:
@@ -290,9 +286,9 @@ def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) 
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
-    """Return the factors of the covariance of noises that are independent of each other, of all reports together.
+    """Return the factors of the joint covariance of all reports' noises, which are independent of each other.
 
-    They are the factors of one block-diagonal covariance, age after age and node after node.
+    It is block-diagonal, age after age and node after node.
     """
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
@@ -300,10 +296,7 @@ def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
 
 
 def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
-    """Return the block-diagonal matrix of these blocks.
-
-    There is one block for each age and node, (a, b).
-    """
+    """Return the block-diagonal matrix of these blocks (a, b), one for each age and node."""
     ages, nodes, rows, columns = blocks.shape
     count = ages * nodes
     numbers = jnp.arange(count)
@@ -319,9 +312,10 @@ def _bound_by_cauchy(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"
 
 
 def _bound_by_young(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young).
+    """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], the bound of least trace by Young's inequality.
 
-    A and B bound E[u u'] and E[v v'], whatever the correlation of u and v.
+    r^2 = tr A and s^2 = tr B. A and B bound E[u u'] and E[v v'], and the correlation of u and v may be any. If r or s
+    is 0, the bound is A + B.
     """
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
     are_positive = (r > 0) & (s > 0)

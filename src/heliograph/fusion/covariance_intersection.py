@@ -23,12 +23,10 @@ def intersect_covariances(
     information: Float[jax.Array, "count n n"],
     weights: Float[jax.Array, " count"],
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
+    """Return x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, with x_0 the first of the means x.
 
-    x_0 is the first of the means. Differences from it are used, since the matrices that multiply them have lost the
-    digits that nearly dependent components cost: the means themselves may be millions of deviations from zero.
-
-    J: inverses of the covariances; w: weights of sum 1; x: the means.
+    J are the information matrices, inverses of the covariances, and w weights of sum 1. Differences from x_0 are used
+    since means may be millions of deviations from zero, while nearly dependent components cost the matrices digits.
     """
     covariance = invert_positive_definite(_sum_weighted(weights, information))
     differences = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
@@ -55,17 +53,17 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
     scaled = information / (jnp.sum(jax.vmap(jnp.trace)(information)) / count)
 
     def improve_weights(progress: _InteriorPointState) -> _InteriorPointState:
-        """Take one Newton step, unless the certificate says that the weights are good enough.
+        """Return the search after one Newton step, or unchanged weights if they are good enough by the certificate.
 
-        w: weights, s = `slack`: multipliers of w >= 0; `scaled`: the information matrices J; P = (sum w J)^-1, g: the
-        trace's gradient. GAP: 1e-10, the relative excess allowed.
+        w: the weights. `slack`: multipliers s of w >= 0. `scaled`: the information matrices J. P = (sum w J)^-1. g: the
+        gradient of tr P. GAP: 1e-10, the relative excess of the trace that is allowed.
         """
         w, slack = progress.weights, progress.slack
         trace, gradient, hessian = _trace_derivatives(scaled, w)
-        # At the optimum s = g - min g: with a tenth of the trace added, the first multipliers are positive.
+        # At the optimum s = g - min g. Start there with a tenth of the trace added, so that multipliers are positive.
         slack = jnp.where(progress.iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
         new_w, new_slack = _take_newton_step(_PointWithDerivatives(w, slack, gradient, hessian))
-        # The certificate of the docstring: max_k tr(P J_k P) is above tr P by more than GAP tr P.
+        # Certificate: weights are good enough if max_k tr(P J_k P) is at most (1 + GAP) tr P.
         is_unfinished = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
         w, slack = jnp.where(is_unfinished, new_w, w), jnp.where(is_unfinished, new_slack, slack)
         return _InteriorPointState(weights=w, slack=slack, goes_on=is_unfinished, iteration=progress.iteration + 1)
@@ -123,10 +121,10 @@ def _take_newton_step(point: _PointWithDerivatives) -> tuple[jax.Array, jax.Arra
     for_ones = root * solve(root[:, None])[:, 0]  # the solution for a right side of ones
 
     def find_moves(target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return dw and ds, the moves of the weights w and of their multipliers s (`slack`) towards w s = target.
+        """Return the moves dw and ds of the weights w and their multipliers s (`slack`) towards w s = target.
 
-        (H + diag(s / w)) dw = target / w - gradient - m 1 is solved by `solve`, in units of `root` = w^1/2. The
-        solution for the right side 1 is `for_ones`; m is such that the dw sum to 0.
+        (H + diag(s / w)) dw = target / w - gradient - m 1, where m makes the dw sum to 0. `solve` solves it in units of
+        `root` = w^1/2, and `for_ones` is its solution for the right side 1.
         """
         without_sum = root * solve((target / root - root * gradient)[:, None])[:, 0]  # for m = 0
         m = jnp.sum(without_sum) / jnp.sum(for_ones)
@@ -178,16 +176,16 @@ def intersect_inverse_covariances(
         return invert_positive_definite(p_information + q_information - common), common
 
     def halve_interval(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the half in which the slope changes its sign; its midpoint alone where the slope is flat there.
+        """Return the half of the interval in which the slope changes its sign, or its midpoint if the slope is 0 there.
 
-        `ends`: of the interval of the weight w that is searched; p, q: the two covariances; FLAT: 1e-15, the share
-        below which a slope is rounding.
+        `ends`: of the interval of the weight w that is searched. p, q: the two covariances. FLAT: 1e-15, the share of
+        its terms up to which a slope is rounding.
         """
         low, high = ends
         w = jnp.mean(jnp.stack(ends))
         covariance, common = fuse_covariances(w)
         factor = covariance @ common
-        # The slope, and the size of the terms whose difference it is.
+        # The slope is a difference of terms; `size` is their sum.
         slope, size = (-jnp.sum((factor @ change) * factor) for change in (p - q, p + q))
         is_flat = jnp.abs(slope) <= FLAT * jnp.abs(size)
         return jnp.where(is_flat | (slope < 0), w, low), jnp.where(is_flat | (slope > 0), w, high)
@@ -208,13 +206,11 @@ def invert_positive_definite(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n 
 
 
 def invert_covariances(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
-    """Invert covariances P_k of one state; a component of variance 0 counts as known to KNOWN.
+    """Return the inverses of covariances P_k of one state, where a component of variance 0 counts as known to KNOWN.
 
-    A component with less than KNOWN of its variance left, given those before it, gets KNOWN of it added; a component of
-    variance zero gets KNOWN of the largest variance that any of the estimates has for it (1 where all are zero): the
-    limit, to KNOWN of each component's scale, and never less.
-
-    KNOWN: 1e-8, the share of a variance that stands for none.
+    KNOWN is 1e-8, the share of a variance that stands for none. A component that has less than KNOWN of its variance
+    left, given earlier ones, gets KNOWN of it added. A component of variance 0 gets KNOWN of the largest variance that
+    any estimate has for it, or of 1 if all are 0.
     """
     variances = jnp.diagonal(matrices, axis1=1, axis2=2)
     largest = jnp.max(variances, axis=0)
@@ -223,11 +219,11 @@ def invert_covariances(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Arr
 
 
 def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
-    """Invert a covariance whose variances are at least `least`.
+    """Return the inverse of a covariance, with `least` added to components of too little variance.
 
-    A component whose variance, given those before it, is below `least` gets that added.
+    These are components whose variance, given earlier ones, is below `least`.
     """
-    # 1 / root of the variance of each component given those before it; rounding where that is next to none.
+    # 1 / sqrt(variance of each component given earlier ones), or 0 if that is rounding.
     _, scales = factor(a)
     is_small = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)
     return invert_positive_definite(a + jnp.diag(is_small * least))
@@ -239,13 +235,12 @@ def restore_exact_components(
     means: Float[jax.Array, "count n"],
     inputs: Float[jax.Array, "count n n"],
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Give the fused estimate an input's mean, and variance 0, where that input has variance 0.
+    """Return the fused estimate, with an input's mean and variance 0 in components where that input has variance 0.
 
-    In `invert_covariances` a small number stands for no variance, of which the mean would keep 1e-8 of what the
-    others say.
+    `invert_covariances` takes a small number for no variance, so that the fused mean would keep 1e-8 of other inputs.
     """
     is_exact_in_input = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
-    # From the last input to the first, so that of several exact ones the first is taken.
+    # Go from the last input to the first, so that the first exact one prevails.
     for mean_of_input, is_exact in zip(reversed(list(means)), reversed(list(is_exact_in_input)), strict=True):
         mean = jnp.where(is_exact, mean_of_input, mean)
     is_exact_in_any = jnp.any(is_exact_in_input, axis=0)

@@ -55,9 +55,9 @@ class ErrorMap(NamedTuple):
     errors: Float[jax.Array, "node n n"]
 
     def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
-        """Return F zeta of each column.
+        """Return F zeta for each column zeta = (x, e_1, ..., e_nodes).
 
-        zeta = (x, e_1, ..., e_nodes): the plant moves x; an error moves by itself, and by x under a wrong model.
+        The plant moves x. An error moves by itself, and under a wrong model also by x (`self.of_state`).
         """
         nodes, n, _ = self.errors.shape
         x, e = columns[:n].reshape(n, -1), columns[n:].reshape(nodes, n, -1)
@@ -81,9 +81,10 @@ class ErrorStep(NamedTuple):
     received: Array
 
     def noise(self) -> Float[jax.Array, "N N"]:
-        """Return B Q B' + K E[nu nu'] K', the covariance of what the step adds.
+        """Return B Q B' + K E[nu nu'] K', the covariance of what the step adds to (x, e_1, ..., e_nodes).
 
-        Q: process noise, nu: noise in what nodes receive, K: their gains. Nodes that share nothing have a block each.
+        Q: process noise. nu: noise in what nodes receive. K: the nodes' gains. `self.received` is E[nu nu'], with a
+        block for each node if they share nothing.
         """
         nodes, n, _ = self.gain.shape
         if self.received.ndim == 4:
@@ -136,9 +137,9 @@ class ErrorMoments(NamedTuple):
 def make_initial_errors(
     mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]
 ) -> ErrorMoments:
-    """Return the moments before the first step, when filters start at known means: errors are x_0 up to a constant.
+    """Return the moments before the first step, when filters start at known means (`starts`).
 
-    The state x and all errors x - start have the covariance of x_0, and are fully correlated.
+    The state x and all errors x - start then have the covariance of x_0, and are fully correlated.
     """
     mean, starts = jnp.asarray(mean), jnp.asarray(starts)
     count = 1 + len(starts)  # the state itself, and the error of each node
@@ -170,7 +171,7 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
 def propagate_state(
     mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return E x and Cov x after a step x+ = matrix x + shift + w, Cov w = noise."""
+    """Return E x and Cov x after a step x+ = A x + shift + w, with A = `motion.matrix` and Cov w = `motion.noise`."""
     matrix = jnp.asarray(motion.matrix)
     mean_after = matrix @ mean + motion.shift
     covariance_after = symmetric(propagate_by_mode(matrix, covariance, motion.noise))
@@ -178,10 +179,10 @@ def propagate_state(
 
 
 def propagate_errors_jointly(errors: ErrorMoments, step: ErrorStep) -> ErrorMoments:
-    """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', and the terms of a wrong model.
+    """Return moments after a step, P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j' and effects of a wrong model.
 
-    zeta = (x, e_1, ..., e_nodes) has the mean and covariance of `errors`; Q: process noise, S_ij: noise that nodes
-    share.
+    `errors` has the mean and covariance of zeta = (x, e_1, ..., e_nodes). Q: process noise. S_ij: noise that nodes
+    share. K_i: gain of node i.
     """
     mean = step.transition @ errors.mean.reshape(-1) + step.shift
     covariance = symmetric(propagate_by_mode(step.transition, errors.covariance, step.noise()))
@@ -202,9 +203,9 @@ class ErrorSources(NamedTuple):
         return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
 
     def joint(self) -> Float[Array, "node n node n"]:
-        """Return Cov(e_i, e_j) of all pairs.
+        """Return Cov(e_i, e_j) of all pairs of errors.
 
-        e_i is `shared`_i times common sources of variance 1, plus an own part of covariance `independent`_i.
+        e_i is `self.shared`_i times common sources of variance 1, plus an own part of covariance `self.independent`_i.
         """
         count, n, _ = self.shared.shape
         roots = self.shared.reshape(count * n, -1)
@@ -213,9 +214,9 @@ class ErrorSources(NamedTuple):
         return of_shared + of_independent
 
     def weigh(self, weights: Float[Array, "n node n"]) -> tuple[Float[Array, "n sources"], Float[Array, "n n"]]:
-        """Return the sources of the sum W e, and the covariance of its independent part.
+        """Return the weighted error W e, as its factor of common sources and the covariance of its independent part.
 
-        e_i is `shared`_i times common sources of variance 1, plus an own part of covariance `independent`_i.
+        e_i is `self.shared`_i times common sources of variance 1, plus an own part of covariance `self.independent`_i.
         """
         xp = library(weights, *self)
         independent = xp.einsum("aib,ibc,dic->ad", weights, self.independent, weights)
@@ -248,10 +249,9 @@ class SourceFactors(NamedTuple):
 
 
 def make_initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
-    """Return the factors before the first step, with room for `sources` more: all is the deviation of x_0.
+    """Return the factors before the first step, with room for `sources` more; the only sources are those of x_0.
 
-    zeta = (x, errors of nodes): each is its mean plus roots times the sources, which are independent numbers of
-    variance 1.
+    zeta = (x, errors of nodes) is its mean plus roots times the sources, which are independent numbers of variance 1.
     """
     nodes, n = errors.bias.shape
     state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))

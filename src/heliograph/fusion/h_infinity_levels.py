@@ -9,10 +9,9 @@ from heliograph.numerics.types import ArrayLike, Float
 def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
     """Return the weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
 
-    By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
-    linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
-
-    A level gamma_i bounds a node's ratio of error to disturbance.
+    A level gamma_i bounds a node's ratio of error to disturbance. By Cauchy's inequality,
+    1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, with equality for these weights. The sharper `fused_level` is linear
+    in c, so the best single node minimises it.
 
     Args:
         levels: gamma_i of the nodes (N,), positive.
@@ -30,10 +29,8 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
 def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
     """Return sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
 
-    The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
-    the gamma_i, `weights` (N,) the c_i.
-
-    A level bounds a node's ratio of error to disturbance, by norms.
+    A level bounds a node's ratio of error to disturbance, by norms. The fused error is sum c_i e_i and a norm is convex
+    (Minkowski), so the fused level is never above the largest local one.
 
     Args:
         levels: gamma_i of the nodes (N,), positive.

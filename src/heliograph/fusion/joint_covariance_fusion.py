@@ -110,20 +110,20 @@ class AbstractJointWeights(AbstractInformedFusion):
         )
 
     def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
-        """Fuse the present estimates with the best weights for their joint covariance.
+        """Return the present estimates fused with the best weights for their joint covariance.
 
-        `errors`: bias and joint covariance of the nodes' errors; `with_mean`: the plant's mean before data is an
-        estimate too.
+        `happened.errors`: bias and joint covariance of the nodes' errors. If `self.with_mean`, the plant's mean before
+        any data is one more estimate.
         """
         errors = happened.errors
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
-            # x - E x, the error of the plant's mean, behind those of the nodes: the first n rows and columns last.
+            # Move x - E x, the error of the plant's mean, behind those of the nodes, so that its n rows come last.
             unbiased = jnp.concatenate([unbiased, errors.state_mean[None]])
             count, n = unbiased.shape
             joint = jnp.roll(errors.covariance, (-n, -n), (0, 1)).reshape(count, n, count, n)
         weights = self.weights(joint)
-        # W sums to I, so that differences of the means suffice: digits that W lacks then cost digits of these alone.
+        # W sums to I, so that it can weigh differences of the means. Rounding of W then only affects these.
         mean = unbiased[0] + jnp.einsum("aib,ib->a", weights, unbiased - unbiased[0])
         return state, (mean, weigh_covariance(weights, joint))
 

@@ -45,13 +45,11 @@ def _with_joint_check(weights: Weights) -> Weights:
 @_with_joint_check
 @compile_on_call
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Compute matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
+    """Return the matrix weights W_i with sum_i W_i = I that minimise W P W', for P = `joint` (node, n, node, n).
 
-    W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'. P^+ alone is wrong where a combination of the estimates
-    has no error. With U = P + E D E', D > 0, the range of E is in that of U, and U gives the weights of P since W E is
-    given. D is the mean of the estimates' variances, so units do not matter; one rank rule, on correlations.
-
-    RANK: units of rounding below which an eigenvalue is none.
+    W = (E' U^+ E)^-1 E' U^+ with E = [I; ...; I] and U = P + E D E'. P^+ alone would be wrong if a combination of the
+    estimates has no error. With D > 0 the range of E is in that of U, and U gives the weights of P since W E = I. D is
+    the mean of the estimates' variances, so that units do not matter. An eigenvalue below RANK roundings counts as 0.
 
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
@@ -130,18 +128,18 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 
 
 def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Return diagonal weights: those that `weigh` gives to each component of the state by itself."""
+    """Return diagonal weights: those that `weigh` gives for each component of the state by itself."""
     nodes, n = joint.shape[:2]
-    # The joint covariance of component a of all nodes: one of a state of that component alone, (node, 1, node, 1).
+    # Component a of all nodes has a joint covariance like that of a state with one component, (node, 1, node, 1).
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
     weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
     return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
 
 
 def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Return one number for each estimate: the weights of errors whose covariances are the traces.
+    """Return weights of one number for each estimate, computed as if covariances were their traces.
 
-    `joint` is Cov(e_i, e_j) of all estimates; its traces replace it, as of a state of one component.
+    `joint`: Cov(e_i, e_j) of all estimates. Its traces replace it, like the covariances of a state of one component.
     """
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", joint).reshape(nodes, 1, nodes, 1)
@@ -152,10 +150,7 @@ def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) ->
 def weigh_covariance(
     weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]
 ) -> Float[jax.Array, "n n"]:
-    """Return the covariance W P W' of the weighted sum of the errors.
-
-    W are the weights, P = Cov(e_i, e_j) of all errors.
-    """
+    """Return the covariance W P W' of the weighted sum of the errors, with weights W and P = `joint`."""
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
 
 
@@ -186,9 +181,9 @@ def solve_regularised_weights(
 def solve_regularised_weights_by_component(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Return the diagonal weights of those that are present: the best for each component of the state by itself.
+    """Return the diagonal weights of the estimates that are `present`, the best for each component by itself.
 
-    `joint`: Cov(e_i, e_j) of a node and its neighbours (degree of them). WRITTEN: most for which the solution is
+    `joint`: Cov(e_i, e_j) of a node and its neighbours, `degree` of them. Up to WRITTEN of them, the solution is
     written out.
     """
     degree, n = joint.shape[:2]
@@ -202,8 +197,8 @@ def component_weights(
 ) -> Float[jax.Array, "degree n"]:
     """Return the diagonals c_i of the weights that are best for each component by itself.
 
-    `joint`: Cov(e_i, e_j) of a node and its neighbours (degree of them); `present`: which arrived; weights of absent
-    ones are 0.
+    `joint`: Cov(e_i, e_j) of a node and its neighbours, `degree` of them. `present`: which estimates arrived; the
+    others have weight 0.
     """
     component = jnp.stack([joint[:, a, :, a] for a in range(joint.shape[1])])
     return jax.vmap(_weigh_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
@@ -212,9 +207,10 @@ def component_weights(
 def _weigh_component(
     joint: Float[jax.Array, "degree degree"], arrived: Float[jax.Array, " degree"]
 ) -> Float[jax.Array, " degree"]:
-    """Return c = U^-1 1 / 1' U^-1 1 over those that arrived (1, else 0), as `solve_regularised_weights` of n = 1.
+    """Return c = U^-1 1 / (1' U^-1 1) over estimates that arrived (`arrived` is 1, else 0), for one component.
 
-    U = P + ridge: P the joint covariance of one component, RIDGE: 1e-8 of the mean variance, so that U is regular.
+    U = P + ridge I, with P the joint covariance of the component. The ridge, RIDGE (1e-8) of the mean variance, makes U
+    regular.
     """
     mean = jnp.sum(arrived * jnp.diagonal(joint)) / jnp.sum(arrived)
     # What U adds to P; the rows of absent estimates are those of I.
@@ -227,9 +223,9 @@ def _weigh_component(
 def weigh_covariance_by_component(
     weights: Float[jax.Array, "degree n"], joint: Float[jax.Array, "degree n degree n"]
 ) -> Float[jax.Array, "n n"]:
-    """Return the covariance C P C' of diagonal weights, a sum over senders at a time.
+    """Return the covariance C P C' with diagonal weights C, computed as one sum over senders after another.
 
-    C: weights (degree, n) of the estimates by component, P = `joint`: Cov(e_i, e_j) of all of them.
+    `weights`: the diagonals of C (degree, n). `joint`: P = Cov(e_i, e_j) of all estimates.
     """
     sums = jnp.einsum("iajb,jb->iab", joint, weights)
     return symmetric(jnp.einsum("ia,iab->ab", weights, sums))
@@ -238,8 +234,8 @@ def weigh_covariance_by_component(
 def solve_regularised_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Return weights of one number for each estimate that is present, of least trace.
+    """Return one weight for each estimate that is present, so that the fused error has the least trace.
 
-    `joint`: Cov(e_i, e_j) of the estimates of a node and its neighbours, of whose fused error the trace is least.
+    `joint`: Cov(e_i, e_j) of the estimates of a node and its neighbours.
     """
     return _weigh_by_trace(partial(solve_regularised_weights, present=present), joint)

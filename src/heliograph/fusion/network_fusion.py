@@ -130,11 +130,11 @@ class Fusion(Module):
     def claim(self, claims: list[Claim]) -> Claim:
         """Return the claim of the fused covariance, from the claims of the filters.
 
-        `quantizer`: None without; else one for all nodes, or one for each, by name.
+        `self.quantizer`: None, or one quantizer for all nodes, or {node: quantizer}.
         """
         if self.quantizer is None:
             return self.rule.claim(claims)
-        # All are of one kind, and that alone decides the claim.
+        # All quantizers are of one kind, and only the kind decides the claim.
         any_quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
         quantizer = stack_over_time(any_quantizer)
         return self.rule.claim([quantizer.claim(claim) for claim in claims])

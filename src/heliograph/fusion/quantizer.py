@@ -72,10 +72,10 @@ class AbstractQuantizer(Module):
         return weakest([claim, "nominal"])
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Return a bound on |what arrives - x| by component that holds whatever the data, where anything arrives.
+        """Return a bound (n,) on |what arrives - x| that holds for all data, if anything arrives.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no such bound.
         """
         raise fail(
             f"reports through {type(self).__name__}", "a quantizer whose error is bounded before any data", "none"
@@ -92,13 +92,12 @@ Quantizer = TypeAliasType("Quantizer", AbstractQuantizer | OverTime)  # an OverT
 
 
 def widen_by_quantization(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
-    """Return a bound on the covariance of x - q, from that of x - xhat (or a bound) P; |q - xhat| <= D by component.
+    """Return a bound on the covariance of x - q, from the covariance P (or a bound) of x - xhat and |q - xhat| <= D.
 
-    With q - xhat = mu: mu mu' <= s diag(D), s = sum D (Cauchy), the smallest trace of all such diagonal bounds. So
-    E[(x - q)(x - q)'] <= (1 + t) P + (1 + 1/t) s diag(D) for every t > 0, with the smallest trace (r + s)^2 at
-    t = s / r, r = sqrt(tr P): then it is (1 + s / r) P + (r + s) diag(D). NaN where D is.
-
-    q: the quantized estimate, xhat: the estimate, D: bounds of the quantizer's error (n,).
+    q is the quantized estimate, xhat the estimate, and D (n,) bounds the quantizer's error. mu = q - xhat has mu mu' <=
+    s diag(D) with s = sum D (Cauchy), which is the diagonal bound of least trace. So E[(x - q)(x - q)'] <= (1 + t) P +
+    (1 + 1/t) s diag(D) for every t > 0. Its trace is least, (r + s)^2, at t = s / r with r = sqrt(tr P), where the
+    bound is (1 + s / r) P + (r + s) diag(D). It is NaN where D is.
     """
     s, r = jnp.sum(error), jnp.sqrt(jnp.trace(covariance))
     t = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
@@ -143,7 +142,7 @@ def check_positive(name: str, value: ArrayLike) -> Parameter:
 
 
 def check_amplitude(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
-    """Raise ValueError unless the amplitude and the error of a level are numbers, the latter to full precision."""
+    """Raise ValueError unless amplitude times scale is finite, and a level's error has full precision."""
     if is_traced(amplitude, scale):
         return
     with np.errstate(over="ignore", under="ignore"):
@@ -203,9 +202,9 @@ class UniformQuantizer(AbstractQuantizer):
 def _quantize_uniformly(
     x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
 ) -> Quantized:
-    """Return the midpoint of the segment that holds x / scale; d from d on, and -d below -d, without a bound beyond.
+    """Return the midpoint of the segment that holds x / scale, in the unit of x; beyond the amplitude d it is d or -d.
 
-    d is the amplitude; what is returned is in the unit of x.
+    A component beyond d is saturated, and its error has no bound (NaN).
     """
     scaled = x / scale
     middle_of_segment = midpoint(find_segment(scaled, amplitude, levels), amplitude, levels)

@@ -49,7 +49,7 @@ class EventSending(AbstractQuantizer):
     announced: bool = eqx.field(static=True, default=True)
 
     def __init__(self, threshold: Float[ArrayLike, "*n"], announced: bool = True):
-        """Keep the change beyond which a value is sent, and whether the receiver knows it, so that silence tells."""
+        """Store the change beyond which a value is sent, and whether the receiver knows the rule (`announced`)."""
         self.threshold = array("threshold", threshold, () if rank("threshold", threshold) == 0 else (None,))
         if np.any(self.threshold <= 0):
             raise fail("threshold", "positive numbers", threshold)
@@ -72,10 +72,11 @@ class EventSending(AbstractQuantizer):
 
     @in_float64
     def step(self, state: LastSent, value: ArrayLike) -> tuple[LastSent, Quantized]:
-        """Send or stay silent; return what the receiver has after this step, NaN where it takes silence for a loss.
+        """Return the next state, and what the receiver has after this step: a new value, the last one, or NaN.
 
-        A value is sent if a component differs from the last sent one by more than its threshold. `announced`: the
-        receiver knows that silence means no change. Symbols: 1 per component sent, else 0.
+        A value is sent if a component differs from the last sent one by more than its threshold. If `self.announced`,
+        the receiver knows that silence means no change and keeps the last value; otherwise silence is a loss (NaN). The
+        symbols are 1 for each component that is sent, else 0.
         """
         x = jnp.asarray(fill_masked(value), dtype=float)
         is_value = ~jnp.any(jnp.isnan(x))
@@ -155,16 +156,16 @@ ReportLinks = ReportLink | Mapping[str, ReportLink]  # one for all nodes, or by 
 
 
 def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], n: int) -> None:
-    """Raise ValueError unless the links of the nodes, and their quantizers or none, fit reports of n numbers."""
+    """Raise ValueError unless the nodes' links, and their quantizers if any, fit reports of n numbers."""
     for link in links:
         instance("report link", link, ReportLink, "a ReportLink").check(n)
     # There are no quantizers, or one for each link.
     for link, quantizer in zip(links, quantizers, strict=False):
         if isinstance(quantizer, OverTime):
             raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
-        # It raises where its error has no bound before any data.
+        # This raises if the error has no bound before any data.
         quantizer.error(n)
-        # A quantizer that holds sends nothing while its value stays, so that silence must be no loss.
+        # A quantizer that holds is silent while its value stays, so that silence must not mean a loss.
         if quantizer.holds and not link.delivers(n):
             raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
                        "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip

@@ -66,10 +66,7 @@ class AbstractFusion(Module):
 
     @property
     def between_neighbours(self) -> bool:
-        """True if it fuses what arrived from neighbours too.
-
-        So it is where its class has weights or gains of neighbours of its own.
-        """
+        """True if the rule can fuse estimates from neighbours: if its class defines weights or gains of neighbours."""
         own, base = type(self), AbstractFusion
         has_own_weights = own.neighbour_weights != base.neighbour_weights
         has_own_gains = own.neighbour_gains != base.neighbour_gains
@@ -148,7 +145,7 @@ class AbstractIntersection(AbstractFusion):
         raise unwritten(self, "weights_of")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Find the weights of the estimates by their covariances and intersect them."""
+        """Return the intersection of the estimates, with weights from their covariances."""
         information = invert_covariances(covariances)
         mean, covariance = intersect_covariances(means, information, self.weights_of(covariances, information))
         return restore_exact_components(mean, covariance, means, covariances)
@@ -272,10 +269,7 @@ class InverseCovarianceIntersection(AbstractFusion):
 
 
 def _combine_claims(claims: list[Claim], strongest: Claim) -> Claim:
-    """Return the weakest claim, for rules whose weights come from covariances.
-
-    `strongest`: the strongest claim of the rule itself.
-    """
+    """Return the weakest of the claims and of `strongest`, the rule's own, for rules with weights by covariances."""
     if "none" in claims:
         raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
     return weakest([*claims, strongest])

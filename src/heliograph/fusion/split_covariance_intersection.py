@@ -83,14 +83,13 @@ class SplitIntersection(AbstractIntersection):
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
         def improve_shares(_: int, shares: jax.Array) -> jax.Array:
-            """Return the best shares for the weights that are the best for these shares; none is below LEAST.
+            """Return the best shares for the weights that are best for the present ones, none below LEAST (1e-12).
 
-            Shares: of each estimate in the bound of the joint covariance, whose `unknown` parts are divided by them;
-            LEAST: 1e-12.
+            The bound of the joint covariance divides the `unknown` part of each estimate by its share.
             """
             weights = matrix_weights(bound_joint(shares))
             deviations = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
-            total = deviations.sum()  # 0 where nothing is unknown: then the shares do not matter
+            total = deviations.sum()  # 0 if nothing is unknown, when the shares do not matter
             new_shares = jnp.where(total > 0, deviations / jnp.where(total > 0, total, 1.0), shares)
             return jnp.maximum(new_shares, LEAST)
 
@@ -105,11 +104,10 @@ class SplitIntersection(AbstractIntersection):
 
 
 def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
-    """Return parts P^b_i = P_i - P^a_ii with the rounding of P_i, of which they are known; one that is 0 stays so.
+    """Return the parts P^b_i = P_i - P^a_ii with the rounding error of P_i added, except parts that are 0.
 
-    A share may be small: divided by it, an eps of P_i that is missing would be much of the bound.
-
-    P_i: covariance of estimate i; P^a: the part of known correlation; P^b: that of unknown correlation.
+    P_i is the covariance of estimate i, P^a its part of known and P^b that of unknown correlation. A part is later
+    divided by a share that may be small, so that a missing rounding error of P_i would matter.
     """
     n = unknown.shape[-1]
     rounding = rounding_of_variances(jnp.einsum("aii->ai", covariances), n)

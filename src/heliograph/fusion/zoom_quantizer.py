@@ -42,7 +42,7 @@ class ZoomQuantizer(AbstractQuantizer):
         decay: "Float[ArrayLike, '']",
         growth: "Float[ArrayLike, '']",
     ):
-        """Keep a uniform quantizer, and how its amplitude decays at each step and grows with the sent value."""
+        """Store a uniform quantizer, and how its amplitude decays at each step and grows with the sent value."""
         self.uniform = UniformQuantizer(levels, amplitude)
         self.decay, self.growth = scalar("decay", decay), scalar("growth", growth)
         if not is_traced(self.decay) and not 0 < self.decay < 1:
@@ -57,9 +57,9 @@ class ZoomQuantizer(AbstractQuantizer):
 
     @in_float64
     def step(self, state: Array, value: ArrayLike) -> tuple[jax.Array, Quantized]:
-        """Quantize with the present amplitude; the next one follows x.
+        """Return the next amplitude, and the value x quantized with the present amplitude.
 
-        The next amplitude is decay times the present one plus growth times x^2; it stays where x is missing.
+        The next amplitude is decay times the present one plus growth times x^2; it stays if x is missing.
         """
         x, amplitude = jnp.asarray(value, dtype=float), jnp.asarray(state, dtype=float)
         next_amplitude = jnp.where(jnp.isfinite(x), self.decay * amplitude + self.growth * x**2, amplitude)

@@ -66,9 +66,9 @@ def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndar
 
 
 def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
-    """Return the free numbers of the table by name at draws of their unbounded coordinates (draws, p), as a dataset.
+    """Return the free numbers of the table (for instance logarithms of variances) at posterior draws, as a dataset.
 
-    These are, for instance, logarithms of variances. All draws are one chain, axis 0.
+    `points`: draws of their unbounded coordinates (draws, p). All draws are one chain, axis 0.
     """
     values = np.stack([solution.parameters.entries_at(x) for x in points])  # (draws, entries)
     names = [entry.name for entry in solution.parameters.entries]
@@ -76,7 +76,10 @@ def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
 
 
 def _select_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
-    """Return log p (draws, rows) of the rows in which something arrived, with the recording and row of each."""
+    """Return log p (draws, rows) of the rows in which something arrived, with the recording and row of each.
+
+    `density`: log p of all rows of all recordings (draws, rows).
+    """
     data = solution.surface.data
     rows = [(i, k) for i, steps in enumerate(data.lengths) for k in range(steps)]
     arrived = np.array([bool(np.isfinite(data.measurements[i, k]).any()) for i, k in rows])
@@ -91,7 +94,7 @@ def _make_total_likelihood_dataset(density: np.ndarray) -> "xr.Dataset":
 
 
 def _make_dataset(content: dict[str, Any], further_coordinates: dict[str, Any] | None = None) -> "xr.Dataset":
-    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}, with one chain numbered 0."""
+    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}; the one chain has number 0."""
     import xarray as xr
 
     _axes, values = next(iter(content.values()))

@@ -64,7 +64,7 @@ class Row(NamedTuple):
 
     @property
     def interval(self) -> str:
-        """Interval in words, with two digits of its own width: "0.12 to 0.31", "below 0.3", "not identified"."""
+        """The interval in words, to two digits of its width: "0.12 to 0.31", "below 0.3" or "not identified"."""
         if not self.identified:
             return "not identified"
         low, high = (round_to_width(end, self.high - self.low) for end in (self.low, self.high))
@@ -79,9 +79,9 @@ class Row(NamedTuple):
 
 
 def round_to_width(value: float, width: float) -> str:
-    """Return a number to two digits of a width, at most eight of its own; to four of its own where there is no width.
+    """Return a number rounded to two digits of its interval's width, at least 2 and at most 8 digits of its own.
 
-    An end that is far smaller than the width keeps two digits of its own.
+    If there is no width, it is rounded to four of its own digits.
     """
     if not np.isfinite(value) or value == 0 or not np.isfinite(width) or width <= 0:
         return f"{value:.4g}"
@@ -105,7 +105,7 @@ class Solution:
     _tables: dict[tuple[Method, float], tuple[Row, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
-        """Return form, log-likelihood, whether this is a maximum, and the numbers; no data."""
+        """Return the form, the log-likelihood, whether the search converged, and the estimates, in one line."""
         numbers = dict(zip([entry.name for entry in self.parameters.entries],
                            self.parameters.entries_at(self.x).tolist(), strict=True))  # fmt: skip
         state = "converged" if self.converged else "not converged"
@@ -161,10 +161,10 @@ class Solution:
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
-        """Hessian of -l along the r identified directions (`basis`); the information where it is not positive."""
+        """Hessian of -l along the r identified directions (`basis`); the information if it is not positive definite."""
         hessian_of_active = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         hessian = self._project_on_identified(hessian_of_active)
-        least_eigenvalue = np.linalg.eigvalsh(hessian)[:1].sum()  # 0 where there is no direction
+        least_eigenvalue = np.linalg.eigvalsh(hessian)[:1].sum()  # 0 if there is no direction
         if least_eigenvalue > 0:
             return hessian
         information = self.surface.evaluations(self.top.x[None]).information[0]
@@ -181,7 +181,7 @@ class Solution:
 
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates (active,) are real numbers that few spans of the data tell, as a step is."""
+        """Which active coordinates (active,) are real numbers that only a few stretches of the data tell."""
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
@@ -189,14 +189,14 @@ class Solution:
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
-        """Return the covariance of the active coordinates, along the identified directions, and its degrees of freedom.
+        """Return the covariance of the active coordinates along the identified directions, and its degrees of freedom.
 
-        It is H^-1 J H^-1 with the Hessian H of -l and J the covariance of the sum of scores, estimated by `method`. Of
-        numbers that a few stretches of the data tell, J is what the model says.
+        It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores, estimated by `method`.
+        For numbers that only a few stretches of the data tell, J is taken from the model.
         """
         scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
         if self.few.any():
-            # The Hessian of all active coordinates from that along the directions, which are as many.
+            # Here all directions are identified, so that the Hessian can be brought back to the active coordinates.
             inverse = np.linalg.inv(self.basis)
             scores, by_model = remove_predicted_scores(scores, inverse.T @ self.hessian @ inverse, self.few)
         estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
@@ -206,7 +206,7 @@ class Solution:
         return np.asarray(self.basis @ sandwich @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
-        """Return the table of estimates by this form with intervals by a method, computed at the first call."""
+        """Return the table of estimates by this form, with intervals by a method; it is computed at the first call."""
         key = method, level
         if key not in self._tables:
             self._tables[key] = self._make_rows(method, level)
@@ -220,7 +220,7 @@ class Solution:
     def describe_with_cheap_errors(self) -> list[str]:
         """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
         active, values = self.active, self.parameters.entries_at(self.x)
-        # Variances g' I^-1 g, with the derivatives g of each number by the active coordinates, on the line.
+        # A number's variance is g' I^-1 g, with its derivative g on the line by the active coordinates.
         information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]
         inverse = np.linalg.pinv(information, hermitian=True)
         slopes = self.parameters.slopes(self.top.x)[:, active]
@@ -232,17 +232,17 @@ class Solution:
         ]
 
     def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
-        """Return in words an estimate `value` and its interval, symmetric on the line, by a standard error there.
+        """Return in words an estimate `value` and its interval, which is symmetric on the unbounded line.
 
-        `slope`: derivative of the number by the active coordinates, which tells whether it is identified.
+        `error`: its standard error on the line. `slope`: its derivative, which tells whether it is identified.
         """
         if entry.coordinate is not None and not self.active[entry.coordinate]:
             return f"{value:>10.4g}  (at the end of its domain)"
         if not self.identifies(slope):
             return f"{value:>10.4g}  (not identified)"
-        with np.errstate(divide="ignore"):  # of a value that rounding puts at the end of its domain
+        with np.errstate(divide="ignore"):  # rounding may put a value at the end of its domain
             center = float(to_line(entry.domain, value))
-            half = student_quantile(np.inf) * error  # of the normal law: infinitely many degrees of freedom
+            half = student_quantile(np.inf) * error  # infinitely many degrees of freedom: the normal law
             row = self._make_row(entry, value, error, (center - half, center + half))
         return f"{row.value:>10}  (about {row.interval})"
 
@@ -306,7 +306,7 @@ class Solution:
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, by its standard error and both ends of its interval on the line."""
+        """Return the row of an identified number, from its standard error and both ends of its interval on the line."""
         low, high = sorted(float(from_line(entry.domain, end)) for end in ends)
         slope = abs(float(slope_from_line(entry.domain, to_line(entry.domain, value))))
         return Row(
@@ -321,19 +321,18 @@ class Solution:
         )
 
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
-        """Return whether the data identify a function of the numbers, which it is if it does not change along ridges.
+        """Return whether the data identify a function of the numbers: whether it does not change along ridges.
 
-        `slopes`: its derivatives by the active coordinates (active,), of which a share ALONG may lie on a ridge.
+        `slopes`: its derivatives by the active coordinates, of which a share ALONG may lie on a ridge (`rank.flat`).
         """
         scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
         size = np.linalg.norm(scaled_slopes)
         return bool(size > 0 and np.linalg.norm(scaled_slopes @ self.rank.flat) <= ALONG * size)
 
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return both ends of an interval, relative to the estimate, by DRAWS sums of blocks of scores drawn anew.
+        """Return both ends of an interval, relative to the estimate, from DRAWS sums of blocks of scores drawn again.
 
-        `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
-        the sum.
+        `slopes`: the number's derivative by the active coordinates. A sum of scores moves the maximum by H^-1 times it.
         """
         sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=DRAWS, seed=0)
         moves = slopes @ self.basis @ np.linalg.solve(self.hessian, sums.T)
@@ -361,9 +360,9 @@ class Solution:
         )
 
     def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
-        """Return where the profile of a coordinate has fallen by `drop` nats, one end for each of `first`.
+        """Return where the profile likelihood of a coordinate has fallen by `drop` nats, by entry of `first`.
 
-        `first`: signed distances from the maximum at which the search for each end begins; END, REAL_END: its limits.
+        `first`: signed distances from the maximum at which the searches begin; END, REAL_END: their limits.
         """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
         return self.surface.find_profile_crossings(
@@ -386,14 +385,14 @@ def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
 
 
 def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
-    """Return the rank of the information of a recording's second half (p, p), with `ridges` flat directions.
+    """Return the rank of the information (p, p) in a recording's second half, with exactly `ridges` flat directions.
 
-    What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
+    What is known before the first step pins down a ridge weakly. That does not grow with the data, so it is not used.
     """
     rank = find_information_rank(late)
     if rank.flat.shape[1] == ridges:
         return rank
-    # The directions of the least eigenvalues, in units of each coordinate's standard error, are the flat ones.
+    # Take the directions of the least eigenvalues as flat, in units of each coordinate's standard error.
     diagonal = np.diag(late)
     unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
     _, vectors = np.linalg.eigh(late * unit[:, None] * unit)

@@ -41,9 +41,9 @@ def describe_boundaries(best: Solution) -> list[str]:
 
 
 def describe_form_conflict(solutions: tuple[Solution, ...]) -> list[str]:
-    """Return a sentence on each number on which the two forms of the likelihood disagree beyond their errors.
+    """Return a sentence for each number on which the two forms of the likelihood disagree beyond their errors.
 
-    APART: how many times the larger of the two standard errors their estimates have to differ by.
+    They disagree if the estimates differ by more than APART times the larger standard error.
     """
     if len(solutions) < 2:
         return []

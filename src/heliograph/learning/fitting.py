@@ -85,7 +85,7 @@ class Fit:
 
     @property
     def observations(self) -> int:
-        """Number of values that arrived, or of true states that are known where those are learned from."""
+        """Number of values that arrived, or of known true states if the fit learns from these."""
         data = self.best.surface.data
         counted = data.measurements if data.truth is None else data.truth
         return int(np.sum(~np.isnan(counted)))
@@ -111,12 +111,13 @@ class Fit:
         return compute_criteria(self.log_likelihood, self.free_numbers, self.observations).bic
 
     def likelihood_ratio(self, smaller: "Fit") -> FitTest:
-        """Test a model with some of the free numbers fixed, fitted to the same data: 2 (l - l_0) is chi-square.
+        """Test a smaller model with some of the free numbers fixed: 2 (l - l_0) is chi-square if it is true.
 
-        Where what is fixed is the end of a domain (a variance of 0) the p-value is too large, by two for one number.
+        l and l_0 are the log-likelihoods of this fit and the smaller one. If a number is fixed at the end of its domain
+        (a variance at 0), the p-value is too large, by a factor of two for one number.
 
         Args:
-            smaller: the fit of that model.
+            smaller: the fit of the smaller model.
 
         Raises:
             ValueError: a fit of other data or of another form, no fewer free numbers, a larger likelihood.
@@ -130,10 +131,10 @@ class Fit:
         return compare_likelihoods(self.log_likelihood, other.log_likelihood, self.free_numbers - other.free_numbers)
 
     def wald(self, values: Values) -> FitTest:
-        """Test that some numbers have given values, by the covariance of the estimates: d' C^-1 d is chi-square.
+        """Test that some numbers have given values: for the difference d of covariance C, d' C^-1 d is chi-square.
 
         Args:
-            values: by the names of the table.
+            values: the values by the names of the table.
 
         Raises:
             ValueError: no values, an unknown name, a number that is at a boundary or not identified.
@@ -150,18 +151,17 @@ class Fit:
         return tuple(row for solution in reversed(self.solutions) for row in solution.rows())
 
     def rows(self, method: Method = "cosines", form: Form | None = None, level: float = LEVEL) -> tuple[Row, ...]:
-        """Return the table of one form with intervals by another method.
+        """Return the table of estimates by one form of the likelihood, with intervals by one method.
 
         Args:
-            method: "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as they are
-                behind random gains; "white" does not; "hessian" believes the model besides; "profile" cuts the
-                likelihood (numbers that have a coordinate to themselves; the others as "hessian"); "bootstrap" draws
-                blocks of scores.
-            form: "linear" or "conditional"; the one that counts unless given.
+            method: "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as with
+                random gains; "white" does not. "hessian" also believes the model. "profile" cuts the likelihood for
+                numbers with a coordinate of their own, others are as by "hessian". "bootstrap" draws blocks of scores.
+            form: "linear" or "conditional"; by default the form of the best solution.
             level: probability with which an interval holds the number, 0.95 by default.
 
-        A number whose logarithm (or logit) is known to a factor of e or worse has its interval by "profile" with all
-        methods, down to the end of its domain where the likelihood there is hardly lower.
+        With every method, a number whose logarithm (or logit) is known to a factor of e or worse has its interval by
+        "profile", down to the end of its domain if the likelihood is hardly lower there.
 
         Raises:
             ValueError: an unknown method, a level that is not between 0.5 and 1, or a form that was not fitted.
@@ -179,7 +179,7 @@ class Fit:
     @property
     def covariance(self) -> Float[np.ndarray, "entries entries"]:
         """Covariance of the estimates in the order of `rows()`, by cosines; NaN if not identified, or at a boundary."""
-        # Cov(v) = J Cov(x) J', of the coordinates x that are no ends of domains, with J = dv/dx.
+        # Cov(v) = J Cov(x) J' with J = dv/dx, for numbers v and the coordinates x that are not at ends of domains.
         best = self.best
         of_coordinates, _ = best.covariance()
         jacobian = self.description.parameters.jacobian(best.x)[:, best.active]
@@ -210,7 +210,7 @@ class Fit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on starts, boundaries, forms that disagree, and what the data cannot identify."""
+        """Sentences on starts, boundaries, forms that disagree, and numbers that the data cannot identify."""
         return (
             *describe_unfinished_climbs(self.solutions, self.ends, self.stopped),
             *describe_boundaries(self.best),
@@ -222,7 +222,7 @@ class Fit:
         """Return the table of estimates: with intervals if `rows` computed them, else with cheap standard errors."""
         delay_lines = [f"{node}: {delays}" for node, delays in self.delays.items()]
         if not self.best.has_rows:
-            # Sentences that need no interval.
+            # Give only the sentences that need no intervals.
             sentences = describe_unfinished_climbs(self.solutions, self.ends, self.stopped)
             sentences = [*sentences, *self.identified.sentences]
             return "\n".join([*self.best.describe_with_cheap_errors(), *delay_lines, *sentences, CHEAP_ERRORS])
@@ -339,15 +339,14 @@ def _maximise_forms(
 
 
 def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
-    """Return recordings with tables of events turned into rows, and {node: law of its delays} of these tables."""
+    """Return the recordings with tables of events turned into rows, and the law of delays of each node in them."""
     recordings = recording if isinstance(recording, list) else [recording]
-    # Tables of events alone know how late each message came.
-    tables = [table for table in recordings if hasattr(table, "lateness")]
+    tables = [table for table in recordings if hasattr(table, "lateness")]  # only these know how late a message came
     if not tables:
         return recording, {}
-    # Of several tables the measurements of a node are counted together, in steps of the first that has any.
+    # A node's measurements in all tables are counted together, in steps of the first table that has the node.
     step_of_node = {name: law.step for table in reversed(tables) for name, law in table.delays().items()}
-    lateness_of_tables = [table.lateness() for table in tables]  # of each, seconds by node
+    lateness_of_tables = [table.lateness() for table in tables]  # for each table, seconds by node
     delays = {}
     for name, step in step_of_node.items():
         lateness = [lateness_by_node[name] for lateness_by_node in lateness_of_tables if name in lateness_by_node]
@@ -380,7 +379,7 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 
 
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
-    """Raise ValueError at a free number of which the data have no information at any of the points (points, p)."""
+    """Raise ValueError for a free number on which the data have no information at any of the points (points, p)."""
     largest = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
     without = [name for name, information in zip(names, largest, strict=True) if not information > 0]

@@ -39,9 +39,9 @@ class Parameter:
 
     @property
     def entry_names(self) -> tuple[str, ...]:
-        """Return the names of its entries in the table; of a covariance those on and below the diagonal.
+        """Return the names of the number's entries in the table; a covariance has those on and below the diagonal.
 
-        `start`: the value of the number from which a search begins, which has its shape.
+        `self.start`: the value, with the number's shape, from which a search begins.
         """
         if self.start.ndim == 0:
             return (self.name,)
@@ -60,10 +60,10 @@ class Parameter:
             return np.asarray(self._trace_entries(np.asarray(x)))
 
     def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line.
+        """Return the derivatives (entries, size) of the entries at a point x (size,) of the unbounded line.
 
-        Entries of an interval have a coordinate each, so that theirs is a diagonal matrix; of others JAX
-        differentiates.
+        Each entry of an interval has its own coordinate, so the derivatives are diagonal. JAX differentiates the
+        others.
         """
         if self.domain.kind == "interval":
             return np.diag(slope_from_line(self.domain, x))
@@ -76,9 +76,9 @@ class Parameter:
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
-        """Return the domain of each of its entries in the table.
+        """Return the domain of each of the number's entries in the table.
 
-        Entries of a simplex are probabilities; of a covariance those on the diagonal are positive, the others real.
+        Entries of a simplex are probabilities. Entries of a covariance are positive on the diagonal and real elsewhere.
         """
         if self.domain.kind == "simplex":
             return (PROBABILITY,) * self.start.size
@@ -113,17 +113,17 @@ class Parameters:
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """Return the coordinates (p,) on the unbounded line at which all free numbers start."""
+        """Return the coordinates (p,) on the unbounded line at which all free numbers (`self.every`) start."""
         return np.concatenate(
             [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
 
     @property
     def entries(self) -> tuple[TableEntry, ...]:
-        """Return the numbers of the table, in order."""
+        """Return the entries of the table in order, each with the place of its own coordinate, or None."""
         results, begin = [], 0
         for parameter in self.every:
-            has_own_coordinates = parameter.domain.kind == "interval"  # one for each entry
+            has_own_coordinates = parameter.domain.kind == "interval"  # one coordinate for each entry
             for i, (name, domain) in enumerate(zip(parameter.entry_names, parameter.entry_domains, strict=True)):
                 results.append(TableEntry(name, domain, begin + i if has_own_coordinates else None))
             begin += parameter.size
@@ -133,8 +133,8 @@ class Parameters:
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of all coordinates on the unbounded line.
 
-        A number of an interval has a coordinate for each entry, of the entry's name; those of a simplex or a
-        covariance are numbered, NAME(0), NAME(1), ...
+        A number of an interval has a coordinate with the name of each entry. A simplex or a covariance has numbered
+        ones, NAME(0), NAME(1), ...
         """
         return tuple(
             parameter.entry_names[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
@@ -170,10 +170,10 @@ class Parameters:
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives (entries, p) of the entries by the coordinates x (p,), each entry taken on the line.
+        """Return the derivatives (entries, p) of the entries, each taken on the line, by the coordinates x (p,).
 
-        On the line an entry is its logarithm or logit where its domain has ends. No warnings: at an end the
-        derivative may be infinite.
+        On the line an entry is its logarithm or logit if its domain has ends. There are no warnings, since a derivative
+        may be infinite at an end.
         """
         entries = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):

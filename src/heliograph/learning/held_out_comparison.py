@@ -140,9 +140,9 @@ def transform_held_out(
 
 
 def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
-    """Return P(z_k <= what came | rows before) of each measurement (rows, received), by the node's laws.
+    """Return P(z_k <= what came | earlier rows) of each measurement (rows, received), by laws of gain and noise.
 
-    Those of gain and noise. None where they have no nodes to sum over, vary over time, or remember.
+    The result is None if these laws of the node vary over time, remember, or have no nodes to sum over.
     """
     models = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in models) or first(node.channel).remembers:
@@ -154,10 +154,11 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
 
 
 def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> PredictedRows:
-    """Return a filter's predictions of the rows from `cut` on, by measurements z and inputs u of all rows.
+    """Return a filter's predictions of the rows from `cut` on, from measurements z and inputs u of all rows.
 
-    They are the log density of each row; its innovation over its predicted deviation, white noise if the filter is
-    right; and a test of these for correlation over at most LAGS rows, None where they are too few.
+    They are each row's log density, its innovation divided by the predicted deviation, which is white noise if the
+    filter is right, and a test of these for correlation over at most LAGS rows. The test is None if there are too few
+    rows.
     """
     log_density, whitened = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(whitened) // 10)
@@ -167,7 +168,7 @@ def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:
-    """Test whether two laws predict one recording equally well: z of the mean difference of log-likelihoods.
+    """Test whether two laws predict one recording equally well, by the mean difference of their log-likelihoods.
 
     Steps where nothing arrived do not count.
 
@@ -181,7 +182,7 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
     """
     for name, law in (("first law", a), ("second law", b)):
         instance(name, law, Predictive, "what `predictive` gives")
-    # NaN among the transforms `pit` says that nothing arrived: in one recording it is so at the same places.
+    # `pit` is NaN where nothing arrived, which must be at the same places if the recording is the same.
     if a.pit.shape != b.pit.shape or np.any(np.isnan(a.pit) != np.isnan(b.pit)):
         raise fail("second law", "the same recording as the first", "another")
     received = ~np.all(np.isnan(a.pit), axis=1)
@@ -191,7 +192,7 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
 
 
 def test_zero_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
-    """Return the test of whether the mean of differences (steps,), correlated over time, is zero."""
+    """Return a test of whether the mean of differences (steps,), which may be correlated over time, is zero."""
     mean, error = estimate_mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
     p_value = float(2 * scipy.stats.norm.sf(abs(z)))

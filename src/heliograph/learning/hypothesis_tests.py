@@ -42,19 +42,19 @@ def chi_square_test(statistic: float, freedom: int) -> FitTest:
 
 
 def compare_likelihoods(larger: float, smaller: float, freedom: int) -> FitTest:
-    """Return the likelihood-ratio test of a model of fewer free numbers: 2 (l - l_0).
+    """Return the likelihood-ratio test of a model with fewer free numbers, by 2 (l - l_0).
 
     Args:
-        larger: log-likelihood of the model with all numbers free.
-        smaller: that with some of them fixed.
-        freedom: number of those.
+        larger: l, the log-likelihood of the model with all numbers free.
+        smaller: l_0, the log-likelihood of the model with some of them fixed.
+        freedom: how many are fixed.
 
     Raises:
-        ValueError: no fewer numbers; a smaller model whose likelihood is larger.
+        ValueError: no number is fixed, or the smaller model has a larger likelihood.
     """
     if freedom < 1:
         raise fail("smaller model", "one of fewer free numbers", f"{-freedom} more" if freedom else "as many")
-    # ROUNDING: nats by which the search for the larger model may have ended too low.
+    # The search for the larger model may have ended too low by ROUNDING nats.
     if smaller > larger + ROUNDING:
         raise fail(
             "smaller model", f"a log-likelihood of at most {larger:.6g}, as part of the larger one", f"{smaller:.6g}"
@@ -65,12 +65,12 @@ def compare_likelihoods(larger: float, smaller: float, freedom: int) -> FitTest:
 def wald_test(
     estimates: Mapping[str, float], covariance: Float[np.ndarray, "entries entries"], values: Values
 ) -> FitTest:
-    """Return Wald's test that some numbers have given values: d' C^-1 d, of the distance d and its covariance C.
+    """Return Wald's test that some numbers have given values, by d' C^-1 d with their distance d and its covariance C.
 
     Args:
-        estimates: by name, in the order of the covariance.
-        covariance: of the estimates.
-        values: by name.
+        estimates: the estimates by name, in the order of the covariance.
+        covariance: the covariance of the estimates.
+        values: the given values by name.
 
     Raises:
         ValueError: no values, an unknown name, a number that is at a boundary or not identified.
@@ -96,7 +96,7 @@ class InformationCriteria(NamedTuple):
 
 
 def compute_criteria(log_likelihood: float, free: int, observations: int) -> InformationCriteria:
-    """Return AIC, AICc and BIC; AICc is infinite where numbers are as many as data.
+    """Return AIC, AICc and BIC; AICc is infinite unless there are more data than free numbers + 1.
 
     Args:
         log_likelihood: at the maximum, in nats.

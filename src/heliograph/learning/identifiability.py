@@ -117,10 +117,10 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
 
 def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
-    """Return what a recording identifies of the free numbers, by its information at three points around a start (p,).
+    """Return which free numbers a recording identifies, from its information at three points near a start (p,).
 
-    `late`: the information of the recording's second half, where what is known before the first step counts least.
-    Points at which it is not finite are left out; if it is finite at none, the start alone is judged.
+    `late` is the information of the recording's second half, in which what is known before the first step counts least.
+    Points where it is not finite are left out. If it is finite at none, only the start is judged.
     """
     points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
@@ -132,7 +132,10 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
 
 def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return POINTS points (p,) drawn near a start (p,), within AROUND, or less of coordinates that are small."""
+    """Return POINTS points (p,) drawn near a start (p,), at most AROUND away in each coordinate.
+
+    Small coordinates are moved less.
+    """
     rng = np.random.default_rng([seed, 1])
     reach = np.minimum(1.0, 0.2 + np.abs(start))
     return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
@@ -141,10 +144,10 @@ def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
 def _judge_identifiability(
     parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
 ) -> Identifiability:
-    """Return the identifiability by the ranks of the information at several points (p,), with its sentences.
+    """Return what is identified, from the ranks of the information at several points (p,), with sentences on it.
 
-    `flat`: directions in columns on which the data say nothing. `ridges`: how many there are where they are fewest;
-    `weakest`: the largest, over the points, of the smallest information in any other direction.
+    `rank.flat`: directions, in columns, on which the data say nothing. `ridges`: their number at the point with fewest.
+    `rank.weakest`: the smallest information in any other direction; the largest over the points counts.
     """
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
@@ -243,9 +246,9 @@ def _join_names(names: list[str]) -> str:
 
 
 def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
-    """Return measurements (steps, received) drawn as the filter at x (p,) expects them, with inputs u.
+    """Return measurements (steps, received) drawn by the model of the filter at x (p,), with inputs u.
 
-    Each row is Gaussian given those before it.
+    Each row is Gaussian given the earlier rows.
     """
     with jax.enable_x64(True):
         return np.asarray(_draw_measurements_by_innovations(objective, x, u, jax.random.key(seed)))
@@ -334,16 +337,16 @@ def _is_route_constant(sensor: AbstractSensor, channel: Channel) -> bool:
 def _compute_link_moments(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Array:
     """Return mean gain, gain variance and noise variance of each output behind a link, (outputs, 3).
 
-    Of each output the gain is that of the measured value of which it has most. The noise is that of sensor and channel
-    together: the diagonal of M R M' + spread of the constant part, with the mean gain M and the sensor's covariance R.
+    An output's gain is that of the measured value with the largest mean gain. The noise variance is the diagonal of M R
+    M' + E[dG R dG'] + Cov(offset), with M the mean gain, dG the gain's deviation and R the sensor's noise covariance.
     """
     moments, R = second_order(link), jnp.asarray(sensor.noise.covariance)
     M, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
-    # Covariances [i, j, a, b] of entries (i, a) and (j, b) of (gain, constant part), the constant part last.
+    # spread[i, j, a, b]: covariance of entries (i, a) and (j, b) of the matrix (gain, offset), with the offset last.
     spread = jnp.asarray(moments.nominal.center)
     second_of_noise_and_one = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(R).at[p, p].set(1.0)
+    # contract(C, S)[i, j] = sum_ab C[i, j, a, b] S[a, b], here E[dG R dG'] + Cov(offset).
     noise = jnp.diagonal(M @ R @ M.T + contract(spread, second_of_noise_and_one))
-    # Of each output the gain of the measured value that it has most of.
     strongest = jnp.argmax(jnp.abs(M), axis=1)
     rows = jnp.arange(len(M))
     return jnp.stack([M[rows, strongest], spread[rows, rows, strongest, strongest], noise], axis=1)

@@ -41,13 +41,12 @@ def count_cosines(steps: int) -> int:
 
 
 def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
-    """Return which of k numbers have their information in a few of the nu stretches of the data, (k,).
+    """Return which of k numbers have their information in only a few of the nu stretches of the data, (k,).
 
-    `information`: of each recording that of each row on each number (steps, k). With the information V_b of stretch b,
-    (sum_b V_b)^2 / sum_b V_b^2 is the number of stretches if all tell the same, and 1 if one tells all. The scores of
-    such numbers vary within a few stretches alone, in which cosines hardly change: they see next to nothing of it.
-
-    Stretches: spans of rows, as many as cosines are used. Few: that number is less than the share FEW of them all.
+    Stretches are spans of rows, as many as cosines are used. With V_b the information in stretch b,
+    (sum_b V_b)^2 / sum_b V_b^2 is nu if all stretches tell the same, and 1 if one tells all. Below FEW nu they are few.
+    Scores of such a number vary only within a few stretches, where cosines hardly change, so that cosines miss them.
+    `information`: for each recording, the information of each row on each number (steps, k).
     """
     by_recording = []
     for rows in information:
@@ -61,10 +60,10 @@ def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "step
 def remove_predicted_scores(
     scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
 ) -> tuple[Scores, Float[np.ndarray, "p p"]]:
-    """Return scores less what the scores of a few numbers K predict of them, and the covariance of that prediction.
+    """Return the scores minus what the scores of some numbers K predict of them, and the covariance of that prediction.
 
-    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with the scores s of each step, the Hessian H of minus the
-    log-likelihood and K the numbers of the mask `few`: where the model is true the two parts are uncorrelated, and the
+    These are s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with s the scores of each step, H the Hessian of minus the
+    log-likelihood and K the numbers marked in `few`. If the model is true, both parts are uncorrelated, and the
     covariances of their sums add up to H.
     """
     coefficients = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])  # (few, p)
@@ -72,9 +71,9 @@ def remove_predicted_scores(
 
 
 def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
-    """Return the long-run covariance (T/nu) sum_j G_j G_j' of scores, summed over series, with its degrees of freedom.
+    """Return the long-run covariance (T/nu) sum_j G_j G_j' of scores, summed over series, and its degrees of freedom.
 
-    G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)), of each series s of T steps.
+    For each series s of T steps, G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T) for j = 1..nu = floor(0.4 T^(2/3)).
 
     Source: Müller, HAC corrections for strongly autocorrelated time series (2014); Lazarus, Lewis, Stock and Watson,
     HAR inference (2018).
@@ -86,7 +85,7 @@ def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
         g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]  # SciPy's sum has the factor 2
         covariances.append(steps / count * g.T @ g)
         steps_and_cosines.append((steps, count))
-    # Each series has nu degrees of freedom; those of the sum by Satterthwaite's rule, with variances as the steps.
+    # Each series has nu degrees of freedom. The sum has (sum T)^2 / sum (T^2 / nu), by Satterthwaite's rule.
     total = sum(steps for steps, _ in steps_and_cosines)
     freedom = total**2 / sum(steps**2 / count for steps, count in steps_and_cosines)
     return LongRunCovariance(np.sum(covariances, axis=0), freedom)
@@ -95,7 +94,7 @@ def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
 def estimate_by_bartlett(scores: Scores) -> LongRunCovariance:
     """Return the long-run covariance of scores with Bartlett's weights, summed over series.
 
-    sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)), of each series s of T steps.
+    For each series s of T steps it is sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', with L = ceil(4 (T/100)^(2/9)).
 
     Source: Newey and West (1987).
     """
@@ -114,9 +113,10 @@ def estimate_if_white(scores: Scores) -> LongRunCovariance:
 
 
 def bootstrap_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
-    """Return sums of scores over blocks of 2 T^(1/3) steps drawn with replacement, less their mean, (draws, p).
+    """Return sums of scores over randomly drawn blocks of 2 T^(1/3) steps, minus their mean, (draws, p).
 
-    Of each series of T steps about T blocks' worth of steps is drawn, and the sums of all series are added.
+    From each series of T steps, blocks of about T steps in total are drawn with replacement. The sums of all series are
+    added.
 
     Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
     """
@@ -126,7 +126,7 @@ def bootstrap_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndar
         length = min(max(int(np.ceil(2 * len(s) ** (1 / 3))), 1), len(s))
         running = np.concatenate([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
         block_sums = running[length:] - running[:-length]  # of the block that begins at each step
-        # The series has `count` blocks, of which a whole number is drawn; the variance is scaled to all.
+        # T steps are `count` blocks. Draw a whole number of blocks, and scale the variance to `count`.
         count = len(s) / length
         whole = max(int(count), 1)
         drawn = block_sums[rng.integers(0, len(block_sums), (draws, whole))].sum(axis=1)
@@ -168,6 +168,6 @@ def find_profile_drop(level: float) -> float:
 def compute_sandwich_covariance(
     hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]
 ) -> Float[np.ndarray, "p p"]:
-    """Return the covariance H^-1 J H^-1 of estimates, H the Hessian of -l and J the covariance of summed scores."""
+    """Return the covariance H^-1 J H^-1 of estimates: H the Hessian of -l, J that of summed scores (`scores`)."""
     half = np.linalg.solve(hessian, scores)
     return np.asarray(np.linalg.solve(hessian, half.T))

@@ -51,11 +51,11 @@ DOMAINS: dict[Kind, Domain] = {
 def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) -> Any:
     """Mark a number of a network as one to be learned, from `start`; it stands wherever the number itself would.
 
-    `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the network and
-    that `hg.fit` calls. One name in several places is one number. Its place decides its domain: a variance and a scale
-    stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain, an
-    entry of a matrix, a number in a user's function may be any, unless `kind` says otherwise. Anywhere else than in a
-    fit it is its start.
+    An example is `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the
+    network and that `hg.fit` calls. One name in several places is one number. Its place decides its domain: a variance
+    or a scale stays positive, a probability stays between 0 and 1, probabilities sum to 1, a covariance matrix stays
+    one. A gain, an entry of a matrix or a number in a user's function may be any real number, unless `kind` says
+    otherwise. Outside of a fit the number is its start.
 
     Args:
         start: value from which the search begins, () or of any shape; of kind "simplex" it sums to 1 over the last
@@ -89,9 +89,9 @@ _reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbe
 
 @contextmanager
 def answer_free_marks_by(reader: _FreeNumberReader) -> Iterator[None]:
-    """Let `reader` answer all calls of `free` inside the block.
+    """Let `reader` answer all calls of `free` inside the `with` block.
 
-    `_reader`: the variable of this context in which calls of `free` find who answers them.
+    `_reader`: the context variable in which `free` finds who answers it.
     """
     token = _reader.set(reader)
     try:
@@ -104,20 +104,20 @@ class _MarkedNumber:
     """A free number while it is being collected: its start, name, and the domain that its places leave it."""
 
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
-        """Keep start, name (`given`, None without one) and the domain that a kind means.
+        """Store the start, the name (`given`, None without one) and the domain that the kind means.
 
-        `explicit`: the user gave the kind, so that its place does not narrow the domain. `place`: where the
-        number stands, to be reported.
+        `explicit`: True if the user gave the kind, so that the place does not narrow the domain. `place`: where the
+        number stands; `report` sets it.
         """
         self.start, self.given, self.place = start, name, ""
         self.domain = None if kind is None else DOMAINS[kind]
         self.explicit = kind is not None
 
     def report(self, name: str, domain: Domain) -> None:
-        """Note the number's place, and narrow its domain to what the check there requires.
+        """Note the number's place, and narrow its domain to what the check at this place requires.
 
-        A kind that the user gave stays. Of two intervals what both allow is kept; a check that requires nothing
-        (REAL) changes nothing; any other domain replaces the one known.
+        A kind that the user gave stays. Two intervals are intersected. A check that requires nothing (REAL) changes
+        nothing. Any other domain replaces the known one.
         """
         self.place = self.place or name
         if self.explicit:
@@ -138,10 +138,9 @@ class FreeNumberCollector:
         self.marks: list[_MarkedNumber] = []
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """Return the start, marked so that checks of its place report the domain.
+        """Return the start, marked so that checks at its place report the domain.
 
-        `marks`: the numbers met so far. A name that was met before is that number again, which has to have the same
-        start.
+        `self.marks`: the numbers met so far. A name met before is the same number again, and must have the same start.
         """
         for mark in self.marks:
             if name is not None and mark.given == name:
@@ -153,14 +152,14 @@ class FreeNumberCollector:
         return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
-        """Return all free numbers that were marked as parameters; one without a name is called after its place."""
+        """Return all marked free numbers as parameters; a number without a name is named after its place."""
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:
             name = mark.given or _make_name_distinct(mark.place or "free number", taken)
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
-            map_to_line(name, domain, mark.start)  # raises at a start outside of the domain
+            map_to_line(name, domain, mark.start)  # raises ValueError for a start outside the domain
             results.append(Parameter(name, mark.start, domain))
         return Parameters(tuple(results))
 
@@ -169,11 +168,11 @@ class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
-        """Hold values by the names of parameters, and the order of the names that the user did not give.
+        """Store values by the names of parameters, and the names that the user did not give, in their order.
 
         Args:
             parameters: all free numbers, in the order of their places.
-            named: of each whether the user gave it a name; the others are found by that order.
+            named: for each, whether the user gave it a name; the others are found by their order.
             values: the value of each parameter, by its name.
         """
         self.values = values
@@ -182,7 +181,8 @@ class ValueReader:
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the value of this name, or of the next number without a name.
 
-        `unnamed`: names that the numbers without one were given, in the order in which the function marks them.
+        `self.unnamed`: iterates over the names given to numbers without one, in the order in which the function marks
+        them.
         """
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
@@ -192,7 +192,7 @@ class ValueReader:
 
 
 def _make_name_distinct(name: str, taken: set[str]) -> str:
-    """Return a name that is not `taken`: the name itself, or with the first free number behind it."""
+    """Return the name itself if it is not `taken`, else the name followed by the first number that makes it new."""
     if name not in taken:
         return name
     return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)
@@ -217,7 +217,7 @@ class Description:
         """Return the network, built with these values of its free numbers, {name: value}.
 
         Raises:
-            ValueError: operations on a free number that derivatives cannot pass, a function that returns no network.
+            ValueError: operations on a free number that JAX cannot differentiate, a function that returns no network.
         """
         with answer_free_marks_by(ValueReader(self.parameters, self.named, values)), jax.enable_x64(True):
             try:
@@ -234,13 +234,13 @@ class Description:
 
     @cached_property
     def near_start(self) -> Network:
-        """Network at a point near the start that is no special case, as one where two free gains are equal or one is 0.
+        """Network at a point near the start that is no special case, as where two free gains are equal or one is 0.
 
-        Whether a gain is random at all is asked here, since it may be known at the start alone. The start itself where
-        no network can be built on either side of it.
+        It tells whether a gain is random at all, which may not be so at the start itself. If no network can be built on
+        either side of the start, it is the network at the start.
         """
         start = self.parameters.start
-        away = ASIDE * (1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0])  # another one for each number
+        away = ASIDE * (1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0])  # different for each number
         for direction in (1.0, -1.0):
             with suppress(ValueError):
                 return self.at_point(start + direction * away)

@@ -100,7 +100,11 @@ def samples_to_tell(
 
 
 def _find_only_node(network: Network) -> tuple[str, Node]:
-    """Return name and node of the network's only node, which receives a sensor through a channel; refuse all others."""
+    """Return the name and the node of a network with one node that receives a sensor through a channel, or raise.
+
+    Raises:
+        ValueError: any other network.
+    """
     instance("network", network, Network, "a Network").check_sends_each_step("samples to tell two laws")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
@@ -141,12 +145,12 @@ def _is_law(leaf: object) -> bool:
 def _predict_densities(
     network: Network, node: Node, channel: AbstractRandomAffine, z: np.ndarray, u: np.ndarray, nodes: int
 ) -> np.ndarray:
-    """Return log p of each measurement given those before it, (runs, steps), if it came through this channel.
+    """Return log p of each measurement given the earlier ones (runs, steps), if it came through this channel.
 
     Args:
-        network: gives the plant.
-        node: gives the sensor.
-        channel: with the law of gains that is judged.
+        network: the network, for its plant.
+        node: the node, for its sensor.
+        channel: the channel with the law of gains to be judged.
         z: measurements (runs, steps, received).
         u: inputs of the plant (steps, inputs).
         nodes: number of values that stand for the law.

@@ -83,7 +83,7 @@ class SenderFit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Remarks on the fit; none where the search converged."""
+        """Remarks on the fit; there are none if the search converged."""
         if self.stopped:
             return ("Stopped before the end: this is the best so far.",)
         return () if self.converged else ("The search did not converge: the estimates are the best points found.",)
@@ -141,10 +141,10 @@ def fit_sender(
     data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood of all recordings at a point of the line.
+        """Return the log-likelihood of all recordings at a point x (p,) of the unbounded line.
 
-        `data`: recordings side by side, of which the first `lengths` rows count. IMPOSSIBLE: a very low number
-        in place of -inf or NaN, since a search needs one.
+        `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE: a very low number that
+        replaces -inf and NaN, since the search needs numbers.
         """
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
@@ -184,9 +184,9 @@ def _search_from_starts(
     best: _BestPoint | None = None  # of all evaluations
 
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood at a point, and keep the best point so far.
+        """Return the log-likelihood at a point, and keep the best point so far in `best`.
 
-        `best` keeps it as not converged, to be returned if the search is stopped.
+        It is kept as not converged, to be returned if the search is stopped.
         """
         nonlocal best
         total = likelihood(x)
@@ -207,7 +207,7 @@ def _search_from_starts(
 
 
 def make_event_filter(network: Network) -> AbstractFilter:
-    """Return the event filter of the network's only node, whose likelihood is maximised."""
+    """Return the event filter of the network's only node; its likelihood is maximised in a fit."""
     (node,) = network.nodes.values()
     if not isinstance(node, Node) or node.trigger is None:
         raise fail("node to be learned", "one whose sender decides", type(node).__name__)
@@ -250,7 +250,7 @@ def _climb_simplex(
 
 
 def _make_row_without_interval(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
-    """Return the table's row of free number `index` at the maximum x (p,), without an interval and standard error."""
+    """Return the table's row for free number `index` at the maximum x (p,), without interval and standard error."""
     return Row(
         name=description.parameters.entries[index].name,
         estimate=float(description.parameters.entries_at(x)[index]),
@@ -266,8 +266,8 @@ def _make_row_without_interval(description: Description, x: Float[np.ndarray, " 
 def _add_interval(row: Row, description: Description, likelihood: Likelihood, top: "_BestPoint", index: int) -> Row:
     """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
-    The profile is the log-likelihood maximised over all other coordinates; the interval ends where it has fallen to a
-    level. NORMAL: 1.96 standard errors from the middle to either end of 95 %.
+    The profile is the log-likelihood maximised over all other coordinates. The interval ends where the profile has
+    fallen to a level. NORMAL: a 95 % interval reaches 1.96 standard errors to either side.
 
     Args:
         row: the row without an interval.
@@ -281,7 +281,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
     profile = _Profile(likelihood, coordinate, top.total - find_profile_drop(LEVEL))
     ends = []
     for side in (-1.0, 1.0):
-        # The entry of the table where its coordinate is at the end.
+        # An end of the interval is the value of the entry where its coordinate is at the end.
         point = top.x.copy()
         point[coordinate] += side * profile.find_distance_to_level(top.x, side)
         ends.append(float(description.parameters.entries_at(point)[index]))
@@ -336,13 +336,11 @@ class _Profile(NamedTuple):
         return outside
 
     def is_above_level(self, value: float, nearby: _ProfilePoint) -> tuple[bool, _ProfilePoint]:
-        """Return whether the profile at a value is above the level, and its point there, searched from one nearby.
+        """Return whether the profile at `value` is above the level, and its point there, searched from a nearby one.
 
-        The first simplex is as large as the two values are apart.
-
-        Profile: the log-likelihood with this coordinate held at the value and maximised over the others. The
-        search stops as soon as it is above `level`. NEAR, LARGEST_SIMPLEX: accuracy on the line, and the
-        largest first simplex.
+        The profile is the log-likelihood with this coordinate held at `value`, maximised over the others. The search
+        stops as soon as it is above `self.level`. Its first simplex is as large as the two values are apart, up to
+        LARGEST_SIMPLEX. NEAR: accuracy on the line.
         """
         size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
         best = _climb_simplex(

@@ -25,9 +25,9 @@ class TellsNumbers(Protocol):
 
 
 def find_told_filter(filter: AbstractFilter) -> TellsNumbers | None:
-    """Return the filter that reads told numbers: `filter`, or that within it, as within limits of states; else None.
+    """Return the filter that reads told numbers, which is `filter` or a filter inside it, or None.
 
-    What stands around it leaves the message as it is.
+    An outer filter, such as one with limits of states, leaves messages as they are.
     """
     while not isinstance(filter, TellsNumbers) and isinstance(within := getattr(filter, "base", None), AbstractFilter):
         filter = within

@@ -48,8 +48,8 @@ class InformationRank(NamedTuple):
 def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationRank:
     """Return the flat and the other directions of information I (p, p), in units 1 / sqrt(I_ii) of each coordinate.
 
-    A direction is flat where the eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING. A coordinate of which nothing
-    is known is one by itself.
+    A direction is flat if its eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING. A coordinate without information
+    is a flat direction by itself. `weakest`: the smallest eigenvalue of the other directions.
     """
     diagonal = np.diag(information)
     known = diagonal > 0
@@ -87,14 +87,17 @@ def find_confounded(
 
 
 def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return dv/dx and d log|v|/dx (p,) of each coordinate that is a number v of the table, at x (p,); 1 of others."""
+    """Return dv/dx and d log|v|/dx (p,) at x (p,), for each coordinate that belongs to one number v of the table.
+
+    For other coordinates both are 1.
+    """
     slopes, log_slopes = np.ones(len(x)), np.ones(len(x))
     for entry, dv_dx, v in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         i = entry.coordinate
         if i is not None:
             slopes[i] = dv_dx[i]
             log_slopes[i] = dv_dx[i] / v if v else np.nan
-    # A number that is 0 has no logarithm: its derivative is put as 0.
+    # A number that is 0 has no logarithm, so its derivative is set to 0.
     return slopes, np.nan_to_num(log_slopes)
 
 
@@ -105,13 +108,11 @@ def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
 
 
 def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
-    """Return the groups of coordinates that a flat direction at any point connects.
+    """Return the groups of coordinates that flat directions connect, at any point.
 
-    `bases`: orthonormal flat directions at each point, in columns.
-
-    A group of one coordinate is one that no data tell.
+    `bases`: orthonormal flat directions at each point, in columns. A group of one is a coordinate that no data tell.
     """
-    # An entry of the projector B B' is not 0 where some flat direction moves both coordinates.
+    # An entry of the projector B B' is nonzero if some flat direction moves both coordinates.
     are_connected = np.max([np.abs(B @ B.T) for B in bases], axis=0) > SAME
     count, labels = connected_components(are_connected, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
@@ -143,11 +144,10 @@ def _make_confounded_numbers(
 
 
 def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
-    """Return the combinations, in rows, that no flat direction of any point changes, in reduced row echelon form.
+    """Return the combinations, in rows of reduced row echelon form, that no flat direction of any point changes.
 
-    `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these.
-
-    SAME: singular value that is rounding.
+    `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these. A singular
+    value up to SAME counts as 0.
     """
     _, singular_values, right_vectors = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(singular_values > SAME))
@@ -192,7 +192,7 @@ def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) ->
 def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
     """Return the text of a weighted sum, such as "a + 0.64 b".
 
-    Weights within SAME of 1 are not written, nor are those of 0.
+    A weight within SAME of 1 or -1 is not written, and a term of weight 0 is left out.
     """
     text = ""
     for name, weight in zip(names, weights, strict=True):

@@ -45,7 +45,7 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
 
 
 def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
-    """Return z = G (y - r) + n + E[G] r: the reference r is taken off before the channel, its mean put back after."""
+    """Return z = G (y - r) + n + E[G] r: the reference r is subtracted before the channel, E[G] r added after it."""
     (channel,) = check_maps("channel less a reference", [channel])
     if channel.past or channel.erases:
         what = "late" if channel.past else "one that erases"
@@ -62,10 +62,10 @@ def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | Ov
 def predict_signal(
     plant: AbstractPlant, sensor: AbstractSensor, x: Float[Array, " n"], u: ArrayLike
 ) -> Float[jax.Array, " m"]:
-    """Return h(f(x, u) + E w) + E v, the prediction of the signal y from the state x a step before.
+    """Return h(f(x, u) + E w) + E v, the prediction of the signal y from the state x one step before.
 
-    f: the plant's transition, w its noise; h: the sensor's function, v its noise. Both ends of a link compute it, so
-    that only what differs from it has to be sent.
+    f is the plant's transition and w its noise; h is the sensor's function and v its noise. Both ends of a link compute
+    the prediction, so that only the difference from it must be sent.
     """
     predicted = plant.transition(jnp.asarray(x), jnp.asarray(u)) + plant.noise_mean()
     return jnp.asarray(sensor.measure(predicted) + sensor.noise.mean)
@@ -74,9 +74,9 @@ def predict_signal(
 def expected_signal(
     plant: AnyPlant, sensor: AnySensor, horizon: int, inputs: "Float[ArrayLike, 'horizon inputs'] | None" = None
 ) -> Float[np.ndarray, "horizon outputs"]:
-    """Return E[y_k] at each step of a linear plant and sensor; h along the noise-free path of a nonlinear one.
+    """Return E[y_k] at each step for a linear plant and sensor, or h along the noise-free path for nonlinear ones.
 
-    Of all references that do not depend on data, E[y_k] leaves the least to send: E (y - r)^2 = Var y + (E y - r)^2.
+    Of all references r that do not depend on data, E[y_k] leaves the least to send: E (y - r)^2 = Var y + (E y - r)^2.
 
     Args:
         plant: the plant.
@@ -88,7 +88,7 @@ def expected_signal(
         E[y_k], (horizon, outputs).
 
     Raises:
-        ValueError: a horizon beyond what varies over time, a sensor that does not fit, inputs of another shape.
+        ValueError: more steps than a varying plant or sensor has, a sensor that does not fit, inputs of another shape.
     """
     check_horizon(horizon, steps_covered((plant, sensor)))
     plant_0 = read_first_plant(plant)
@@ -102,7 +102,7 @@ def expected_signal(
 
 @compile_on_call
 def _predict_outputs(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inputs"]) -> jax.Array:
-    """Return E[y_k] over the steps of a plant that moves by its mean alone, with these inputs."""
+    """Return E[y_k] at each step, with the plant moved by its mean alone under these inputs."""
 
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Move the state's mean x over step k with inputs u; return it with the mean of the measurement there."""

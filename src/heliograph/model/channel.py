@@ -166,7 +166,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> DelayedLink:
-    """Return a link that receives at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k.
+    """Return a link that delivers at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k.
 
     Before the first step zeros were sent.
 
@@ -177,7 +177,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
         timestamped: True if the receiver knows d, as the last number of z; False unless given.
 
     Raises:
-        ValueError: a delay that is no whole number of steps from 0, a link that is late already.
+        ValueError: a delay that is no whole number of steps or is negative, a link that is already late.
     """
     checked = check_maps("delayed link", [link])
     return build_with_told_numbers(lambda links: DelayedLink(links[0], delay, timestamped), checked)
@@ -186,10 +186,10 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
     """Return a channel whose packet is lost with probability 1 - arrival; the receiver reads z = 0 and does not know.
 
-    Where the receiver knows of the loss, it is an `erasure`.
+    If the receiver knows of the loss, use `erasure` instead.
 
     Args:
-        channel: that of the packets which arrive.
+        channel: the channel of packets that arrive.
         arrival: probability that a packet arrives, from 0 to 1.
         radius: how far that probability may be off (default 0: it is known).
 
@@ -223,17 +223,17 @@ def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
 
 
 def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:
-    """Return the relayed signal and the direct one, both received: z = (z_relay, z_direct), independent given y.
+    """Return a channel that delivers z = (z_relay, z_direct): y through a relay and y directly, independent given y.
 
     Args:
         relayed: channel through the relay.
-        direct: channel of the same y past it.
+        direct: channel of the same y that bypasses the relay.
 
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    # A memory without a name, such as fading, that stands in both becomes one of each. Numbers that a channel tells its
-    # receiver follow its own outputs.
+    # A memory without a name (such as fading) that stands in both channels becomes two. Numbers that a channel tells
+    # its receiver follow its own outputs.
     channels = separate_memories(check_maps("stack", [relayed, direct]))
     return stack_channels_with_told_numbers(_delay_all_like_latest, channels)
 
@@ -245,22 +245,22 @@ def _delay_all_like_latest(links: Sequence[AbstractRandomAffine]) -> list[Abstra
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
-    """Return channels side by side, each of which carries its own part of y: the first its first components, and so on.
+    """Return channels side by side: the first carries the first components of y, the second the next, and so on.
 
     Args:
-        channels: one for each part of y, in its order.
+        channels: one for each part of y, in order.
 
     Raises:
         ValueError: no channels.
     """
-    # A memory without a name that stands in several channels becomes one of each.
+    # A memory without a name that stands in several channels becomes a separate one in each.
     separate = separate_memories(check_maps("parallel channels", channels))
     return stack_channels_with_told_numbers(_select_part_for_each_link, separate)
 
 
 def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
-    """Return the links as ones that are all given the whole signal, of which each takes its own part, in turn."""
-    # past: by how many steps the latest may be late; all are given as many earlier signals.
+    """Return links that take the whole signal, each of which selects its own part of it, one part after another."""
+    # past: the most steps by which a link may be late. All links are given so many earlier signals.
     size, past = sum(signal_size(link) for link in links), max(link.past for link in links)
     links_of_whole_signal = []
     start = 0  # the first component of the link's part of the signal
@@ -271,11 +271,11 @@ def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[Ab
 
 
 def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool = False) -> Superposed:
-    """Return the links that transmit at once, of which the receiver gets the sum z = sum_i (G_i y_i + n_i) + n.
+    """Return links that transmit at once, so that the receiver gets the sum z = sum_i (G_i y_i + n_i) + n.
 
-    Link i carries its own part of y, as in `parallel` (`joint_sensor` makes one sensor of several); `same=True`: all
-    carry all of y, as relays of one signal do. Links are independent: what is common to them, as one first hop that
-    several relays hear, comes before the sum, Series([first, superposed(relays, noise, same=True)]).
+    Link i carries its own part of y, as in `parallel` (`joint_sensor` makes one sensor of several). With `same=True`
+    all links carry all of y, as relays of one signal do. Links are independent. What they have in common, such as a
+    first hop that several relays hear, comes before the sum: Series([first, superposed(relays, noise, same=True)]).
 
     Args:
         links: one for each transmitter, with as many outputs each as the receiver gets.
@@ -283,7 +283,7 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
         same: True if every link carries all of y; False unless given.
 
     Raises:
-        ValueError: links of other sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
+        ValueError: links of unequal sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
             flags or time stamps, which would be added up.
     """
     separate = separate_memories(check_maps("links of a sum", links))  # one object given twice is two links
@@ -310,9 +310,9 @@ def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same:
 
 
 def _check_can_be_added(name: str, link: AbstractRandomAffine) -> None:
-    """Raise ValueError where a link delivers what cannot be added up: flags, time stamps, or NaN for what it lost.
+    """Raise ValueError if a link delivers what cannot be added up: flags, time stamps, or NaN for a loss.
 
-    `name`: what the link is called in the error.
+    `name`: the name of the link in the error.
     """
     maps = [link, *all_inner_maps(link)]
     if any(isinstance(m, ModeOutput) or (isinstance(m, DelayedLink) and m.timestamped) for m in maps):
@@ -326,7 +326,7 @@ def mean_gain(channel: Channel) -> Channel:
     """Return the channel that most people would design for: every gain taken as its mean, with the noise as it is.
 
     Args:
-        channel: of random gains; it may vary over time.
+        channel: a channel of random gains; it may vary over time.
 
     Raises:
         ValueError: a gain law that does not know its mean, a channel that remembers.
@@ -370,7 +370,7 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 
 
 def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
-    """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
+    """Return the indices of received components that are angles; raise ValueError unless the models fit each other."""
     plant_0 = first(plant)
     sensor_0 = first(sensor).typical(plant_0.inputs)
     for model in list_mode_models(sensor_0):
@@ -378,7 +378,7 @@ def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
             "sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(sensor_0.angles)
         )
     steps = unstack(channel) if sensor_0.circular else [first(channel)]
-    # For each step, which of the received components are angles; gains other than 1 raise, for they bend an angle.
+    # At each step, which received components are angles. A gain other than 1 raises, since it does not keep an angle.
     received_angles: set[Angles] = {step.carry_angles(sensor_0.angles) for step in steps}
     if len(received_angles) > 1:
         raise fail("channel", "the same angles at every step", sorted(received_angles))

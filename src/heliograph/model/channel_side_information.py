@@ -116,9 +116,9 @@ def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
 
 
 def _average_law(law: object, memory: AbstractMemory) -> ArrayLike:
-    """Return typical numbers of their law: its mean, or zeros, the first mode, where a memory's modes are told.
+    """Return typical values of the numbers that a link tells: the mean of their law, or zeros for modes of a memory.
 
-    No law (None) raises ValueError, for then the user has to give them.
+    Zeros mean the first mode. Without a law (None) it raises ValueError, since the user must then give the numbers.
     """
     if law is None:
         raise fail("typical numbers", "numbers as they may come, where there is no law", "none")
@@ -131,9 +131,9 @@ KnownGain = TypeAliasType("KnownGain", bool | Pilot)  # of a hop: told, by a pil
 
 
 def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
-    """Return the hop that delivers its gain, or a pilot's reading of it, after z; the hop itself for `known` False.
+    """Return a hop that delivers its gain, or a pilot's reading of it, after z; for `known` False the hop itself.
 
-    `known`: True for the gain itself, or the Pilot, whose reading is the gain plus noise.
+    `known`: True for the gain itself, or a Pilot, whose reading is the gain plus noise.
     """
     if known is False:
         return hop
@@ -194,10 +194,10 @@ def separate_told_numbers(channel: AbstractRandomAffine) -> SeparatedToldNumbers
 def build_with_told_numbers(
     build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]
 ) -> M:
-    """Return what `build` makes of channels, and behind its outputs all numbers that the channels tell the receiver.
+    """Return what `build` makes of the channels, with all numbers that the channels tell after its outputs.
 
-    A channel may tell numbers about itself beside each message, such as its present gain. These do not go through what
-    is built: `build` gets the links without them, and they are delivered as they are.
+    A channel may tell its receiver numbers about itself, such as its present gain. These do not go through what is
+    built: `build` gets the links without them, and they are delivered unchanged.
     """
     links = [separate_told_numbers(channel).link for channel in channels]
     built = build(links)
@@ -209,19 +209,18 @@ def build_with_told_numbers(
 def stack_channels_with_told_numbers(
     place: Callable[[list[AbstractRandomAffine]], list[AbstractRandomAffine]], channels: Sequence[AbstractRandomAffine]
 ) -> Stack:
-    """Return channels side by side, each one's told numbers after its own outputs, as its receiver gets them.
+    """Return channels side by side, each with the numbers that it tells after its own outputs.
 
     Told numbers come with a message and say what the link did to it, such as its gain.
 
     Args:
-        place: takes each channel's link, of its own signal, and returns as many links of all signals, one above the
-            other.
+        place: takes the channels' links, each of its own signal, and returns as many links of the joined signal.
         channels: the channels.
     """
     links, maps = [separate_told_numbers(channel).link for channel in channels], list[AbstractRandomAffine]()
     for link, channel, placed_link in zip(links, channels, place(links), strict=True):
         maps.append(placed_link)
-        # A channel that tells its receiver nothing is its own link; of any other the told numbers follow its outputs.
+        # A channel that tells nothing is its own link. For any other channel, append what it tells.
         if link is not channel:
             maps += _list_told_outputs(placed_link, placed_link.inputs)
     return Stack(maps)

@@ -38,12 +38,12 @@ class DiffuseStart(Module):
         return DiffuseStart(tuple(name_list("states with an unknown start", states)), known)
 
     def of_states(self, states: tuple[str, ...]) -> "UnknownStart":
-        """Return the start of a plant with these states: which are unknown, and the covariance of the others.
+        """Return the start of a plant with these states: which states are unknown, and the covariance of the others.
 
-        `self.names`: of the unknown ones, None for all. Rows and columns of unknown states are set to 0.
+        `self.names`: names of the unknown states, None for all. Rows and columns of unknown states are set to 0.
 
         Raises:
-            ValueError: a name that is no state, a covariance that is none.
+            ValueError: a name that is no state, a matrix that is no covariance.
         """
         unknown_states = states if self.names is None else self.names
         for name in unknown_states:

@@ -107,10 +107,10 @@ def check_claim(claim: object) -> None:
 
 
 def weakest(claims: list[Claim]) -> Claim:
-    """Return the weakest of some claims, in the order "exact", "upper", "nominal", "none": what all of them support.
+    """Return the weakest of some claims, in the order "exact", "upper", "nominal", "none".
 
-    A claim says what an estimate's covariance is: that of its error, an upper bound of it, what the filter believes, or
-    nothing.
+    A claim says what an estimate's covariance is: exactly that of the error, an upper bound of it, only what the filter
+    believes, or nothing.
 
     Args:
         claims: at least one.
@@ -128,8 +128,8 @@ def weakest(claims: list[Claim]) -> Claim:
 def lower_claim_by_noise(claim: Claim, *models: PyTree) -> Claim:
     """Return a claim, lowered to what the noises of these models support.
 
-    "upper" where a noise is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps
-    so large that the rounding error depends on the signal.
+    It is "upper" at most if a noise is only known by a bound of its covariance. It is "nominal" at most if a
+    measurement is rounded so coarsely that the rounding error depends on the signal.
     """
     rounded = find_rounded_noises(*models)
     if not all(noise.is_exact or noise.is_bounded for noise in rounded):
@@ -139,7 +139,7 @@ def lower_claim_by_noise(claim: Claim, *models: PyTree) -> Claim:
 
 
 def mask_sound_estimates(estimate: Estimate) -> np.ndarray:
-    """Return which of some estimates have a finite mean and, where one is claimed, a covariance (to rounding)."""
+    """Return which estimates have a finite mean and, if they claim one, a valid covariance (to rounding)."""
     has_finite_mean = ~find_not_finite(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
         return has_finite_mean
@@ -147,8 +147,8 @@ def mask_sound_estimates(estimate: Estimate) -> np.ndarray:
 
 
 def _mask_covariances_over_time(matrices: np.ndarray) -> np.ndarray:
-    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, equal ones judged once."""
-    # In a long recording of a filter that has settled most matrices (time, n, n) are equal to the one before.
+    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, judging equal ones once."""
+    # When a filter has settled, most matrices (time, n, n) of a long recording equal the previous one.
     if matrices.ndim == 3 and len(matrices) > 2 and np.array_equal(matrices[-1], matrices[len(matrices) // 2]):
         rows = matrices.reshape(len(matrices), -1)
         is_new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
@@ -160,7 +160,7 @@ def _mask_covariances_over_time(matrices: np.ndarray) -> np.ndarray:
 def _mask_covariances(matrices: np.ndarray) -> np.ndarray:
     """Return which matrices (..., n, n) are finite and positive semidefinite to rounding."""
     is_finite = ~find_not_finite(matrices, 2)
-    # The quick test of all at once first; else matrix by matrix, as correlations, whatever the states' units.
+    # Try a quick test of all at once. If it fails, test each matrix as correlations, so that units do not matter.
     if is_finite.all() and _are_definite((matrices + np.swapaxes(matrices, -1, -2)) / 2):
         return np.asarray(is_finite)
     finite = np.where(is_finite[..., None, None], matrices, np.eye(matrices.shape[-1]))
@@ -174,7 +174,7 @@ def _mask_covariances(matrices: np.ndarray) -> np.ndarray:
 def _are_definite(covariances: np.ndarray) -> bool:
     """Return whether all matrices P are semidefinite to rounding: whether P + tol diag(P) has a Cholesky factor.
 
-    Then their correlations have no eigenvalue below -tol (DEFINITENESS_TOLERANCE). The matrices are changed in place.
+    If so, their correlations have no eigenvalue below -tol (DEFINITENESS_TOLERANCE). The matrices are changed in place.
     """
     diagonal = np.arange(covariances.shape[-1])
     covariances[..., diagonal, diagonal] *= 1 + DEFINITENESS_TOLERANCE
@@ -186,10 +186,10 @@ def _are_definite(covariances: np.ndarray) -> bool:
 
 
 def _is_semidefinite(correlations: np.ndarray) -> np.ndarray:
-    """Return the mask of the matrices (..., n, n) whose eigenvalues are not below zero, to rounding.
+    """Return which matrices (..., n, n) have no eigenvalue below zero, to rounding.
 
-    Where C + tol I has a Cholesky factor for all, which takes a sixth of the time, none has an eigenvalue below -tol
-    (DEFINITENESS_TOLERANCE); where it has none, eigenvalues tell which.
+    If C + tol I has a Cholesky factor for all of them, none has an eigenvalue below -tol (DEFINITENESS_TOLERANCE). This
+    test takes a sixth of the time. If it fails, the eigenvalues tell which matrices are semidefinite.
     """
     try:
         np.linalg.cholesky(correlations + DEFINITENESS_TOLERANCE * np.eye(correlations.shape[-1]))
@@ -202,10 +202,10 @@ AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
 
 
 def lower_unsound_claim(estimate: AnyEstimate) -> AnyEstimate:
-    """Return one estimate, with the claim "none" where its mean is no number or its covariance is none.
+    """Return one estimate, with the claim "none" if its mean is not finite or its covariance is not valid.
 
-    Several estimates side by side (a mean of more than one axis) are returned as they are: their property `claims` says
-    of which theirs holds.
+    Several estimates side by side (a mean of more than one axis) are returned unchanged; their property `claims` says
+    which claims hold.
     """
     if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or mask_sound_estimates(estimate).all():
         return estimate

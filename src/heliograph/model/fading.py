@@ -40,8 +40,8 @@ def gilbert_elliott(
 ) -> Modes:
     """Return a link that is `good` or `bad` for a while: it fails with a probability at each step, and then recovers.
 
-    `good` and `bad` are any channels, with losses too: `erasure(link, arrival)` in each makes losses in bursts. It
-    starts in its stationary law. Links of one `name` are good and bad together.
+    `good` and `bad` are any channels, also with losses: `erasure(link, arrival)` in each makes losses in bursts. The
+    link starts in its stationary law. Links of one `name` are good and bad together.
 
     Args:
         good: channel at the steps at which the link is good.
@@ -107,9 +107,9 @@ def autoregressive_fading(
     each with its own mean and deviation.
 
     Args:
-        mean: of the gain.
+        mean: mean of the gain.
         deviation: standard deviation of the gain, not negative.
-        correlation: of the gain from one step to the next, from -1 to 1.
+        correlation: correlation of the gain from one step to the next, from -1 to 1.
         noise: law, covariance (m, m) or variance of n, in the unit of z squared.
         dimension: number of components where `noise` is a variance (default 1).
         name: links of one name drift together (default: none is shared).
@@ -165,13 +165,13 @@ def with_flag(
 def shared(link: Channel, name: str) -> Channel:
     """Return the link as one of those that share its fading: all links of one name are in one state at each step.
 
-    A link is independent of all others, also where one object stands at several nodes or hops, unless it has a name,
-    from here or as `name` of `gilbert_elliott`, `markov_fading` and the others. What the nodes of a network share
-    stands in `Network.shared` and in reports.
+    Without a name a link is independent of all others, even if one object stands at several nodes or hops. The name
+    comes from here, or from `name` of `gilbert_elliott`, `markov_fading` and so on. `Network.shared` and reports list
+    what the nodes of a network share.
 
     Args:
-        link: a link with memory, or a channel that is made of some.
-        name: name of what is shared; that of a channel with several memories is followed by their numbers.
+        link: a link with memory, or a channel that contains some.
+        name: name of what is shared; for a channel with several memories, it is followed by their numbers.
 
     Raises:
         ValueError: a channel without memory (nodes share its independent draws by `Network.sharing`), no name.
@@ -184,19 +184,19 @@ def shared(link: Channel, name: str) -> Channel:
         raise fail("shared link", "one with memory, such as gilbert_elliott(...)", got)
     named_copies = {}
     for i, (key, memory) in enumerate(memories_of_link.items()):
-        # Of several memories each has a number behind the name.
+        # Each of several memories gets a number after the name.
         named_copies[key] = memory.named(name if len(memories_of_link) == 1 else f"{name} {i}")
     return replace_memories(link, named_copies)
 
 
 def without_memory(channel: Channel) -> Channel:
-    """Return the channel whose modes are drawn anew at each step: what a filter believes that assumes no memory.
+    """Return the channel with its modes drawn anew at each step, as a filter believes that assumes no memory.
 
-    Each step's draws have the law that they have in the channel (of one that does not vary: in the long run); no two
-    steps depend on each other. A channel that forgets is itself.
+    Draws at different steps are independent. At each step they have the law that they have in the channel (in the long
+    run if the channel is constant). A channel without memory is returned as it is.
 
     Args:
-        channel: of any memory by modes; it may vary over time.
+        channel: a channel with any memory by modes; it may vary over time.
 
     Raises:
         ValueError: a channel that remembers in a way of its own.
@@ -213,10 +213,10 @@ def without_memory(channel: Channel) -> Channel:
 def memory_matters(channel: Channel) -> bool:
     """Return whether mean gains are correlated over time, so that a linear filter without memory claims too much.
 
-    Memory in the variance of noise alone does not matter to it. An uncertain chain always may.
+    Memory in only the variance of noise does not matter to such a filter. An uncertain chain always may matter.
 
     Args:
-        channel: of a node; it may vary over time.
+        channel: the channel of a node; it may vary over time.
 
     Raises:
         ValueError: a channel with a memory of another kind.
@@ -225,7 +225,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    # The channel as a sum of terms with memories of their own, each as the list of its maps over all steps.
+    # Split the channel into a sum of terms without common memory; a term is the list of its maps over all steps.
     terms = zip(*(split_terms_without_common_memory(step) for step in unstack(channel)), strict=True)
     is_constant = not isinstance(channel, OverTime)
     for maps_of_term in terms:

@@ -72,7 +72,7 @@ def last_input(u: np.ndarray) -> np.ndarray:
 
 
 def find_median_spacing(time: np.ndarray) -> float:
-    """Return the median time between rows, of dates in seconds; NaN of fewer than two."""
+    """Return the median time between rows, in seconds for dates, or NaN for fewer than two rows."""
     if len(time) < 2:
         return float("nan")
     steps = seconds_between(np.asarray(time))[1:]
@@ -81,9 +81,9 @@ def find_median_spacing(time: np.ndarray) -> float:
 
 
 def find_months_between_rows(time: np.ndarray) -> int:
-    """Return how many months of the calendar lie between rows that are firsts of months; 0 of other times.
+    """Return how many calendar months lie between rows if all are firsts of months, else 0.
 
-    Years, quarters and months have no length in seconds: steps are counted on the calendar.
+    Months, quarters and years have no fixed length in seconds, so such steps are counted on the calendar.
     """
     clock = np.asarray(time)
     if clock.dtype.kind != "M" or len(clock) < 3:

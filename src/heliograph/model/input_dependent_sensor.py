@@ -60,7 +60,7 @@ def read_input_names(inputs: Names) -> tuple[str, ...]:
 
 
 def count_matrix_rows(matrix: object, inputs: tuple[str, ...]) -> int:
-    """Return the number of rows of a matrix, or of what a function of the inputs returns."""
+    """Return the number of rows of a matrix, or of the matrix that a function of the inputs returns."""
     if not callable(matrix):
         return int(array("sensor matrix", cast(ArrayLike, matrix), ("outputs", "states")).shape[-2])
     try:
@@ -80,10 +80,10 @@ def read_noise_of_inputs(
     Args:
         noise: a law, a covariance, a variance, or a function of the inputs that returns a covariance.
         outputs: names of the outputs; y, or y0, y1, ... for None.
-        rows: of the sensor's matrix; None for a sensor without one.
+        rows: number of rows of the sensor's matrix; None for a sensor without one.
         inputs: names of the inputs on which the noise may depend.
     """
-    # How many outputs there are, said by the sensor's matrix, or by their names, or by the noise; else it is one.
+    # The number of outputs comes from the sensor's matrix, else from their names, else from the noise, else it is 1.
     components = None if callable(noise) else count_components(noise)
     count_without_matrix = (components or 1) if outputs is None else len(name_list("sensor outputs", outputs))
     count = rows or count_without_matrix
@@ -96,11 +96,11 @@ def read_noise_of_inputs(
 
 
 def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
-    """Return a sensor's function h(x); raise ValueError where it needs more arguments than the state."""
+    """Return a sensor's function h(x); raise ValueError if it needs more arguments than the state."""
     checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
     try:
         signature = inspect.signature(checked)
-    except ValueError:  # of what is not Python, nothing is known before it is called
+    except ValueError:  # a function not written in Python has no signature to check
         return checked
     try:
         signature.bind(None)
@@ -111,7 +111,7 @@ def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], Array
 
 
 def require_constant(name: str, value: object) -> Any:
-    """Return a sensor's matrix or noise as it is; raise ValueError for a function, whose inputs have no names."""
+    """Return a sensor's matrix or noise as it is; raise ValueError for a function, as its inputs have no names here."""
     if callable(value):
         expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
         raise fail(name, expected, "a function")

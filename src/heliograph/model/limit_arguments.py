@@ -34,7 +34,7 @@ def read_intervals(limits: object, received: int, name: str = "limits") -> Float
 
 
 def read_numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
-    """Return real numbers as an array of doubles; raise ValueError, which says what was `expected` of `name`."""
+    """Return real numbers as an array of doubles; raise ValueError, with what was `expected` of `name`, for others."""
     try:
         values = np.asarray(value)
         if values.size and values.dtype.kind not in "fiu":  # neither floats nor whole numbers, signed or not

@@ -62,12 +62,12 @@ class SwitchingRates(Module):
     def transition_over(self, time: jax.Array) -> jax.Array:
         """Return exp(G t), the transition probabilities (modes, modes) over a time t under the rates G.
 
-        By the eigenvalues growth + i turn of G, and their projectors real + i imaginary.
+        It is computed from the eigenvalues growth_k + i turn_k of G and their projectors real_k + i imaginary_k.
         """
         size = jnp.exp(jnp.asarray(self.growth) * time)
         cosine, sine = size * jnp.cos(self.turn * time), size * jnp.sin(self.turn * time)
         rows = jnp.einsum("k,kij->ij", cosine, self.real) - jnp.einsum("k,kij->ij", sine, self.imaginary)
-        return jnp.maximum(rows, 0.0)  # rounding may leave one a little below 0
+        return jnp.maximum(rows, 0.0)  # rounding may make a probability slightly negative
 
 
 class ModalPlant(AbstractPlant, AbstractWithMemory):
@@ -331,10 +331,10 @@ def markov_sensor(
 
 
 def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax.Array:
-    """Return the transition probabilities (M, M) of joint modes, of the plant and all else, over a row with inputs u.
+    """Return the transition probabilities (M, M) of the joint modes of plant and all else, over a row with inputs u.
 
-    The plant's mode is the slowest in their order: it moves by the plant's rates over the input dt, if the plant has
-    rates (it is `chain` alone otherwise), then all move by `chain` (M, M).
+    The plant's mode varies slowest in their order. If the plant has rates, its mode moves by them over the input dt,
+    and then all modes move by `chain` (M, M). Otherwise the result is `chain`.
     """
     if not isinstance(plant, ModalPlant) or plant.rates is None:
         return chain
@@ -348,7 +348,7 @@ def list_mode_models(model: Any) -> tuple[Any, ...]:
 
 
 def _read_mode_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
-    """Return the models of a chain's modes, at least two, checked: of the class `kind`, constant and without modes."""
+    """Return the checked models of a chain's modes: at least two, of the class `kind`, constant and without modes."""
     checked = tuple(items(name, models, "one model for each mode"))
     if len(checked) < 2:
         raise fail(name, "at least two, one for each mode", len(checked))

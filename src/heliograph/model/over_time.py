@@ -28,7 +28,7 @@ class OverTime(Module):
     values: PyTree
 
     def __init__(self, values: object):
-        """Hold an array, or a model whose arrays are all stacked over time, along a leading axis of one length."""
+        """Hold an array, or a model of arrays, whose leading axes are all time and have one length."""
         self.values = jax.tree.map(_convert_leaf, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
         if len(steps) != 1 or None in steps:
@@ -56,7 +56,7 @@ def stack(models: Sequence[T]) -> T:
     if len({_describe_structure(leaves, structure) for leaves, structure in leaves_and_structures}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
     leaf_of_models = zip(*(leaves for leaves, _ in leaves_and_structures), strict=True)
-    # What is no array is the same in all of them.
+    # Leaves that are not arrays are the same in all models.
     stacked = [_stack_leaves(*leaves) if eqx.is_array(leaves[0]) else leaves[0] for leaves in leaf_of_models]
     _leaves, structure = leaves_and_structures[0]
     stacked_model: T = jax.tree.unflatten(structure, stacked)
@@ -88,7 +88,7 @@ def _stack_leaves(*leaves: PyTree) -> object:
 def over_time(items: Sequence[object]) -> OverTime:
     """Return one model object per time step (a channel, a plant, ...) as a single object that varies in time.
 
-    What channels remember without a name is one memory over time, whose transition may differ from step to step.
+    Memories of channels that have no name become one memory over time, whose transition may differ from step to step.
 
     Args:
         items: objects of one structure, one for each step.
@@ -114,7 +114,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
         """Return the k-th values of an `OverTime`, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
-        # Only arrays have an axis of steps; what is none is the same at all steps.
+        # Only arrays have an axis of steps. Everything else is the same at all steps.
         values, rest = eqx.partition(leaf.values, eqx.is_array)
         return eqx.combine(jax.tree.map(lambda v: _take_entry(v, k), values), rest)
 
@@ -125,11 +125,11 @@ def _take_entry(values: PyTree, k: PyTree) -> object:
     """Return the entry k of an array along its first axis, also for a k that JAX traces."""
     if isinstance(k, jax.Array):
         return jax.lax.dynamic_index_in_dim(jnp.asarray(values), k, keepdims=False, allow_negative_indices=False)
-    return values[k, ...]  # the dots keep a number an array
+    return values[k, ...]  # with the dots, an entry of one number is still an array
 
 
 def steps_covered(tree: object) -> int | None:
-    """Return the smallest number of steps that the time-varying parts of a model cover; None if nothing varies.
+    """Return the smallest number of steps that the time-varying parts of a model have, or None if nothing varies.
 
     Args:
         tree: a plant, a sensor, a channel or any tree of arrays.

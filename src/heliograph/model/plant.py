@@ -115,10 +115,10 @@ class AbstractPlant(Module):
     def make_motion_about(
         self, u: jax.Array, center: jax.Array, middle: jax.Array | None = None
     ) -> Callable[[jax.Array], jax.Array]:
-        """Return x -> f(x, u) in coordinates in which means and covariances can be taken, about `center`.
+        """Return the function x -> f(x, u) in coordinates about `center`, in which means and covariances can be taken.
 
-        Angles do not jump by turns, but go on from those at `center`. Attitudes are given as changes from `center`, and
-        returned as changes from `middle`, the state after the step (f(center, u) unless given), added to it.
+        Angles do not jump by full turns, but continue from those at `center`. Attitudes are given as changes from
+        `center` and returned as changes from `middle`, the state after the step (f(center, u) by default).
         """
         f: Callable[[jax.Array], jax.Array] = self.manifold.chart_move(lambda x: self.transition(x, u), center, middle)
         return f
@@ -128,13 +128,13 @@ class AbstractPlant(Module):
         raise unwritten(self, "transition")
 
     def noise_covariance(self, u: jax.Array) -> jax.Array:
-        """Return the covariance of w, (n, n); it may depend on the input (a time step, a distance travelled)."""
+        """Return the covariance (n, n) of w, which may depend on the inputs (a time step, a distance travelled)."""
         if isinstance(self.noise, AbstractNoise):
             return jnp.asarray(self.noise.covariance)
         return as_real(self.noise(u))
 
     def noise_mean(self) -> jax.Array:
-        """Return the mean of the process noise w, (n,); zero where only a covariance is known of it."""
+        """Return the mean (n,) of the process noise w, or zeros if only its covariance is known."""
         if isinstance(self.noise, AbstractNoise | JointNoise):
             return jnp.asarray(self.noise.mean)
         return jnp.zeros(self.initial_mean.shape)
@@ -148,7 +148,7 @@ class AbstractPlant(Module):
         return cholesky(self.noise_covariance(u)) @ jax.random.normal(key, self.initial_mean.shape, dtype=float)
 
     def sample_initial(self, key: jax.Array) -> jax.Array:
-        """Draw the initial state x_0 (n,), by the law of its deviation, or a Gaussian one where none is given."""
+        """Draw the initial state x_0 (n,) by the law of its deviation, or by a Gaussian law if none is given."""
         mean = jnp.asarray(self.initial_mean)
         if self.deviation is not None:
             x = mean - self.deviation.mean + self.deviation.sample(key)
@@ -323,7 +323,7 @@ class LinearPlant(AbstractPlant):
         check_turn_invariance("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _read_matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
-        """Return a matrix of the plant as an array, or as a function of the inputs u, after a check of its shape."""
+        """Return a matrix of the plant as an array, or as a function of the inputs u, with its shape checked."""
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)
@@ -343,7 +343,7 @@ class LinearPlant(AbstractPlant):
 
 
 def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the states that are rotation vectors, three for each attitude; raise unless they are so."""
+    """Return the names of the states that are rotation vectors; raise unless there are three for each attitude."""
     given, allowed = [str(name) for name in items("attitude", attitude, "names")], set(states) - set(circular)
     if len(given) % 3 or len(set(given)) < len(given) or not set(given) <= allowed:
         expected = f"three of {[name for name in states if name in allowed]} for each attitude, each once"
@@ -354,7 +354,7 @@ def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: t
 def _read_initial_law(
     mean: ArrayLike, spread: NoiseLike | DiffuseStart, unknown: bool = False
 ) -> tuple[Vector, Any, AbstractNoise | None]:
-    """Return mean, covariance and law of the deviation (None: Gaussian) of an initial state; diffuse if `unknown`."""
+    """Return mean, covariance and law (None: Gaussian) of an initial state, which may be diffuse if `unknown`."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]
     if isinstance(spread, DiffuseStart):
@@ -372,7 +372,7 @@ AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime ho
 
 
 def read_manifold(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
-    """Return which of so many states are angles or attitudes: from the places of angles, or from the states' plant."""
+    """Return which of `states` states are angles or attitudes, from the places of angles or from the states' plant."""
     plant = first(angles)
     if not isinstance(plant, AbstractPlant):
         return Manifold(angles_at(angles, states))
@@ -395,5 +395,5 @@ def read_first_plant(plant: AnyPlant) -> Any:
     """Return the plant at its first step."""
     plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
     if isinstance(plant_0.noise, AbstractNoise):
-        _ = plant_0.noise.covariance  # refused where it does not exist
+        _ = plant_0.noise.covariance  # raises if it does not exist
     return plant_0

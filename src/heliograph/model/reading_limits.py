@@ -108,10 +108,11 @@ class ReadingLimits(Module):
         return limited or self.stuck is not None
 
     def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
-        """Return readings without those that count as missing, given the runs of equal ones before them, if any.
+        """Return the readings without those that count as missing, from runs of equal readings before them (`before`).
 
-        Missing is what is beyond the limits, or a code; neither ends a run. `self.stuck`: from how many equal readings
-        in a row a component is missing too; None where runs are not counted.
+        A reading is missing if it is beyond the limits, or is a code; neither ends a run of equal readings.
+        `self.stuck`: the number of equal readings in a row from which a component counts as missing; None if runs are
+        not counted.
         """
         refused = self.find_refusal_reasons(z)
         values = np.where(refused > 0, np.nan, z)
@@ -123,10 +124,10 @@ class ReadingLimits(Module):
         return ScreenedReadings(np.where(is_stuck, np.nan, values), refused, repeats)
 
     def find_refusal_reasons(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
-        """Return the number of the reason for which each value by itself counts as missing; 0 where it does not.
+        """Return the number of the reason for which each value by itself counts as missing, or 0 if it does not.
 
-        A code is a value of `invalid` that stands for no reading, such as -999, also where it is beyond the limits
-        (`low`, `high`). NaN is missing already.
+        A code is a value of `self.invalid`, such as -999, that stands for no reading; it counts as a code even beyond
+        the limits (`self.low`, `self.high`). NaN is missing already and has no reason.
         """
         is_code, is_beyond = equals_code(z, self.invalid), (z < self.low) | (z > self.high)
         return np.where(is_code, number_of_reason("code"), np.where(is_beyond, number_of_reason("limits"), 0))
@@ -136,9 +137,9 @@ class ReadingLimits(Module):
         return np.asarray(self.find_refusal_reasons(z) > 0)
 
     def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
-        """Describe in words the components of a measurement that are refused; "" if there are none.
+        """Return in words which components of a measurement are refused, or "" if none is.
 
-        `refused`: the number of each one's reason, as `screen` returns it.
+        `refused`: the number of each component's reason, as `screen` returns it.
         """
         descriptions = []
         for i in np.flatnonzero(refused).tolist():
@@ -154,15 +155,15 @@ class ReadingLimits(Module):
 
 
 def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
-    """Return whether each number is a code: equal up to the rounding of a product, or as single precision stores it.
+    """Return whether each number is a code, a number such as -999 that stands for no reading.
 
-    A code is a number that stands for no reading, such as -999.
+    Numbers count as equal up to the rounding of a product, and if single precision stores the code so.
     """
     numbers = np.asarray(z, dtype=np.float64)[..., None]
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)
-    # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. Whole numbers
-    # are exact in both precisions, but for the largest.
+    # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. All but the
+    # largest whole numbers are exact in both.
     with np.errstate(over="ignore"):
         single = codes.astype(np.float32).astype(np.float64)
     rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)

@@ -73,9 +73,9 @@ class RelayNetwork(Module):
 
     @property
     def received(self) -> tuple[int, ...]:
-        """Return how many numbers each filter receives in a step, in the order of `filters`: relays and receiver.
+        """Return how many numbers each filter receives in a step, in the order of `filters`: relays, then the receiver.
 
-        By the first link to it in any slot; all deliver as many.
+        The first link to a filter in any slot tells, since all deliver equally many.
         """
         return tuple(
             next(first(link).outputs for slot in self.slots for link in slot.get(name, {}).values())
@@ -172,10 +172,10 @@ class RelaySteps(Module):
         return np.repeat(np.arange(len(self.received)), self.received)
 
     def predict_maps(self) -> tuple[Float[np.ndarray, "time R n"], Float[np.ndarray, "time R"]]:
-        """Return B and b of the prediction B s + b of each received number from the estimate s of its filter.
+        """Return B and b of the prediction B s + b of all R received numbers from the estimate s of their filter.
 
-        R numbers in all. What is sent, (y, each relay's signal), is predicted from s: y by a step of the plant, a
-        relay's signal, which is of a step before, by the sensor alone; `gain` and `offset` are the links' means.
+        What is sent, (y, each relay's signal), is predicted from s: y by one step of the plant, and a relay's signal,
+        which is one step old, by the sensor alone. `self.gain` and `self.offset` are the means of the links.
         """
         relays, m = len(self.received) - 1, self.sensing.shape[1]
         matrix_of_sent = np.concatenate([self.sensing @ self.transition, *[self.sensing] * relays], axis=1)
@@ -233,7 +233,8 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
 def _list_arrays_by_step(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """Return an array of a plant or sensor at each of `horizon` steps, with a leading axis of steps.
 
-    `read`: takes the array out of the model. `dimensions`: its axes at one step; one more if the model varies.
+    `read`: takes the array out of the model. `dimensions`: its number of axes at one step; a varying model has one
+    more.
     """
     value = np.asarray(read(stack_over_time(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:
@@ -242,7 +243,7 @@ def _list_arrays_by_step(model: PyTree, horizon: int, read: Callable[[PyTree], A
 
 
 def _check_linear(plant: object, sensor: object) -> None:
-    """Raise unless plant and sensor are linear, without inputs or angles, and fit each other."""
+    """Raise ValueError unless plant and sensor are linear, without inputs or angles, and fit each other."""
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         got = f"{type(plant).__name__} and {type(sensor).__name__}"
         raise fail("relay network", "a LinearPlant and a LinearSensor", got)
@@ -276,7 +277,7 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
 
 
 def _check_reached(network: RelayNetwork, name: str) -> None:
-    """Raise ValueError if nobody ever transmits to a relay, or to the receiver (RECEIVER), called `name`.
+    """Raise ValueError if nobody ever transmits to the relay, or to the receiver (RECEIVER), called `name`.
 
     A slot maps each receiver to its senders with their links.
     """

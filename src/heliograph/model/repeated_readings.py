@@ -48,9 +48,9 @@ class Repeats(NamedTuple):
 
     @staticmethod
     def read(stored: object) -> "Repeats":
-        """Return runs of equal readings that were stored: as a list of the fields, or as they are.
+        """Return stored runs of equal readings, from a list of their fields, or from such runs themselves.
 
-        Until version 0.4.0 two fields were stored; the others are empty then.
+        Version 0.4.0 and earlier stored two fields; the others are then empty.
 
         Raises:
             ValueError: no such list.
@@ -119,14 +119,14 @@ def _bound_probability_within_step(
 ) -> Float[np.ndarray, " outputs"]:
     """Return the largest probability that the noise of each output lies in an interval as long as its `step`.
 
-    It is that of the interval about the mean. `step`: the least difference of two readings, such as a converter's.
+    It is that of the interval around the mean. `step`: the least difference of two readings, such as a converter's.
     """
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
         return np.asarray(1 - 2 * scipy.special.stdtr(float(noise.degrees), -step / (2 * scale)))
     if not isinstance(noise, Gaussian | Contaminated):
         raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
-    # A mixture of Gaussians: the logarithms of their shares, and their variances.
+    # The noise is a mixture of Gaussians with these shares (as logarithms) and variances.
     log_share, _mean, variance = (np.asarray(numbers) for numbers in noise.branches())
     with np.errstate(divide="ignore"):
         within_step = scipy.special.erf(step[:, None] / np.sqrt(8 * variance))  # of each Gaussian
@@ -134,17 +134,17 @@ def _bound_probability_within_step(
 
 
 def longest_run_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
-    """Return the least n of which a run of n equal readings begins at a reading with probability at most `seldom`.
+    """Return the least n for which n equal readings in a row have a probability of at most `seldom`.
 
-    Noise is independent from reading to reading, so that a run of n has probability at most p^(n - 1).
+    Noise is independent between readings, so n equal ones in a row have probability at most p^(n - 1).
 
     Args:
-        equal: bound p of the probability that a reading equals the one before.
+        equal: p, a bound of the probability that a reading equals the previous one.
         seldom: the probability.
     """
     with np.errstate(divide="ignore"):
         n = 1 + np.ceil(np.log(seldom) / np.log(np.clip(equal, 0.0, 1 - 1e-12)))
-    return np.asarray(np.maximum(n, LEAST))  # LEAST, 3: two equal ones may be one that was sent twice
+    return np.asarray(np.maximum(n, LEAST))  # LEAST is 3, since two equal readings may be one that was sent twice
 
 
 def find_stuck_counts(
@@ -206,10 +206,10 @@ def _find_counts_by_noise_law(
 
 
 def delivers_as_sent(link: AbstractRandomAffine, outputs: tuple[int, ...]) -> bool:
-    """Decide whether a link loses outputs or delivers them as they are: no radio with a gain and noise of its own."""
+    """Return whether a link delivers outputs exactly as sent or loses them, unlike a radio with a gain and noise."""
     if any(isinstance(hop, AbstractHop) and hop.transmits for hop in (link, *all_inner_maps(link))):
         return False
     try:
-        return link.carry_angles(outputs) == outputs  # which, too, have to arrive as they were sent
+        return link.carry_angles(outputs) == outputs  # as if all were angles, which must arrive as sent
     except ValueError:
         return False

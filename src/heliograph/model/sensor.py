@@ -76,16 +76,17 @@ class AbstractSensor(Module):
         return self
 
     def under(self, names: Sequence[str], u: Array) -> "AbstractSensor":
-        """Return the sensor as it is under the inputs u of a plant, called `names`, of which it may take some."""
+        """Return the sensor under inputs u of a plant, called `names`; it takes those that it depends on."""
         if not self.inputs:
             return self
         places = np.array([list(names).index(name) for name in self.inputs])
         return _sensor_under_inputs(self, u[places])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
-        """Return the sensor under inputs that stand for any; raise ValueError where the plant lacks its inputs.
+        """Return the sensor under typical inputs; raise ValueError if the plant lacks an input of the sensor.
 
-        They are not whole, lest an angle times one is whole turns. `names`: of the plant's inputs.
+        Typical inputs are not whole numbers, so that an angle times one is no full turn. `names`: of the plant's
+        inputs.
         """
         lacking = [name for name in self.inputs if name not in names]
         if lacking:
@@ -99,8 +100,8 @@ class AbstractSensor(Module):
             raise fail(f"sensor of {name}", "one that depends on no inputs", f"one of {list(self.inputs)}")
 
     def check_states(self, states: int) -> None:
-        """Raise ValueError unless the sensor measures a state of this length and returns as many numbers as outputs."""
-        if self.inputs:  # inputs of 1 stand for any
+        """Raise ValueError unless the sensor measures a state of this length and returns one number for each output."""
+        if self.inputs:  # check with inputs of 1, since any will do
             _sensor_under_inputs(self, np.ones(len(self.inputs))).check_states(states)
             return
         try:
@@ -282,11 +283,11 @@ def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, 
     """
 
     def shape(states: int) -> tuple[int, ...] | None:
-        """Return the shape of h(x), h being `measure`, for a state of this length; None where h does not take it."""
+        """Return the shape of h(x) for a state of this length, or None if h, `measure`, cannot take it."""
         try:
             with jax.enable_x64(True):
                 return tuple(jax.eval_shape(lambda x: jnp.asarray(measure(x)), np.zeros(states)).shape)
-        except Exception:  # not for this length; what is wrong for all is said where the plant is known
+        except Exception:  # it may take other lengths; other faults are reported when the plant is known
             return None
 
     one, other = (shape(states) for states in LONG)
@@ -297,9 +298,9 @@ def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, 
 
 
 def without_output_names(model: T) -> T:
-    """Return a model with sensors, such as a filter, whose outputs are named y0, y1, ..., on which no number depends.
+    """Return a model with its sensors' outputs renamed to y0, y1, ..., which changes no number.
 
-    Models that differ in names alone are then of one structure, and one program is for all.
+    Models that differ only in names then have one structure, so that one program serves all.
     """
     unnamed: T = jax.tree.map(_drop_names, model, is_leaf=_is_sensor)
     return unnamed
@@ -311,7 +312,7 @@ def _is_sensor(model: object) -> bool:
 
 
 def _drop_names(model: Any) -> Any:
-    """Return the sensor with outputs called y0, y1, ..., and so the sensors inside it; what is no sensor as it is."""
+    """Return a sensor with its outputs, and those of sensors inside it, named y0, y1, ...; anything else as it is."""
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
     leaves, tree = jax.tree.flatten(model, is_leaf=lambda leaf: leaf is not model and _is_sensor(leaf))
@@ -350,7 +351,7 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
 
 
 def angles_of_outputs(angles: "Sequence[int] | AnySensor", outputs: int) -> Angles:
-    """Return which of so many outputs are angles, from their places or from the sensor whose outputs they are."""
+    """Return which of `outputs` outputs are angles, from their places or from the sensor whose outputs they are."""
     sensor = first(angles)
     if not isinstance(sensor, AbstractSensor):
         return angles_at(angles, outputs)
@@ -360,7 +361,7 @@ def angles_of_outputs(angles: "Sequence[int] | AnySensor", outputs: int) -> Angl
 
 
 def refuse_angles(name: str, *models: AnyPlant | AnySensor) -> None:
-    """Raise ValueError where a state or an output is an angle, for what knows numbers on a line alone."""
+    """Raise ValueError if a state or an output is an angle; `name`: what cannot handle angles."""
     circular = [angle for model in models for angle in first(model).circular]
     if circular:
         raise fail(name, "no angles (cubature, extended, mixture and multiple model filters take them)", circular)

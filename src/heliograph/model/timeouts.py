@@ -25,9 +25,9 @@ class LongSilences(NamedTuple):
     unit: str
 
     def describe(self) -> str:
-        """Return how many silences of a node there are, how long the longest is, and after which row, in words.
+        """Return in words how many silences of a node there are, and the length and row of the longest.
 
-        `rows`: the row before each, `lengths`: how long each is, in the unit of `timeout`.
+        `self.rows`: the row before each silence. `self.lengths`: their lengths, in the unit of `self.timeout`.
         """
         longest = int(np.argmax(self.lengths))
         several = f"{len(self.rows)} times, the longest " if len(self.rows) > 1 else ""

@@ -74,7 +74,7 @@ class AbstractTrigger(Module):
         return self.reference in ("sent", "acknowledged")
 
     def side_information(self, outputs: int) -> int:
-        """Count the numbers about lost transmissions that arrive behind z: none, one, or one for each component."""
+        """Return how many numbers about lost transmissions arrive after z: none, one, or one for each component."""
         if self.losses == "unknown":
             return 0
         return outputs if self.region == "each" else 1
@@ -89,15 +89,15 @@ class AbstractTrigger(Module):
     def start(self, outputs: int) -> SenderState:
         """Return a sender that has transmitted nothing yet."""
         zeros = jnp.zeros(outputs, dtype=int)
-        # Where y is compared with a value sent before, the first value begins.
+        # If y is compared with an earlier value, the sender has not begun before the first value is sent.
         begun = jnp.full(outputs, not self.needs_reference)
         return SenderState(jnp.zeros(outputs), zeros, begun, zeros, zeros)
 
     def reasons(self, sender: SenderState, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """Return the reason for which each component of y is sent at step k, (m,), 0 (SILENT) where it is not.
+        """Return the reason for which each component of y is sent at step k, (m,), or 0 (SILENT) if it is not sent.
 
-        FIRST where there is no reference yet, else EVENT by the rule, else HEARTBEAT where the last one is too old
-        (`age`: steps since it).
+        The reason is FIRST without a reference yet, else EVENT if the rule says so, else HEARTBEAT if the last
+        transmission is too old (`sender.age`: steps since then).
         """
         reason = jnp.where(self.event(y - sender.reference, key, k), self._event_reason(), SendReason.SILENT)
         if self.heartbeat is not None:
@@ -110,10 +110,10 @@ class AbstractTrigger(Module):
         return SendReason.EVENT
 
     def after(self, sender: SenderState, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> SenderState:
-        """Return the sender after it transmitted the components that have a reason, of which `arrived` arrived (m,).
+        """Return the sender after it sent the components with a reason, of which those in `arrived` arrived (m,).
 
-        `lost` counts the transmissions lost since the last that arrived; the reference is the value sent last, or the
-        last that was acknowledged; a reason is stored with a minus sign if the transmission was lost.
+        `lost` counts the transmissions lost since the last one that arrived. The reference is the value sent last, or
+        the last one acknowledged. A reason is stored with a minus sign if the transmission was lost.
         """
         sent = reason > 0
         arrived = arrived & sent
@@ -128,16 +128,16 @@ class AbstractTrigger(Module):
     def receive_if_sent(
         self, sender: SenderState, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[SenderState, jax.Array]:
-        """Return the sender after the step, and what the receiver gets: NaN of what the rule does not send.
+        """Return the sender after the step, and what the receiver gets, NaN where the rule does not send.
 
         Args:
-            sender: before the step.
-            y: the measurement, of which the rule decides what is sent.
-            z: what the channel would make of y, NaN of what it would lose.
-            key: random, for rules that draw.
-            k: the step.
+            sender: the sender before the step.
+            y: the measurement; the rule decides which components of it are sent.
+            z: what the channel would deliver of y, NaN where it would lose it.
+            key: random key, for rules that draw.
+            k: number of the step.
         """
-        # A reason above 0: the component is sent. What the channel would not lose is present.
+        # A component is sent if its reason is above 0, and present if the channel would not lose it.
         reason, is_present = self.reasons(sender, y, key, k), ~jnp.isnan(z)
         # Components are sent one by one, or all in one message.
         one_by_one = self.region == "each"
@@ -147,10 +147,11 @@ class AbstractTrigger(Module):
         return self.after(sender, y, reason, arrived), received
 
     def known_losses(self, sender: SenderState, reason: jax.Array, arrived: jax.Array) -> jax.Array:
-        """Return the numbers about losses that arrive behind z, from the sender before this step.
+        """Return the numbers about losses that arrive after z, from the sender before this step.
 
-        "numbered": how many transmissions were lost since the last that arrived, NaN where none arrives now; "known":
-        whether one was lost now; "unknown": none. (m,) if components are sent one by one, else one.
+        If losses are "numbered", it is how many transmissions were lost since the last that arrived, or NaN if none
+        arrives now. If "known", it is whether one was lost now. If "unknown", there are none. The shape is (m,) if
+        components are sent one by one, else (1,).
         """
         sent = reason > 0
         if self.losses == "numbered":
@@ -166,9 +167,10 @@ class AbstractThreshold(AbstractTrigger):
     delta: eqx.AbstractVar[Float[Array, "..."]]
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """Return whether each component is sent, (m,): where error = y - reference is beyond delta.
+        """Return whether each component is sent (m,): whether error = y - reference is beyond delta.
 
-        Each by its own error ("each"), all where that of any is ("box"), or by the length of the vector ("ball").
+        Region "each" judges each component by its own error. "box" sends all if any error is beyond delta. "ball" sends
+        all if the length of the error vector is.
         """
         delta = jnp.asarray(self.delta)
         if self.region == "ball":
@@ -177,10 +179,7 @@ class AbstractThreshold(AbstractTrigger):
         return beyond if self.region == "each" else jnp.full(len(error), jnp.any(beyond))
 
     def check_outputs(self, outputs: int) -> None:
-        """Raise ValueError unless delta, the threshold, is one number, or one for each component of a box.
-
-        A ball's radius is one number.
-        """
+        """Raise ValueError unless delta is one number, or for a box one number for each component."""
         if np.ndim(self.delta) and (self.region == "ball" or np.shape(self.delta) != (outputs,)):
             expected = "one number" if self.region == "ball" else f"one number, or {outputs}"
             raise fail("delta of the trigger", expected, f"shape {np.shape(self.delta)}")
@@ -336,7 +335,7 @@ class Periodic(AbstractTrigger):
 
 
 def read_threshold(delta: ArrayLike) -> Float[Array, "..."]:
-    """Return a threshold delta as an array, after a check: a positive number, or one for each component."""
+    """Return a checked threshold delta as an array: one positive number, or one for each component."""
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
     if not is_traced(checked) and not np.all(checked > 0):
@@ -345,10 +344,10 @@ def read_threshold(delta: ArrayLike) -> Float[Array, "..."]:
 
 
 def read_choice(name: str, value: object, kinds: object) -> Any:
-    """Return a value that is one of the words of a type, such as Literal["sent", "acknowledged"]; refuse any other.
+    """Return a value that is one of the words of a type, such as Literal["sent", "acknowledged"].
 
     Raises:
-        ValueError: none of them.
+        ValueError: any other value.
     """
     words = get_args(kinds)
     if not isinstance(value, str) or value not in words:

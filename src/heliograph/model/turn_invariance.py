@@ -91,11 +91,11 @@ def _compare_turned(name: str, function: Callable[..., jax.Array], places: Seque
 
 
 def _turn_attitude_long_way_round(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
-    """Return the state with the other rotation vector of the same attitude: the turn the other way, r (1 - 2 pi / |r|).
+    """Return the state with the other rotation vector of the same attitude, r (1 - 2 pi / |r|): the turn the other way.
 
     Args:
         x: the state.
-        places: of the rotation vector's three components in it.
+        places: places of the rotation vector's three components in the state.
     """
     r = x[list(places)]
     other: np.ndarray = x.copy()
@@ -106,7 +106,7 @@ def _turn_attitude_long_way_round(x: np.ndarray, places: Sequence[int]) -> np.nd
 def _evaluate_at_points(
     function: Callable[..., jax.Array], points: jax.Array, rests: tuple[jax.Array, ...]
 ) -> jax.Array:
-    """Return f(x, ...) at each of some points x, with the i-th entry of each of `rests` as its further arguments."""
+    """Return f(x, ...) at each of some points x; point i gets entry i of each array in `rests` as further arguments."""
     return jnp.stack([jnp.asarray(function(x, *(values[i] for values in rests))) for i, x in enumerate(points)])
 
 

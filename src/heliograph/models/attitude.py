@@ -15,8 +15,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 def turn_attitude(attitude: Float[ArrayLike, "*any 3"], by: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 3"]:
     """Return an attitude turned in its own axes: log(exp(attitude) exp(by)), a rotation vector of at most pi.
 
-    What a gyroscope says: r+ = turn_attitude(r, rate * dt), exact while the rate stays in the body's axes. Written for
-    the transition of a plant with `attitude=`, and for arrays.
+    With a gyroscope's rate it is r+ = turn_attitude(r, rate * dt), which is exact if the rate is constant in the body's
+    axes. It is for the transition of a plant with `attitude=`, and for arrays.
 
     Args:
         attitude: rotation vector in radians, R = exp [r]x from body to world. Shape (..., 3).
@@ -30,7 +30,7 @@ def turn_attitude(attitude: Float[ArrayLike, "*any 3"], by: Float[ArrayLike, "*a
 
 
 def rotation_matrix(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 3 3"]:
-    """Return R = exp [r]x of an attitude r: R turns a vector from the body's axes into the world's, R' turns it back.
+    """Return R = exp [r]x of an attitude r, which turns vectors from the body's axes to the world's, and R' back.
 
     Args:
         attitude: rotation vector in radians. Shape (..., 3).
@@ -68,14 +68,14 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
     largest = abs(values).max(axis=-1, keepdims=True)
     if not is_traced(values) and not largest.all():
         raise fail("quaternion", "four numbers of which one is not 0", "all of them 0")
-    attitude: Array = rotation_vector_of(values / largest)  # so that no square overflows, or is 0
+    attitude: Array = rotation_vector_of(values / largest)  # scaled so that no square overflows or underflows
     return attitude
 
 
 def _read_coordinates(name: str, value: ArrayLike, last: int) -> Any:
-    """Return an array of JAX as it is, any other as doubles; raise ValueError unless its last axis has length `last`.
+    """Return a JAX array as it is, or another as doubles; raise ValueError unless its last axis is `last` long.
 
-    NaN stands for a missing coordinate and is let through. `name`: what the array is called in errors.
+    NaN stands for a missing coordinate and is allowed. `name`: what the array is called in errors.
     """
     if isinstance(value, jax.Array):
         coordinates = value
@@ -83,7 +83,7 @@ def _read_coordinates(name: str, value: ArrayLike, last: int) -> Any:
         try:
             coordinates = array(name, value, (None,) * np.ndim(value), missing=True)  # None: an axis of any length
         except (TypeError, ValueError):
-            coordinates = array(name, value, (last,), missing=True)  # no array of numbers, which this names
+            coordinates = array(name, value, (last,), missing=True)  # raises with the reason
     shape = jnp.shape(coordinates)
     if shape[-1:] != (last,):
         raise fail(name, f"shape (..., {last})", f"shape {shape}")

@@ -47,14 +47,14 @@ def discretize(
     dt: "Float[ArrayLike, '']",
     B: "Float[ArrayLike, 'n inputs'] | None" = None,
 ) -> Discretized:
-    """Return the step of length dt of dx = (A x + B u) dt + dW: F, Q and the matrix of an input that is held.
+    """Return the step of length dt of dx = (A x + B u) dt + dW: F, Q, and the matrix of a constant input.
 
-    The series of all three over a short step, which is then doubled: Q(2h) = Q(h) + F(h) Q(h) F(h)', sums of what is
-    positive, so that no digits cancel however long or stiff the step is. F is right to 1e-13 of its norm.
+    All three come from series over a short step that is then doubled: Q(2h) = Q(h) + F(h) Q(h) F(h)'. These are sums of
+    positive terms, so that no digits cancel however long or stiff the step is. F is exact to 1e-13 of its norm.
 
     Args:
         A: matrix of the motion (n, n).
-        intensity: S, the covariance that W gains in a unit of time (n, n); a number for that in each state.
+        intensity: S (n, n), the covariance that W gains in a unit of time; a number is a variance for each state.
         dt: length of the step.
         B: matrix of the inputs (n, inputs); none by default.
 
@@ -106,9 +106,10 @@ class ContinuousSystem(Module):
         """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over a short step h."""
 
         def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Return the terms of order k of both series, and the sums with them; a is A, h the length of the step.
+            """Return the terms of order k of both series, and the sums with these terms.
 
-            The terms are h^k A^(k-1) / k! of the integral of exp(A s), and the like of exp(A s) S exp(A s)'.
+            The first series is the integral of exp(A s) from 0 to h, with terms h^k A^(k-1) / k!. The second is the
+            integral of exp(A s) S exp(A s)'. `a` is A, and h the length of the step.
             """
             integral_term, noise_term, integral, noise = parts
             integral_term, half = a @ integral_term * (h / k), a @ noise_term * (h / k)
@@ -126,9 +127,10 @@ class ContinuousSystem(Module):
 
 
 def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
-    """Return F - I, F, the integral of F, and Q over twice the step, given those over the step in the same order.
+    """Return F - I, F, the integral of F, and Q over twice the step, from the same over the step.
 
-    F(2h) = F F, F(2h) - I = 2 (F - I) + (F - I)^2, and Q(2h) = Q + F Q F', written with `growth`, F - I.
+    `growth`: F - I. F(2h) = F F, F(2h) - I = 2 (F - I) + (F - I)^2, integral(2h) = 2 integral + (F - I) integral, and
+    Q(2h) = Q + F Q F'.
     """
     matrix_times_noise = noise + growth @ noise  # F Q
     return (
@@ -140,14 +142,14 @@ def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[A
 
 
 def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
-    """Return the body of a loop that doubles a step in its first `count` turns, and then leaves it as it is.
+    """Return the body of a loop that doubles a step in its first `count` turns and then leaves it unchanged.
 
     A compiled loop has a fixed number of turns, while `count` may be traced.
     """
 
     def double_up_to_count(i: Any, matrices: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the matrices of twice the step in turn i of the loop, if i is below `count`, else those given."""
-        # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
+        """Return the matrices of twice the step in turn i of the loop if i is below `count`, else the given ones."""
+        # Double zeros after the last turn, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
         doubled = _double_step(*(jnp.where(goes_on, matrix, 0.0) for matrix in matrices))
         return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, matrices, strict=True))
@@ -156,7 +158,7 @@ def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[
 
 
 def _read_continuous_matrices(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
-    """Return A (n, n), B (n, inputs; no columns for None) and the noise intensity (n, n), checked, as one system."""
+    """Return A (n, n), B (n, inputs) and the noise intensity (n, n), checked, as one system; B None has no columns."""
     a = array("matrix of the motion", A, (None, None))
     n = a.shape[0]
     a = array("matrix of the motion", a, (n, n))
@@ -255,7 +257,7 @@ def continuous_plant(
 
 
 def append_time_step(inputs: Names) -> list[str]:
-    """Return the names of inputs with "dt" (TIME_STEP) behind them, the length of a step; raise if it is among them."""
+    """Return the names of inputs followed by "dt" (TIME_STEP), the length of a step; raise if "dt" is among them."""
     names = name_list("input names", inputs)
     if TIME_STEP in names:
         raise fail("input names", f"no {TIME_STEP!r}, which is added as the length of a step", names)

@@ -49,7 +49,7 @@ class MatrixSideBySide(TransitionSideBySide):
     """The block-diagonal matrix of linear plants."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
-        """Return A (n, n) of the joint state under the inputs u of all plants: the plants' own along the diagonal."""
+        """Return A (n, n) of the joint state under the inputs u of all plants, with the plants' own on the diagonal."""
         plants: list[Any] = list(self.plants)  # linear ones
         plants_and_inputs = zip(plants, split_inputs(u, self.places), strict=True)
         matrices = [jnp.asarray(plant.transition_matrix(own_inputs)) for plant, own_inputs in plants_and_inputs]
@@ -60,7 +60,7 @@ class InputsSideBySide(TransitionSideBySide):
     """The input matrices of linear plants, one above the other."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
-        """Return B (n, inputs) under the inputs u: each plant's rows, zero but in the columns of its own inputs."""
+        """Return B (n, inputs) under the inputs u; a plant's rows are zero except in the columns of its own inputs."""
         rows, plants = [], list[Any](self.plants)  # linear ones
         for plant, own_inputs, columns in zip(plants, split_inputs(u, self.places), self.places, strict=True):
             matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own_inputs))
@@ -133,11 +133,11 @@ def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
 
 
 def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
-    """Return A and B of linear plants side by side: constants, or functions of the inputs where one of theirs is.
+    """Return A and B of linear plants side by side, as functions of the inputs if some plant's matrix is one.
 
     Args:
         parts: the plants, each with its own states and inputs.
-        places: of each plant's inputs among all inputs.
+        places: places of each plant's inputs among all inputs.
         count: number of all inputs.
     """
     if any(isinstance(value, MatrixOfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):

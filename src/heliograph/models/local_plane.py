@@ -59,25 +59,25 @@ class LocalPlane(Module):
         """Return east, north and up of points, in metres; NaN where a coordinate is NaN.
 
         Args:
-            latitude: degrees. Shape (*points,), as the others.
+            latitude: degrees. Shape (*points,), like the others.
             longitude: degrees.
             height: metres above the ellipsoid.
 
         Raises:
-            ValueError: shapes that do not fit, or a latitude beyond 90 degrees (longitude and latitude exchanged?).
+            ValueError: shapes that do not fit, or a latitude beyond 90 degrees (perhaps a longitude).
         """
-        phi, turn, rise = self._subtract_origin(latitude, longitude, height)  # latitude, longitude, height of that
+        phi, turn, rise = self._subtract_origin(latitude, longitude, height)  # relative to the origin
         radius, _ = self._origin  # r_0: its distance from the earth's axis
         across, along = _subtract_on_meridian(np.radians(self.latitude), self.height, phi, rise)
-        # The meridian's plane turned by the difference in longitude: r cos l - r_0 = (r - r_0) - 2 r sin^2(l / 2).
+        # Turn by the difference l in longitude: r cos l - r_0 = (r - r_0) - 2 r sin^2(l / 2), which loses no digits.
         out = across - 2 * (radius + across) * np.sin(turn / 2) ** 2
         return self._from_meridian((radius + across) * np.sin(turn), out, along)
 
     def to_geodetic(self, position: ArrayLike) -> Float[np.ndarray, "*points 3"]:
         """Return latitude and longitude in degrees (-180 to 180) and height in metres of points of the plane.
 
-        Longitude in closed form; latitude from Bowring's by Newton's steps, whose error is below rounding for heights
-        above -5,000 km.
+        The longitude has a closed form. The latitude is Bowring's, corrected by Newton steps; its error is below
+        rounding for heights above -5,000 km.
 
         Args:
             position: east, north and up in metres. Shape (*points, 3).
@@ -88,7 +88,7 @@ class LocalPlane(Module):
         points = _read_coordinates("position on a local plane", position, 3)
         east, out, along = self._to_meridian(points)
         radius, _ = self._origin  # r_0: the origin's distance from the earth's axis
-        # r - r_0 = (east^2 + 2 r_0 out + out^2) / (r + r_0), without the difference of what is large.
+        # r - r_0 = (east^2 + 2 r_0 out + out^2) / (r + r_0), which avoids a difference of large numbers.
         distance = np.hypot(east, radius + out)
         across = (east**2 + 2 * radius * out + out**2) / (distance + radius)
         turn = np.arctan2(east, radius + out)
@@ -128,10 +128,10 @@ class LocalPlane(Module):
     def turn_covariance(
         self, latitude: ArrayLike, longitude: ArrayLike, covariance: ArrayLike
     ) -> Float[np.ndarray, "*points 3 3"]:
-        """Return covariances of positions in the plane's axes from those in east, north and up of the points.
+        """Return covariances of positions in the plane's axes, from those in the axes east, north and up of the points.
 
-        T C T' with T from the axes at a point to those at the origin: a turn by the longitude's difference times
-        sin(latitude), 1.4 degrees at 100 km in the latitude of Berlin, and by the curvature of the ground.
+        They are T C T', where T turns from the axes at a point to those at the origin. The turn is the difference in
+        longitude times sin(latitude), 1.4 degrees at 100 km at Berlin's latitude, plus the curvature of the ground.
 
         Args:
             latitude: of the points, degrees. Shape (*points,).
@@ -143,7 +143,7 @@ class LocalPlane(Module):
         """
         phi, turn, _ = self._subtract_origin(latitude, longitude, self.height)
         matrix = _read_coordinates("covariance of positions", covariance, 3, 3)
-        # Rows east, north, up; columns out of the earth's axis, east, along the axis.
+        # Rows: east, north, up. Columns: away from the earth's axis, east, along the axis.
         axes_at_points = _make_axes(np.radians(self.latitude) + phi, turn)
         axes_at_origin = _make_axes(np.radians(self.latitude), turn=0.0)
         T = axes_at_origin @ np.swapaxes(axes_at_points, -1, -2)
@@ -152,7 +152,7 @@ class LocalPlane(Module):
     def _subtract_origin(
         self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return latitude, longitude (radians, the second from -pi to pi) and height of points, less the origin's."""
+        """Return latitude and longitude (radians, from -pi to pi) and height of points, minus the origin's."""
         named = {"latitude": latitude, "longitude": longitude, "height": height}
         values = [_read_coordinates(f"{name} of points", value) for name, value in named.items()]
         try:
@@ -171,20 +171,20 @@ class LocalPlane(Module):
         return np.stack([east, c * along - s * out, c * out + s * along], axis=-1)
 
     def _to_meridian(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return points of the plane (..., 3) in other axes: east, out of the earth's axis, and along that axis.
+        """Return points of the plane (..., 3) in other axes: east, away from the earth's axis, and along that axis.
 
-        North and up are turned by the origin's latitude; all in metres from the origin.
+        North and up are turned by the origin's latitude. All numbers are metres from the origin.
         """
         c, s = np.cos(np.radians(self.latitude)), np.sin(np.radians(self.latitude))
         east, north, up = np.moveaxis(points, -1, 0)
         return east, c * up - s * north, s * up + c * north
 
     def _find_latitude_and_height(self, across: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return latitude (radians) and height of points less the origin's.
+        """Return latitude (radians) and height of points, minus the origin's.
 
         The points lie `across` metres farther from the earth's axis than the origin, and `along` metres along it. The
-        Jacobian of (r, z) by (lat, h) is a rotation times diag(M + h, 1), M the meridian's radius of curvature, so
-        that a Newton step turns what is left by the latitude and divides its first part by M + h.
+        Jacobian of (r, z) by (latitude, h) is a rotation by the latitude times diag(M + h, 1), with M the meridian's
+        radius of curvature. A Newton step therefore rotates the residual and divides its first part by M + h.
         """
         origin = np.radians(self.latitude)
         radius, above = self._origin
@@ -201,7 +201,7 @@ class LocalPlane(Module):
 
 
 def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
-    """Return an array whose last axes have the lengths `last`, with any axes before them; NaN is missing."""
+    """Return an array whose last axes have the lengths `last`, after any leading axes; NaN stands for missing."""
     try:
         leading_axes = max(np.ndim(value) - len(last), 0)
     except ValueError:  # rows of different lengths, which the check names
@@ -211,9 +211,10 @@ def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
 
 
 def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance r = (N + h) cos lat from the earth's axis, and the height z over the equator's plane (m).
+    """Return the distance r from the earth's axis and the height z above the plane of the equator, in metres.
 
-    z = (N (1 - e^2) + h) sin lat. Latitude in radians; N is the radius of curvature across the meridian.
+    r = (N + h) cos lat and z = (N (1 - e^2) + h) sin lat, with the latitude in radians and N the radius of curvature
+    across the meridian.
     """
     N = SEMI_MAJOR / np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     r = (N + height) * np.cos(latitude)
@@ -243,9 +244,10 @@ def _subtract_on_meridian(
 
 
 def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return a first latitude (radians) by Bowring's formula, from r and z: metres from the axis, and over the equator.
+    """Return an approximate latitude (radians) by Bowring's formula.
 
-    beta: the parametric latitude, estimated from the point's direction.
+    r: metres from the earth's axis. z: metres above the plane of the equator. beta: the parametric latitude, estimated
+    from the point's direction.
     """
     axis_ratio = 1 - FLATTENING  # b / a
     distance = np.hypot(r, z)
@@ -257,10 +259,10 @@ def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
-    """Return the axes east, north, up at points as the rows of matrices (..., 3, 3).
+    """Return the axes east, north and up at points, as the rows of matrices (..., 3, 3).
 
-    Their coordinates are out of the earth's axis in the origin's meridian, east of it, and along the axis. Latitude of
-    the points, and `turn`, their longitude less the origin's, in radians.
+    Their coordinates are: away from the earth's axis in the origin's meridian, east of that meridian, and along the
+    axis. `latitude`: of the points. `turn`: their longitude minus the origin's. Both are in radians.
     """
     c, s, c_turn, s_turn = np.cos(latitude), np.sin(latitude), np.cos(turn), np.sin(turn)
     c, s, c_turn, s_turn = np.broadcast_arrays(c, s, c_turn, s_turn)

@@ -25,12 +25,12 @@ def constant_velocity(
 ) -> LinearPlant:
     """Return the plant of a nearly constant velocity on each axis: dv = dW.
 
-    States of each axis: its position and "AXIS_velocity" ("velocity" of the axis "position"). Over a step Q is
-    q [[dt^3/3, dt^2/2], [dt^2/2, dt]].
+    Each axis has the states AXIS (its position) and "AXIS_velocity"; for the axis "position" it is "velocity". Over a
+    step, Q of an axis is q [[dt^3/3, dt^2/2], [dt^2/2, dt]].
 
     Args:
         intensity: q, the variance that a velocity gains in a unit of time.
-        dt: length of every step; by default the input "dt" says it.
+        dt: length of every step; by default it is the input "dt".
         axes: names of the positions, or a mapping of them to units; "position" by default.
         initial_mean: mean before the first step (n,); zero by default.
         initial_covariance: its covariance; by default a variance of 1e8 of each state: nothing is known.
@@ -52,11 +52,11 @@ def constant_acceleration(
 ) -> LinearPlant:
     """Return the plant of a nearly constant acceleration on each axis: da = dW.
 
-    States of each axis: its position, "AXIS_velocity" and "AXIS_acceleration".
+    Each axis has the states AXIS (its position), "AXIS_velocity" and "AXIS_acceleration".
 
     Args:
         intensity: variance that an acceleration gains in a unit of time.
-        dt: length of every step; by default the input "dt" says it.
+        dt: length of every step; by default it is the input "dt".
         axes: names of the positions, or a mapping of them to units; "position" by default.
         initial_mean: mean before the first step (n,); zero by default.
         initial_covariance: its covariance; by default a variance of 1e8 of each state: nothing is known.
@@ -115,9 +115,9 @@ def gauss_markov(
     The autocovariance over a time t is deviation^2 exp(-|t| / T).
 
     Args:
-        deviation: standard deviation of each, at all times.
-        time: T, in which each is forgotten to 1/e.
-        dt: length of every step; by default the input "dt" says it.
+        deviation: standard deviation of each process, at all times.
+        time: T, after which the autocorrelation is 1/e.
+        dt: length of every step; by default it is the input "dt".
         states: names of the processes, or a mapping of them to units; "x" by default.
 
     Raises:
@@ -193,9 +193,10 @@ def _make_intensity(order: int, value: ArrayLike) -> Any:
 
 
 def _name_states(axes: Sequence[str], order: int) -> list[str]:
-    """Return the names of the states, axis by axis: position, velocity and acceleration, the first `order` of these.
+    """Return the names of the states, axis by axis: the first `order` of position, velocity and acceleration.
 
-    "x", "x_velocity", ...; of the axis "position" the derivatives are called "velocity" and "acceleration" alone.
+    They are "x", "x_velocity" and so on. For the axis "position" the derivatives are only "velocity" and
+    "acceleration".
     """
     names, derivatives = list[str](), ("velocity", "acceleration")[: order - 1]
     for axis in axes:

@@ -63,7 +63,7 @@ class Components:
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     def interval(self, coverage: float = BAND) -> tuple[np.ndarray, np.ndarray]:
-        """Return both ends (steps, m) of the Gaussian interval that holds each with this probability.
+        """Return both ends (steps, m) of the Gaussian interval that holds each component with this probability.
 
         Args:
             coverage: probability inside, above 0 and below 1.
@@ -145,7 +145,7 @@ def components(source: HasMeans | HasMean, weights: Weights) -> Components:
 def _read_weights(name: str, value: ArrayLike, mean: np.ndarray) -> np.ndarray:
     """Return the weights of a combination of states for each row, in the shape of `mean` (..., n).
 
-    Given once (n,) they hold for all rows. `name`: of the combination, for errors.
+    Weights (n,) hold for all rows. `name`: the name of the combination, for errors.
     """
     is_given_by_row = np.ndim(value) > 1
     shape = mean.shape if is_given_by_row else mean.shape[-1:]

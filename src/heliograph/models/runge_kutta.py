@@ -38,7 +38,7 @@ class RungeKuttaStep(DriftAndStepLength):
         h = dt / self.substeps
 
         def take_substep(_: object, x: jax.Array) -> jax.Array:
-            """Return the state x after one shorter step of length h: Runge and Kutta's fourth order, inputs held."""
+            """Return the state x after a shorter step of length h, by the fourth-order Runge-Kutta rule."""
             k1 = as_real(self.drift(x, inputs))
             k2 = as_real(self.drift(x + h / 2 * k1, inputs))
             k3 = as_real(self.drift(x + h / 2 * k2, inputs))
@@ -59,9 +59,9 @@ class LinearizedNoise(DriftAndStepLength):
     state: Array
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the noise covariance Q (n, n) of a step, by the drift's Jacobian at the fixed state `self.state`.
+        """Return the noise covariance Q (n, n) of a step, from the drift's Jacobian at the fixed state `self.state`.
 
-        The inputs u are those of the drift and, where no number is given, the step's length.
+        u holds the inputs of the drift, and the step's length if no number was given for it.
         """
         inputs_of_drift, dt = self.split(u)
         jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, inputs_of_drift)))(jnp.asarray(self.state))

@@ -38,7 +38,8 @@ class SumOfComponents(Module):
     def rows(self, u: Any) -> Any:
         """Return the weights of the states (..., n) under inputs u (..., inputs).
 
-        A state whose place is not None is weighed also by the input at that place, as a regression's coefficient is.
+        A state's weight is multiplied by the input at its place in `self.places`, as for a coefficient of a regression.
+        If the place is None, it is not.
         """
         xp = library(u) if not isinstance(u, jax.Array) else jnp
         one = xp.ones(u.shape[:-1])

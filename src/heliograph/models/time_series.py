@@ -55,14 +55,14 @@ def level(
     initial_variance: "Float[ArrayLike, ''] | DiffuseStart" = WIDE,
     name: str = "level",
 ) -> Component:
-    """Return a level that wanders: a random walk, the local level model.
+    """Return a level that follows a random walk, as in the local level model.
 
     Args:
-        variance: of a step of the level; 0 for a constant.
-        initial_mean: before the first step; 0 by default.
-        initial_variance: of that, or `hg.diffuse` where nobody knows it; 1e8 by default: give more where data are
+        variance: variance of a step of the level; 0 for a constant.
+        initial_mean: mean before the first step; 0 by default.
+        initial_variance: its variance, or `hg.diffuse` if it is unknown; 1e8 by default, so give more if data are
             larger than 1,000.
-        name: of the component and its state; "level" by default.
+        name: name of the component and of its state; "level" by default.
 
     Raises:
         ValueError: a negative variance.
@@ -195,15 +195,15 @@ def cycle(
     variance: "Float[ArrayLike, '']",
     name: str = "cycle",
 ) -> Component:
-    """Return a stochastic cycle: a wave that is damped, and kept going by noise; stationary from the start.
+    """Return a stochastic cycle: a damped wave that noise keeps going, stationary from the start.
 
-    It has variance / (1 - damping^2) at all times. States: NAME and "NAME_shifted".
+    Its variance is variance / (1 - damping^2) at all times. Its states are NAME and "NAME_shifted".
 
     Args:
-        period: steps to a turn, at least 2.
-        damping: factor of each step, from 0 to below 1; of 1 it is a `trigonometric_seasonal` of one harmonic.
-        variance: of the noise in both states.
-        name: of the component; "cycle" by default.
+        period: steps in a turn, at least 2.
+        damping: factor of each step, from 0 to below 1 (at 1 use a `trigonometric_seasonal` of one harmonic).
+        variance: variance of the noise in each of the two states.
+        name: name of the component; "cycle" by default.
 
     Raises:
         ValueError: a period below 2, a damping of 1 or more, a negative variance.
@@ -290,32 +290,32 @@ def regression(
 
 
 def stationary(x: "Float[ArrayLike, ' p']") -> Any:
-    """Return the coefficients of a stationary autoregression, any of which comes of just one x of real numbers.
+    """Return the coefficients of a stationary autoregression from real numbers x, one to one.
 
-    The partial autocorrelations are x / sqrt(1 + x^2); Durbin and Levinson's recursion makes coefficients of them. With
-    the opposite sign they are coefficients of an invertible moving average.
+    The partial autocorrelations are x / sqrt(1 + x^2), and Durbin and Levinson's recursion makes coefficients of them.
+    With the opposite sign they are coefficients of an invertible moving average.
 
     Args:
         x: any numbers (p,), such as free ones of a fit.
 
     Raises:
-        ValueError: what are no numbers.
+        ValueError: x is no array of numbers.
 
     Source: Monahan, A note on enforcing stationarity in autoregressive-moving average models (1984).
     """
     numbers = array("x", x, (None,))
     xp = library(numbers)
     partial = numbers / xp.sqrt(1 + numbers**2)
-    coefficients = partial[:0]  # of the order 0: none
+    coefficients = partial[:0]  # order 0 has no coefficients
     for k in range(len(partial)):
         coefficients = xp.concatenate([coefficients - partial[k] * coefficients[::-1], partial[k : k + 1]])
     return coefficients
 
 
 def stationary_covariance(matrix: Any, noise: Any) -> Any:
-    """Return the stationary covariance P = F P F' + Q (F: `matrix`, Q: `noise`), by linear equations for its entries.
+    """Return the stationary covariance P = F P F' + Q, with F = `matrix` and Q = `noise`.
 
-    (I - F kron F) vec P = vec Q.
+    It solves the linear equations (I - F kron F) vec P = vec Q.
     """
     xp, n = library(matrix, noise), len(matrix)
     equations = np.eye(n * n) - xp.kron(matrix, matrix)
@@ -330,7 +330,7 @@ def _read_initial_variance(variance: "ArrayLike | DiffuseStart") -> Any:
 
 
 def _make_rotation(angle: Any) -> Any:
-    """Return the matrix (2, 2) that turns a wave's pair of states by an angle in a step."""
+    """Return the matrix (2, 2) that turns a wave's pair of states by an angle."""
     xp = library(angle)
     c, s = xp.cos(angle), xp.sin(angle)
     return xp.stack([xp.stack([c, s]), xp.stack([-s, c])])

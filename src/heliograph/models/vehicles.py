@@ -70,9 +70,9 @@ class ArcMotion(StepLength):
     wheelbase: Any
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return (x, y, heading) after a step: the chord of the arc, in the direction half way of the turn.
+        """Return (x, y, heading) after a step along an arc: its chord points in the direction halfway through the turn.
 
-        u: speed, then the turn rate, or with a wheelbase the steering angle (radians).
+        u: the speed, and the turn rate, or with a wheelbase the steering angle (radians).
         """
         dt, speed = self.length(u), u[0]
         rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
@@ -94,9 +94,9 @@ class NoiseTimesStep(StepLength):
 
 
 def sine_ratio(angle: jax.Array) -> jax.Array:
-    """Return sin(a) / a, 1 at 0; below NEAR, a small angle in radians, by its series."""
+    """Return sin(a) / a for an angle in radians, which is 1 at 0; below NEAR it comes from the series 1 - a^2 / 6."""
     is_small = jnp.abs(angle) < NEAR
-    safe_angle = jnp.where(is_small, 1.0, angle)  # so that the quotient that is not taken has derivatives, too
+    safe_angle = jnp.where(is_small, 1.0, angle)  # the quotient that is not taken must have finite derivatives too
     return jnp.where(is_small, 1 - angle**2 / 6, jnp.sin(safe_angle) / safe_angle)
 
 
@@ -149,14 +149,14 @@ def unicycle(
 ) -> Plant:
     """Return the plant of a vehicle that drives at a given "speed" and "turn_rate": an arc of a circle each step.
 
-    States: "x", "y" and the angle "heading" (circular), 0 along the first axis. Inputs: "speed", "turn_rate" in radians
-    in a unit of time, and "dt" unless given; both are held over the step.
+    The states are "x", "y" and the angle "heading" (circular), which is 0 along the first axis. The inputs are "speed",
+    "turn_rate" in radians in a unit of time, and "dt" unless given; speed and rate are held over the step.
 
     Args:
         intensity: S of Q = S dt, the covariance that (x, y, heading) gain in a unit of time, (3, 3).
         initial_mean: mean before the first step (3,).
         initial_covariance: its covariance, or the law of its deviation.
-        dt: length of every step; by default the input "dt" says it.
+        dt: length of every step; by default it is the input "dt".
         axes: names of both positions; "x" and "y" by default.
 
     Raises:
@@ -185,7 +185,7 @@ def bicycle(
         intensity: S of Q = S dt, the covariance that (x, y, heading) gain in a unit of time, (3, 3).
         initial_mean: mean before the first step (3,).
         initial_covariance: its covariance, or the law of its deviation.
-        dt: length of every step; by default the input "dt" says it.
+        dt: length of every step; by default it is the input "dt".
         axes: names of both positions; "x" and "y" by default.
 
     Raises:

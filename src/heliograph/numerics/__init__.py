@@ -4,7 +4,7 @@
 def __getattr__(name: str) -> object:
     """Load a name that other folders take; nothing is imported before, as in `heliograph` itself.
 
-    Called of the first such name only: then the functions of `lazy_names` take this one's place.
+    It is called only for the first such name. Then the functions of `lazy_names` replace it.
     """
     from heliograph.numerics.lazy_exports import lazy_names
 

@@ -17,7 +17,7 @@ Angles = tuple[int, ...]  # which components are angles
 
 
 def read_angles(name: str, circular: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return those of a model's `names`, in their order, that a user listed as `circular`, checked.
+    """Return the names that a user listed as `circular`, checked, in the order of the model's `names`.
 
     Args:
         name: what an error calls the list.
@@ -32,7 +32,7 @@ def read_angles(name: str, circular: Sequence[str], names: Sequence[str]) -> tup
 
 
 def angles_at(angles: object, size: int) -> Angles:
-    """Return the indices of angles among `size` components, from a user's list of them; ValueError of other numbers."""
+    """Return the indices of angles among `size` components from a user's list; raise ValueError for other numbers."""
     indices = array("angles", items("angles", angles, "places"), (None,)).tolist()
     if not set(indices) <= set(range(size)):
         raise fail("angles", f"places from 0 to {size - 1}", indices)
@@ -40,9 +40,9 @@ def angles_at(angles: object, size: int) -> Angles:
 
 
 def wrap_near(value: A, reference: Array, angles: Angles) -> A:
-    """Return the angles (..., n) with full turns removed, so that they lie within half a turn of `reference` (..., n).
+    """Return the angles (..., n) changed by full turns so that they lie within half a turn of `reference` (..., n).
 
-    Components that are no angles are unchanged.
+    Components that are not angles are unchanged.
     """
     if not angles:
         return value
@@ -61,11 +61,12 @@ def wrap_angles(value: A, angles: Angles) -> A:
 def continue_angles(
     function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, angles: Angles
 ) -> Callable[[jax.Array], jax.Array]:
-    """Return the function with its angular results continued from `center`, so that no jump is taken for a change.
+    """Return the function with its angular results continued from `center`, so that no jump counts as a change.
 
-    f(x) is taken near f(center) + D (x - center), where D is the Jacobian of resulting angles by given angles, rounded
-    to whole turns. So an angle that follows a given one makes any number of turns with it, and every other angle is
-    taken within half a turn of its value at the center. `given` are the places of angles in x, `angles` those in f(x).
+    f(x) is taken near f(center) + D (x - center). D is the Jacobian of resulting angles by given angles, rounded to
+    whole turns. An angle that follows a given angle thus makes any number of turns with it, and every other angle is
+    taken within half a turn of its value at the center. `given`: places of angles in x. `angles`: places of angles in
+    f(x).
     """
     if not angles:
         return function
@@ -79,9 +80,9 @@ def continue_angles(
 
 
 def find_wraps(values: Array, most: float) -> np.ndarray:
-    """Return before which rows an angle goes around: from near pi to near -pi, or back.
+    """Return the rows before which an angle wraps around: from near pi to near -pi, or back.
 
-    Values (time,) that never leave +-`most`, and of which two in a row are further apart than pi, are such an angle's.
+    Values (time,) count as such an angle if they never leave +-`most`, and some neighbours are more than pi apart.
     """
     values = np.asarray(values)
     jumps = np.flatnonzero(np.abs(np.diff(values)) > TURN / 2) + 1

@@ -51,15 +51,15 @@ def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concat
 
 
 def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
-    """Return the function with what it makes of an object shared by all who ask, as long as one of them holds it.
+    """Return the function with its result for an object shared by all callers, as long as one of them holds it.
 
-    What is made must hold the object, whose identity is the key: so the identity is not given to another meanwhile.
+    The result must hold the object. Its identity is the key, which is then not given to another object meanwhile.
     """
     in_use: WeakValueDictionary[int, T] = WeakValueDictionary()
 
     @wraps(make, updated=())
     def share_or_make(source: S) -> T:
-        """Return what was made of this object and is still in use (somebody holds it), else make it."""
+        """Return the result for this object if somebody still holds it, else make it."""
         result = in_use.get(id(source))
         if result is None:
             result = in_use[id(source)] = make(source)
@@ -69,11 +69,11 @@ def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
 
 
 def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function of hashable arguments with its results, NumPy arrays, cached, and copied at each call.
+    """Return a function of hashable arguments whose results, NumPy arrays, are cached and copied at each call.
 
-    Without the copy, JAX converts an array that a trace closes over to the precision of that trace once for all traces:
-    after one in single precision the same array is single in a double one, or an index of another type than the length
-    it meets.
+    The copy is needed because JAX converts an array that a trace closes over once for all traces, to the precision of
+    the first. After a trace in single precision, the same array would be single in a double one, or an index of the
+    wrong type.
     """
     cached = cast(Callable[P, T], cache(function))
 

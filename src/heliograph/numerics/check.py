@@ -34,14 +34,14 @@ class DomainReportingArray(np.ndarray):
 
 
 def mark_checked(value: object, report: Callable[[str, Domain], None]) -> DomainReportingArray:
-    """Return a copy of an array that calls `report(name, domain)`, the numbers it may hold, when it is checked."""
+    """Return a copy of an array that calls `report(name, domain)` when it is checked, with the numbers it may hold."""
     copy = np.array(value, dtype=np.float64).view(DomainReportingArray)
     copy.report = report
     return copy
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
-    """Tell an array marked by `mark_checked` what numbers it may hold: `whole`, or `entry` of an entry of a list."""
+    """Tell an array marked by `mark_checked` what numbers it may hold: `whole`, or `entry` if it is in a list."""
     if isinstance(value, DomainReportingArray):
         if value.report is not None:
             value.report(name, whole)
@@ -52,7 +52,7 @@ def report_domain(name: str, value: object, whole: Domain, entry: Domain | None 
 
 
 def report_covariance(name: str, value: object) -> None:
-    """Tell an array marked by `mark_checked` that it is a covariance or variance; in rows, one on the diagonal."""
+    """Tell an array marked by `mark_checked` that it is a covariance or variance (in rows, on the diagonal)."""
     if isinstance(value, DomainReportingArray):
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):
@@ -84,7 +84,7 @@ def show_value(value: object) -> str:
 
 
 def error_text(error: Exception) -> str:
-    """Return an error of a user's function in 120 characters at most; where JAX cannot trace it, what to write."""
+    """Return a user function's error in at most 120 characters, or what to write instead if JAX cannot trace it."""
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return "one that decides by a value: write jnp.where"
     for raised in (error, error.__cause__):
@@ -98,10 +98,8 @@ def error_text(error: Exception) -> str:
 def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
     """Return `value` as a float64 array of the given shape, NaN where it is masked; a traced one keeps its precision.
 
-    A length in the shape may be any: None, or a name by which an error calls it.
-
-    Numbers must be real and finite; `missing` lets NaN pass, as a number that did not arrive. Of what is traced the
-    shape alone is checked.
+    A length in the shape is free if it is None, or a name for errors. Numbers must be real and finite; with `missing`
+    they may be NaN, for a number that did not arrive. Of a traced array only the shape is checked.
     """
     report_domain(name, value, REAL)
     return check_numbers(name, _read_numbers(name, value), shape, missing)
@@ -126,7 +124,7 @@ def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], 
 
 
 def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str:
-    """Return a shape in words, with an example of a table where something else came."""
+    """Return a shape in words, with an example if an array of fewer dimensions came."""
     if shape == (None,):
         return "a list of numbers, such as [1, 0]"
     words = ("rows", "columns") if len(shape) == 2 else ("any",) * len(shape)  # for lengths that are free
@@ -136,9 +134,9 @@ def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str
 
 
 def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
-    """Raise where names of a table's columns contradict an array's: one twice, or just `names` in another order.
+    """Raise ValueError if a table's column names contradict an array's: one twice, or just `names` in another order.
 
-    Names are texts; an array, or a table whose columns have numbers, has none.
+    Only texts count as names. An array, or a table whose columns have numbers, has none.
     """
     columns: Any = getattr(table, "columns", None)
     is_table = columns is not None and not callable(columns)
@@ -172,7 +170,7 @@ def _read_numbers(name: str, value: ArrayLike) -> Any:
 
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
-    """Return `value` as a finite scalar from `low` to `high`, which a traced one may exceed; no True or False."""
+    """Return `value` as a finite scalar from `low` to `high`; it may be traced and unchecked, but not True or False."""
     if isinstance(value, bool | np.bool_):
         raise fail(name, _describe_range(low, high), show_value(value))
     report_domain(name, value, Domain(low=low, high=high))
@@ -190,7 +188,7 @@ def _describe_range(low: float, high: float) -> str:
 
 
 def items(name: str, value: object, what: str) -> list[Any]:
-    """Return the items of a list, a tuple or another iterable, or raise; so of text, dictionaries and sets."""
+    """Return the items of a list, tuple or other iterable; raise ValueError for others, texts, mappings and sets."""
     try:
         if isinstance(value, str | bytes | Mapping | AbstractSet):
             raise TypeError
@@ -200,14 +198,14 @@ def items(name: str, value: object, what: str) -> list[Any]:
 
 
 def table(name: str, value: object, what: str) -> dict[str, Any]:
-    """Return a copy of a dictionary whose keys are names, or raise: expected a dictionary of `what`."""
+    """Return a copy of a dictionary whose keys are names; raise ValueError, expecting one of `what`, for others."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise fail(name, f"a dictionary of {what} by name", show_value(value))
     return dict(value)
 
 
 def spread_over_names(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: str = "node") -> list[T]:
-    """Return one value for each of `names`, from a value for all of them or a dictionary with just these keys."""
+    """Return one value for each of `names`, from one value for all of them or a dictionary with exactly these keys."""
     if not isinstance(value, Mapping):
         return [value] * len(names)
     if set(value) != set(names):
@@ -216,14 +214,14 @@ def spread_over_names(name: str, value: T | Mapping[str, T], names: Sequence[str
 
 
 def instance(name: str, value: object, kind: type[T], what: str) -> T:
-    """Return a value that is an object of class `kind`, or raise: expected `what`."""
+    """Return the value if it is an object of class `kind`; raise ValueError, with `what` was expected, if not."""
     if not isinstance(value, kind):
         raise fail(name, what, show_value(value))
     return value
 
 
 def function(name: str, value: object, of: str) -> Any:
-    """Return a value that can be called, or raise: expected a function of `of`."""
+    """Return the value if it can be called; raise ValueError, which expects a function of `of`, if not."""
     if not callable(value):
         raise fail(name, f"a function of {of}", show_value(value))
     return value
@@ -236,14 +234,14 @@ def check_progress(value: object, of: str) -> None:
 
 
 def file_path(name: str, value: object) -> Path:
-    """Return a value as the path of a file or folder, or raise."""
+    """Return a value as the path of a file or folder; raise ValueError for anything else."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
         raise fail(name, "a path", show_value(value))
     return Path(value)
 
 
 def rank(name: str, value: object) -> int:
-    """Return the number of axes of what may become an array, or raise."""
+    """Return the number of axes of what may become an array; raise ValueError for anything else."""
     try:
         return np.ndim(cast(ArrayLike, value))
     except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
@@ -251,7 +249,7 @@ def rank(name: str, value: object) -> int:
 
 
 def flag(name: str, value: object) -> bool:
-    """Return a value that is True or False, or raise."""
+    """Return a value that is True or False; raise ValueError for anything else."""
     if not isinstance(value, bool | np.bool_):
         raise fail(name, "True or False", show_value(value))
     return bool(value)
@@ -274,7 +272,7 @@ def is_whole(value: object) -> TypeGuard[int | np.integer]:
 
 
 def check_count(name: str, value: object, least: int = 1) -> int:
-    """Return a whole number from `least` to MOST (2^32 - 1): an int or one of NumPy's, no float and no bool."""
+    """Return a whole number from `least` to MOST (2^32 - 1), an int or NumPy's; raise ValueError for others."""
     if not is_whole(value) or value < least:
         expected = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
         raise fail(name, expected, value if isinstance(value, int | float) else show_value(value))
@@ -284,14 +282,14 @@ def check_count(name: str, value: object, least: int = 1) -> int:
 
 
 def check_seed(name: str, value: object) -> int:
-    """Return a whole number from 0 to MOST, 2^32 - 1, or raise: keys of draws are made of 32 bits of it."""
+    """Return a whole number from 0 to MOST (2^32 - 1), the 32 bits of a seed; raise ValueError for others."""
     if not is_whole(value) or not 0 <= value <= MOST:
         raise fail(name, f"a whole number from 0 to {MOST}", show_value(value))
     return int(value)
 
 
 def check_horizon(value: object, covered: int | None = None) -> int:
-    """Return a number of steps, no more than the `covered` ones that something varying has; None: nothing varies."""
+    """Return a number of steps, at most the `covered` steps of something that varies (None: nothing varies)."""
     horizon = check_count("horizon", value)
     if covered is not None and horizon > covered:
         raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
@@ -336,17 +334,17 @@ def is_diagonal(matrix: np.ndarray) -> bool:
 def standard_deviations(matrix: np.ndarray) -> np.ndarray:
     """Return standard deviations (..., n) of covariances (..., n, n), by which a matrix is judged in any units.
 
-    A component of variance zero has the least deviation that its off-diagonal entries allow, 1 if all are zero.
+    A component of variance zero gets the least deviation that its off-diagonal entries allow, or 1 if all are zero.
     """
     deviations = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
-    divisors = np.where(deviations > 0, deviations, np.inf)  # an entry over inf is 0, and allows any deviation
+    divisors = np.where(deviations > 0, deviations, np.inf)  # an entry divided by inf is 0, which allows any deviation
     least_allowed = np.max(np.abs(matrix) / divisors[..., None, :], axis=-1, initial=0.0)
     of_zero_variance = np.where(least_allowed > 0, least_allowed, 1.0)
     return np.asarray(np.where(deviations > 0, deviations, of_zero_variance))
 
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
-    """Return non-negative numbers (count,) that sum to one, to PROBABILITY_TOLERANCE, or raise; traced ones unasked."""
+    """Return non-negative numbers (count,) that sum to 1 within PROBABILITY_TOLERANCE; traced ones are not checked."""
     report_domain(name, value, SIMPLEX, PROBABILITY)
     chances = array(name, value, (count,))
     if is_traced(chances):
@@ -361,8 +359,8 @@ def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
 def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
     """Return the radius of each uncertain probability; a scalar is the same radius for each.
 
-    A radius, by which p may be wrong, above max(p, 1 - p) is refused: p could not move so far. The extremes that it
-    leaves are read off the numbers, so that neither it nor, where it is positive, p (`nominal`) can be traced.
+    A radius is how far p (`nominal`) may be off. Above max(p, 1 - p) it is refused, since p cannot move so far. It
+    cannot be traced, nor can p with a positive radius, since the extreme laws are found from the numbers.
     """
     numbers = _read_numbers(name, value)
     if is_traced(numbers):
@@ -379,7 +377,7 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
 
 
 def name_list(name: str, value: Names) -> list[str]:
-    """Return names as a list, none of them blank; of a mapping (name to unit) its keys, each marked with its unit."""
+    """Return names as a list, none of them blank; a mapping {name: unit} gives names that carry their units."""
     names: list[str]
     if isinstance(value, Mapping):
         names = [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
@@ -391,7 +389,7 @@ def name_list(name: str, value: Names) -> list[str]:
 
 
 def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str, ...]:
-    """Return `count` distinct names; of None prefix0, prefix1, ...; of a mapping (name to unit) its keys with units."""
+    """Return `count` distinct names: those given (those of {name: unit} carry units), or prefix0, ... for None."""
     if value is None:
         return tuple(f"{prefix}{i}" for i in range(count))
     distinct = tuple(name_list(name, value))

@@ -32,7 +32,7 @@ class Compensated(NamedTuple):
 
 
 def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
-    """Return fl(a + b), the rounded sum, and its rounding error a + b - fl(a + b), whichever of a and b is larger.
+    """Return the rounded sum fl(a + b) and its rounding error a + b - fl(a + b); either of a and b may be larger.
 
     Source: Knuth, The art of computer programming, volume 2, theorem B of section 4.2.2.
     """
@@ -43,10 +43,10 @@ def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
 
 
 def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Callable[[Compensated], Compensated]:
-    """Return x -> f(high + low) of a JAX function f of one array, compensated: its low part is what rounding loses.
+    """Return x -> f(high + low) for a JAX function f of one array; the result's low part is what rounding loses.
 
-    Loops hand on what was lost before them, and their own roundings stay. Where a low part is no number, as behind the
-    derivative of a root at 0, it is 0.
+    Loops pass on what was lost before them, but their own rounding errors stay. A low part that is not finite, as after
+    the derivative of a root at 0, becomes 0.
 
     Args:
         function: f, of operations with derivatives.
@@ -54,9 +54,9 @@ def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Calla
     """
 
     def evaluate(x: Compensated) -> Compensated:
-        """Return f(high + low) as high + low, with low 0 where it is no number, or where nothing was lost (None).
+        """Return f(high + low) as high + low; the low part is 0 if it is not finite, or if nothing was lost (None).
 
-        f is `function`, evaluated operation by operation, in a precision of rounding `unit`.
+        f is `function`, evaluated operation by operation in a precision with rounding `unit`.
         """
         program = jax.make_jaxpr(function)(x.high)
         result = _CompensatedEvaluation(unit).evaluate_program(program, [x])[0]
@@ -70,9 +70,9 @@ class _CompensatedEvaluation:
     """Evaluation of a traced program in numbers that are high + low."""
 
     def __init__(self, unit: float):
-        """Choose splitter, type and operations for numbers of the rounding `unit`, 2^-53 of doubles."""
-        bits = 1 - round(np.log2(unit))  # of a number's fraction: 24 of single precision, 53 of double
-        self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # times which a number is split into halves of its digits
+        """Choose splitter, type and rules for a precision with rounding `unit`, which is 2^-53 for doubles."""
+        bits = 1 - round(np.log2(unit))  # bits of a number's fraction
+        self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # factor that splits a number into halves of its digits
         self.stored = np.float32 if bits <= 24 else np.float64
         self.rules: dict[str, Callable[..., Compensated]] = {
             "add": self._add, "add_any": self._add, "sub": self._subtract, "mul": self._multiply, "div": self._divide,
@@ -81,7 +81,7 @@ class _CompensatedEvaluation:
         }  # fmt: skip
 
     def evaluate_program(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
-        """Return the results of a traced program, each with what rounding lost, operation by operation."""
+        """Return the results of a traced program, each with what rounding lost, evaluated operation by operation."""
         jaxpr, known = program.jaxpr, map(self._split_known, program.consts)
         values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
@@ -96,7 +96,7 @@ class _CompensatedEvaluation:
         return list(map(look_up, jaxpr.outvars))
 
     def _split_known(self, number: Any) -> Compensated:
-        """Split a known real number into what the precision holds of it and the rest; others have no rest (None)."""
+        """Split a known real number into what the precision can hold and the rest; anything else has no rest (None)."""
         if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
             return Compensated(number)
         exact = np.asarray(number, np.float64)
@@ -105,7 +105,7 @@ class _CompensatedEvaluation:
         return Compensated(high, low if np.any(low) else None)
 
     def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
-        """Return the results of one operation f; of one without a rule in `rules`, f(high) + f'(high) low.
+        """Return the results of one operation f; without a rule in `self.rules` it is f(high) + f'(high) low.
 
         A call of a program and a branch are evaluated inside.
         """
@@ -123,7 +123,7 @@ class _CompensatedEvaluation:
         """Take one of several programs, each evaluated so."""
 
         def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
-            """Return its results; each real one gets a low part, be it 0, as all branches need the same structure."""
+            """Return a branch's results; each real one gets a low part, even 0, as all branches need one structure."""
             results = self.evaluate_program(branch, given)
             are_real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
             return [
@@ -152,9 +152,9 @@ class _CompensatedEvaluation:
         return Compensated(a.high * b.high, _sum_terms_present(self._find_product_error(a.high, b.high), *lost))
 
     def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
-        """Return q = fl(a / b) and its low part: the remainder a - q b, with the low parts of a and b, over b.
+        """Return q = fl(a / b) and its low part (a_high - q b_high + a_low - q b_low) / b_high.
 
-        The product q b is rounded, too: its error is taken off.
+        The product q b_high is rounded too, so that its rounding error is subtracted.
         """
         quotient = a.high / b.high
         rounded_product = quotient * b.high
@@ -163,7 +163,7 @@ class _CompensatedEvaluation:
         return Compensated(quotient, _sum_terms_present(remainder, a.low, by_low_of_b) / b.high)
 
     def _take_root(self, a: Compensated, **_: Any) -> Compensated:
-        """Return r = fl(sqrt(a)) and its low part: the remainder a - r^2, with the low part of a, over 2 r."""
+        """Return r = fl(sqrt(a_high)) and its low part (a_high - r^2 + a_low) / (2 r)."""
         root = jnp.sqrt(a.high)
         remainder = (a.high - root * root) - _or_zero(self._find_product_error(root, root))
         return Compensated(root, _sum_terms_present(remainder, a.low) / (2 * root))
@@ -173,7 +173,7 @@ class _CompensatedEvaluation:
         return self._multiply(a, a)
 
     def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
-        """Return a^y as y - 1 products; the reciprocal of a^-y for y < 0, 1 for y = 0."""
+        """Return a^y as y - 1 products; for y < 0 it is the reciprocal of a^-y, and for y = 0 it is 1."""
         if y == 0:
             return _one_like(a)
         if y < 0:
@@ -181,14 +181,14 @@ class _CompensatedEvaluation:
         return reduce(self._multiply, [a] * y)
 
     def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
-        """Add the entries along axes, one after another, with what rounding loses; of no entries the sum is 0."""
+        """Return the sum of the entries along axes, added one by one, with what rounding loses; no entries give 0."""
         for axis in sorted(axes, reverse=True):
             entries = _split_along_axis(a, axis)
             a = reduce(self._add, entries) if entries else Compensated(jnp.sum(a.high, axis=axis))
         return a
 
     def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
-        """Return the running sums along an axis, from its first entry on or from its last, with what rounding loses."""
+        """Return the running sums along an axis, from its first or (`reverse`) last entry, with what rounding loses."""
         sums = _split_along_axis(a, axis)  # the entries at first
         if reverse:
             for i in reversed(range(len(sums) - 1)):
@@ -218,9 +218,9 @@ class _CompensatedEvaluation:
         return Compensated(*(None if part is None else jnp.reshape(part, shape) for part in total))
 
     def _find_product_error(self, a: Any, b: Any) -> Any:
-        """Return a b - fl(a b), the rounding error of a product; None where it is exact: one is 0 or a power of two.
+        """Return the rounding error a b - fl(a b) of a product; None if it is exact as a or b is 0 or a power of two.
 
-        The halves of the numbers' digits have exact products, so only fl(a b) is rounded.
+        Products of halves of the digits are exact, so that the error is a1 b1 - fl(a b) + a1 b2 + a2 b1 + a2 b2.
         """
         if _scales_without_rounding(a) or _scales_without_rounding(b):
             return None
@@ -228,9 +228,9 @@ class _CompensatedEvaluation:
         return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
 
     def _split_digits_in_halves(self, a: Any) -> tuple[Any, Any]:
-        """Return a as a sum of two numbers of half as many digits: far - (far - a), far = splitter a, and the rest.
+        """Return a as a sum of two numbers with half its digits: far - (far - a) with far = splitter a, and the rest.
 
-        Known numbers are split by NumPy in the precision of the program, and kept in double.
+        NumPy splits known numbers in the precision of the program and keeps them as doubles.
 
         Source: Dekker, A floating-point technique for extending the available precision (1971).
         """
@@ -265,7 +265,7 @@ def _apply_to_first_order(
     with_low = [i for i, x in enumerate(inputs) if x.low is not None]
 
     def call_with(*values: Any) -> Any:
-        """Return f (`function`) of the high parts, with these values in place of those that have a low part."""
+        """Return f (`function`) of the high parts, with `values` in place of the inputs that have a low part."""
         arguments = [x.high for x in inputs]
         for i, value in zip(with_low, values, strict=True):
             arguments[i] = value
@@ -290,18 +290,18 @@ def _apply_to_first_order(
 
 
 def _scales_without_rounding(a: Any) -> bool:
-    """Return whether a known number multiplies without rounding: each entry is 0 or a power of two.
+    """Return whether a known number multiplies without rounding, because each entry is 0 or a power of two.
 
-    Of JAX's numbers, which may not be known yet, False is returned.
+    For JAX's numbers, which may not be known yet, it is False.
     """
     if isinstance(a, jax.Array | jax.core.Tracer):
         return False
-    mantissa, _ = np.frexp(a)  # from 0.5 to 1, and 0.5 of a power of two
+    mantissa, _ = np.frexp(a)  # from 0.5 to 1; it is 0.5 for a power of two
     return bool(np.all((np.abs(mantissa) == 0.5) | (np.asarray(a) == 0)))
 
 
 def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
-    """Return the entries along an axis, each with its low part, or None if there is none of the whole."""
+    """Return the entries along an axis, each with its own low part, or None if the whole has none."""
     count = jnp.shape(a.high)[axis]
     highs = [_take(a.high, i, axis) for i in range(count)]
     lows = [None if a.low is None else _take(a.low, i, axis) for i in range(count)]
@@ -314,10 +314,10 @@ def _take(x: Any, i: int, axis: int) -> Any:
 
 
 def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int], left: bool) -> Compensated:
-    """Arrange a factor of a matrix product so that the product is their entrywise product, summed over axis 1.
+    """Return a factor of a matrix product, arranged so that the product is an entrywise product summed over axis 1.
 
-    The left factor becomes (batch, summed, rows, 1), the right one (batch, summed, 1, columns). `batch` and `summed`
-    are its axes of these kinds; of each kind the axes become one.
+    The left factor becomes (batch, summed, rows, 1) and the right one (batch, summed, 1, columns). `batch` and `summed`
+    are the factor's axes of these kinds; all axes of a kind become one.
     """
     shape = jnp.shape(a.high)
     others = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]  # rows, or columns

@@ -25,9 +25,9 @@ class Share(NamedTuple):
 
 
 def wilson(hits: float, of: float) -> Share:
-    """Return the share of `hits` k among n (`of`), with Wilson's interval of 95 %; (NaN, 0, 1) of nothing.
+    """Return the share k / n of hits, k = `hits` among n = `of`, with Wilson's 95 % interval; (NaN, 0, 1) if n is 0.
 
-    It holds the p with |k - n p| <= 1.96 sqrt(n p (1 - p)).
+    The interval holds the p with |k - n p| <= 1.96 sqrt(n p (1 - p)).
 
     Source: Wilson, Probable inference (1927).
     """
@@ -37,16 +37,16 @@ def wilson(hits: float, of: float) -> Share:
     p = hits / n
     middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half_width = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    # The ends are exactly 0 of no hits and 1 of hits alone, which rounding would miss.
+    # Without hits the lower end is exactly 0, and with hits only the upper end is exactly 1; rounding would miss this.
     low = 0.0 if hits == 0 else float(middle - half_width)
     high = 1.0 if hits == n else float(middle + half_width)
     return Share(estimate=p, low=low, high=high)
 
 
 def count_independent(values: Float[np.ndarray, " time"]) -> float:
-    """Return how many independent values say as much of the mean: N (1 - a) / (1 + a), a the correlation of neighbours.
+    """Return the number N (1 - a) / (1 + a) of independent values that tell the mean as well as these N values.
 
-    A negative correlation counts as none, so that it is never more than N; nor is it less than 1.
+    a is the correlation of neighbours. A negative one counts as 0, so that the number is at most N. It is at least 1.
     """
     deviations, count = values - np.mean(values), len(values)
     sum_of_squares = float(np.sum(deviations**2))
@@ -65,18 +65,18 @@ def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     count = max(int(is_known.sum()), 1)
     mean = float(values[is_known].sum() / count)
     deviations = np.where(is_known, values - mean, 0.0)
-    # The variance of the sum of all values is sum over t of (1 - |t| / width) sum_k e_k e_(k+t), e the deviations. That
-    # is the sum of the squares of all moving sums of `width` deviations, divided by the width.
+    # The variance of the sum of all values is sum_t (1 - |t| / width) sum_k e_k e_(k+t), with the deviations e. This
+    # equals the sum of squares of all moving sums of `width` deviations, divided by the width.
     width = int(np.ceil(len(values) ** (1 / 3))) + 1
     moving_sums = np.convolve(deviations, np.ones(width))
     return mean, float(np.sqrt(np.mean(moving_sums**2) * (len(moving_sums) / width)) / count)
 
 
 def round_to(value: float, error: float) -> str:
-    """Return a number as text to two digits of its standard error, to four digits where there is no error above 0."""
+    """Return a number as text, to two digits of its standard error, or to four of its own without an error above 0."""
     if not (np.isfinite(value) and 0 < error < np.inf):
         return f"{value:.4g}"
-    decimals = 1 - int(np.floor(np.log10(error)))  # digits behind the point; below 0 tens or hundreds are rounded to
+    decimals = 1 - int(np.floor(np.log10(error)))  # digits after the point; if negative, round to tens or hundreds
     if not -6 <= decimals <= 9:
         return f"{value:.4g}"
     return f"{round(value, decimals):.{max(decimals, 0)}f}"

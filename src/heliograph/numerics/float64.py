@@ -19,9 +19,9 @@ _first: list[int] = []  # the process in which something was computed first; a f
 
 
 def refuse_forked_process() -> None:
-    """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process.
+    """Raise ValueError in a fork of a process that has computed something; otherwise remember this process.
 
-    `_first` holds the id of the first process that came here: a fork inherits it, and JAX's threads it does not.
+    `_first` holds the id of the first process that came here. A fork inherits the id, but not JAX's threads.
     """
     here = os.getpid()
     if not _first:
@@ -84,10 +84,10 @@ def in_haste() -> Options:
 
 @cache
 def understood() -> Options:
-    """Return those of OPTIONS for XLA, the compiler, that this release knows; it does not promise to keep them.
+    """Return those of OPTIONS for the compiler XLA that its present release knows, since releases may drop some.
 
-    LEVEL, the optimisation level, is left out where JAX's flag jax_disable_most_optimizations is set, which it would
-    overrule.
+    LEVEL, the optimisation level, is left out if JAX's flag jax_disable_most_optimizations is set, which it would
+    override.
     """
     has_no_level = jax.config.values["jax_disable_most_optimizations"]
     names = [name for name in OPTIONS if not (has_no_level and name == LEVEL)]
@@ -95,7 +95,7 @@ def understood() -> Options:
 
 
 def _is_understood(name: str) -> bool:
-    """Return whether this version of XLA knows one of OPTIONS, tried by compiling a trivial program with it."""
+    """Return whether this version of XLA knows an entry of OPTIONS, by compiling a trivial program with it."""
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options={name: OPTIONS[name]})()
     except jax.errors.JaxRuntimeError:
@@ -107,7 +107,7 @@ def to_numpy(tree: PyTree) -> PyTree:
     """Return a tree with its known numeric JAX arrays as NumPy arrays; keys and traced values stay as they are."""
 
     def convert(leaf: object) -> object:
-        """Return one leaf: a known array of numbers as NumPy's, anything else (a traced one, random keys) as it is."""
+        """Return a leaf as a NumPy array if it is a known array of numbers; a traced one or random keys as they are."""
         if isinstance(leaf, jax.core.Tracer) or not isinstance(leaf, jax.Array):
             return leaf
         holds_random_keys = jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
@@ -119,8 +119,8 @@ def to_numpy(tree: PyTree) -> PyTree:
 def in_float64(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function, run in double precision (JAX's float64 scope), with NumPy arrays as its results.
 
-    Inside a trace it changes nothing, so that the same object can be called by a user and by a compiled scan (which may
-    have chosen single precision).
+    Inside a trace it changes nothing. The same object can thus be called by a user and by a compiled scan, which may
+    have chosen single precision.
 
     Args:
         function: of arrays or model objects; its results too.
@@ -140,14 +140,14 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
-    """Let these methods and properties of a user's class compute what is known in float64, wherever they are called.
+    """Make these methods and properties of a user's class compute known numbers in float64, wherever they are called.
 
-    A model is described outside of any computation in float64, where a formula in jax.numpy would give seven digits.
-    The library's own classes use NumPy for numbers that are known, and are left as they are.
+    A model is described outside of any float64 scope, where a formula in jax.numpy would give seven digits. The
+    library's own classes use NumPy for known numbers, and are left as they are.
 
     Args:
         kind: the class, while it is made (`__init_subclass__`).
-        names: methods that return numbers; those that it does not write itself are left out.
+        names: methods that return numbers; those that the class does not define itself are skipped.
     """
     if kind.__module__.split(".")[0] == __name__.split(".")[0]:
         return
@@ -160,9 +160,9 @@ def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
 
 
 def _compute_known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function, computed at once and in double precision where no argument is traced.
+    """Return the function, computed at once and in double precision if no argument is traced.
 
-    Also inside of a trace: what is known is then a number in it, not operations in the trace's precision.
+    Inside a trace, known numbers are then constants in it, rather than operations in the trace's precision.
     """
 
     @wraps(function)
@@ -200,7 +200,11 @@ def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def as_array(leaf: object) -> object:
-    """Return a number as an array, which compiled code takes as an argument; anything else as it is."""
+    """Return a number as an array, which compiled code takes as an argument; anything else as it is.
+
+    Raises:
+        ValueError: texts, and integers too large for a double.
+    """
     value = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
     if isinstance(value, np.ndarray) and value.dtype.kind in "OUS":  # objects (so large integers) and texts
         raise fail("argument", "numbers that a double can hold", show_value(leaf))

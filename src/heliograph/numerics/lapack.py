@@ -14,20 +14,20 @@ A = TypeVar("A", jax.Array, np.ndarray)
 
 
 def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return the eigenvalues and eigenvectors (columns) of a symmetric matrix; of a batch one after another.
+    """Return the eigenvalues and eigenvectors (columns) of a symmetric matrix; a batch is computed one after another.
 
-    JAX deals a batch out to the processor's threads by a call that waits for them on one of them: programs that run
-    side by side on as many threads then wait for each other for ever.
+    JAX would distribute a batch over the processor's threads, by a call that waits for them on one of them. Programs
+    that run side by side on as many threads would then wait for each other for ever.
     """
     values, vectors = _eigh(a)
     return values, vectors
 
 
 def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
-    """Return A^+ B, A^+ the pseudoinverse of a positive semidefinite A, by its correlation matrix; NumPy or JAX.
+    """Return A^+ B with the pseudoinverse A^+ of a positive semidefinite A, by its correlations; for NumPy or JAX.
 
-    So units do not matter. Directions in which the correlations' eigenvalue is below `tolerance` of the largest are
-    skipped, as are rows of zeros.
+    By the correlation matrix, units do not matter. Directions whose eigenvalue is at most `tolerance` times the largest
+    are skipped, as are rows of zeros.
     """
     xp = library(a, b)
     deviation = xp.sqrt(xp.maximum(xp.diagonal(a), 0.0))

@@ -28,7 +28,7 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
     load, list_names, names = lazy_loader.attach_stub(package, file)
 
     def load_attribute(name: str) -> object:
-        """Return the object of a public name, imported; raise with the names most like it where there is none."""
+        """Return the object of a public name, importing it; raise AttributeError, with similar names, for others."""
         if name in names or name.startswith("_"):
             with pause_collector():
                 return load(name)
@@ -40,11 +40,11 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
 def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | None = None) -> NoReturn:
     """Raise AttributeError for a name that an object does not have, with what to write instead.
 
-    That is what stands in `remedies` under the name; else the attributes most like it; else the function of heliograph
-    of this name.
+    That is the entry of `remedies` for the name, or else the most similar attributes, or else the function of
+    heliograph of this name.
     """
     kind = type(owner)
-    if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
+    if name.startswith("_") or hasattr(kind, name):  # a private name, or a property that raised an AttributeError
         object.__getattribute__(owner, name)
     public = {other: other for other in object.__dir__(owner) if not other.startswith("_")}
     remedy = suggest_names(name, public)
@@ -62,10 +62,10 @@ def suggest_names(name: str, known: Mapping[str, str]) -> str:
 
 
 def list_closest_names(name: str, known: Mapping[str, str]) -> list[str]:
-    """Return the values of the `known` names most like a name, MOST at most; capitals and _ count for nothing.
+    """Return the values of the `known` names most similar to a name, at most MOST; capitals and _ do not count.
 
-    First the one that others call so (MEANT), then those alike by their letters (ALIKE is the least likeness of
-    difflib's), then those that contain it.
+    First comes the name that others use for it (MEANT), then names with similar letters (of a likeness of difflib of at
+    least ALIKE), and then names that contain it.
     """
     by_stripped_name: dict[str, str] = {}
     for public_name, shown_name in known.items():
@@ -86,9 +86,10 @@ def _strip_name(name: str) -> str:
 
 
 def _list_public(package: str, names: list[str]) -> dict[str, str]:
-    """Return public names that a user may have meant, each with how it is written: the package's `names` first.
+    """Return public names that a user may have meant, each with how it is written: the package's own `names` first.
 
-    Of heliograph itself (no dot) also those of its rooms (subpackages), as room.name; of a room those of heliograph.
+    For heliograph itself (without a dot), the names of its rooms (subpackages) follow as room.name. For a room, those
+    of heliograph follow.
     """
     known = {name: name for name in names}
     if "." in package:

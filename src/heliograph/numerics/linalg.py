@@ -61,11 +61,11 @@ def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) ->
 
 @jax.jit
 def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return lower L with A = L L' of a positive semidefinite A, and the reciprocals of its diagonal, (n, n) and (n,).
+    """Return lower L (n, n) with A = L L' of a positive semidefinite A, and the reciprocals (n,) of its diagonal.
 
-    Column by column: the first column of what is left of A, times the reciprocal root of its pivot; of a zero column
-    that is 0. A pivot is judged by the component's own diagonal entry: units do not decide what is singular. More than
-    WRITTEN columns are a loop, so that the program stays short.
+    A column of L is the first column of what is left of A, times the reciprocal root of its pivot, or 0 for a zero
+    column. A pivot is judged relative to the component's own diagonal entry, so that units do not decide what is
+    singular. More than WRITTEN columns are computed in a loop, so that the program stays short.
     """
     n, remainder, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
     if not 0 < n <= WRITTEN:
@@ -76,7 +76,7 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
         column = remainder[:, 0] * scales[j]
         columns.append(jnp.concatenate([jnp.zeros(j, a.dtype), column]))
-        # The Schur complement of the pivot.
+        # What is left is the Schur complement of the pivot.
         remainder = remainder[1:, 1:] - outer(column[1:], column[1:])
     return jnp.stack(columns, axis=1), jnp.stack(scales)
 
@@ -86,10 +86,10 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     n, whole = len(a), diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take column j of the factor off what is left of the matrix, and put it and its scale in their places.
+        """Subtract column j of the factor from what is left of the matrix, and put it and its scale in their places.
 
-        `whole` is the matrix's diagonal, by which a pivot is judged, a scale the reciprocal root of a pivot, and
-        `growth` the largest ratio so far of an entry of `whole` to its pivot.
+        `whole`: the matrix's diagonal, by which a pivot is judged. A scale is the reciprocal root of a pivot. `growth`:
+        the largest ratio so far of an entry of `whole` to its pivot.
         """
         remainder, lower, scales, growth = carry
         scale = compute_pivot_reciprocal_root(remainder[j, j], whole[j], growth)
@@ -105,11 +105,11 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: jax.Array) -> jax.Array:
-    """Return 1 / root of a pivot; 0 of one that is zero up to rounding of the `whole` entry, NaN of a negative one.
+    """Return 1 / sqrt(pivot); it is 0 for a pivot that is zero up to rounding, and NaN for a negative one.
 
-    `whole` is the diagonal entry of the matrix, of which the pivot is left. `growth` is the largest ratio of a diagonal
-    entry to its pivot before; dividing by such a pivot multiplies by it what rounding makes of this one, and so how far
-    below zero this one may be by rounding. The root is taken of infinity where nothing is left: of derivative 0.
+    `whole`: the diagonal entry of the matrix of which the pivot is left. `growth`: the largest ratio so far of a
+    diagonal entry to its pivot. Dividing by such a pivot multiplies rounding errors by this ratio, so a pivot may be so
+    far below zero by rounding. For a zero pivot the root is taken of infinity, which makes its derivative 0.
     """
     is_zero_or_more = pivot >= -negative_tolerance(pivot, growth) * whole
     if_not_positive = jnp.where(is_zero_or_more, jnp.inf, jnp.nan)
@@ -151,8 +151,8 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
     lower, scales = factor(jnp.asarray(a))
 
     def solve(b: Array) -> jax.Array:
-        """Return X of A X = B, A = L L'; `scales` are the reciprocals of L's diagonal, 0 for a pivot of zero."""
-        # L Y = B, then L' X = Y. L' is upper; with its rows and columns in reverse order it is lower, as Y and X then
+        """Return X of A X = B with A = L L'; `scales` are the reciprocals of L's diagonal, 0 for a pivot of zero."""
+        # Solve L Y = B, then L' X = Y. With rows and columns in reverse order, the upper L' becomes lower, and Y and X
         # are upside down.
         y = _substitute(lower, scales, jnp.asarray(b)) * scales[:, None]
         reversed_numerators = _substitute(lower.T[::-1, ::-1], scales[::-1], y[::-1])
@@ -195,11 +195,11 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
 def squared_distance_terms(
     a: jax.Array, x: jax.Array, size: Array | float = 0.0, roundings: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the terms (n,) of x' A^-1 x, each of a component given those before it, and which of them these determine.
+    """Return the terms (n,) of x' A^-1 x, of each component given earlier ones, and which of them these determine.
 
-    A is x's covariance. A determined component counts 1 where it agrees with those before it, infinity where not. One
-    whose standard deviation is no more than `roundings` roundings of its `size` (of the numbers whose difference x is)
-    counts as determined, too.
+    A is x's covariance. A determined component counts 1 if it agrees with the earlier ones, and infinity if not. It
+    also counts as determined if its standard deviation is at most `roundings` roundings of `size`, the size of the
+    numbers whose difference x is.
     """
     variance = diagonal(a)
     agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)  # see squared_distance
@@ -220,10 +220,10 @@ def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def find_not_finite(values: np.ndarray, axes: int) -> np.ndarray:
-    """Return which arrays, along the last `axes` axes, have a number that is not finite: flags by the other axes.
+    """Return which arrays, along the last `axes` axes, have a number that is not finite.
 
-    Then the sum of all is not finite either, which takes a third of the time to see. Each number is looked at only if
-    it is not, since the sum may also have overflowed.
+    If all numbers are finite, so is their sum, which takes a third of the time to check. Each number is looked at only
+    if the sum is not finite, since it may also have overflowed.
     """
     with np.errstate(all="ignore"):
         if np.isfinite(np.sum(values)):

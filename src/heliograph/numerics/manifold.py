@@ -42,9 +42,9 @@ class Manifold(NamedTuple):
         return self._replace_rotations(wrap_angles(change, self.angles), turn_between, x, other)
 
     def _replace_rotations(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
-        """Return `whole` (..., n) with each of its rotation vectors replaced by `make` of those of x and y.
+        """Return `whole` (..., n) with each of its rotation vectors replaced by make(that of x, that of y).
 
-        `rotations` are the places of their components, three after three.
+        `self.rotations`: the places of their components, three for each vector.
         """
         for i in range(0, len(self.rotations), 3):
             columns = np.array(self.rotations[i : i + 3])  # of one rotation vector
@@ -62,9 +62,9 @@ class Manifold(NamedTuple):
         return wrap_near(x, reference, self.angles)
 
     def chart(self, function: Callable[[jax.Array], jax.Array], center: jax.Array) -> Callable[[jax.Array], jax.Array]:
-        """Return the function of plain differences from `center`, x -> function(center plus (x - center)).
+        """Return the function x -> function(center plus (x - center)) of plain differences from `center`.
 
-        `plus` adds vectors and turns attitudes: the derivative at x = center is that by the change of the state.
+        `plus` adds vectors and turns attitudes. The derivative at x = center is then that by the change of the state.
         """
         if not self.rotations:
             return function
@@ -73,10 +73,10 @@ class Manifold(NamedTuple):
     def chart_move(
         self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None
     ) -> Any:
-        """Return the motion f of states near `center` as a function of vectors, of which moments can be taken.
+        """Return the motion f of states near `center` as a function of vectors, for which moments can be computed.
 
-        x -> m + (f(center plus (x - center)) difference m), with m the `middle`, f(center) unless given: `plus` and
-        `difference` turn attitudes, + and - are those of vectors. Angles are continued over full turns.
+        It is x -> m + (f(center plus (x - center)) difference m), with m the `middle`, by default f(center). `plus` and
+        `difference` turn attitudes; + and - are those of vectors. Angles are continued over full turns.
         """
         continued = continue_angles(function, center, self.angles, self.angles)
         if not self.rotations:
@@ -94,10 +94,10 @@ class Manifold(NamedTuple):
         return self._replace_rotations(x, lambda r, other: other + turn_between(r, other), x, center)
 
     def reset_jacobian(self, change: jax.Array) -> jax.Array | None:
-        """Return d((x + d) difference x')/dd at d = change, x' = x plus change (n, n): the identity but for attitudes.
+        """Return d((x + d) difference x')/dd at d = change with x' = x plus change (n, n), or None without rotations.
 
-        It turns errors about x into errors about x': its block for a rotation is the right Jacobian. None where there
-        are no rotations, and all is the identity. `plus` and `difference` turn attitudes, + is that of vectors.
+        It turns errors about x into errors about x'. It is the identity except for attitudes, where the block of a
+        rotation is the right Jacobian. `plus` and `difference` turn attitudes; + is that of vectors.
         """
         if not self.rotations:
             return None

@@ -9,8 +9,8 @@ import numpy as np
 def fill_masked(value: Any) -> Any:
     """Return numbers with NaN, or dates with NaT, where they are masked or missing; anything else as it is.
 
-    Masked are entries of NumPy's masked arrays, also within a list; missing are None and NA, among numbers of a list or
-    in columns of tables.
+    Entries of NumPy's masked arrays may be masked, also within a list. None and NA are missing, among numbers of a list
+    or in columns of tables.
     """
     if isinstance(value, list | tuple):
         if any(isinstance(item, np.ma.MaskedArray) for item in value):
@@ -25,9 +25,9 @@ def fill_masked(value: Any) -> Any:
 
 
 def _fill_array(numbers: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """Return an array with NaN, or NaT among dates, where it is masked, or an object in it is absent (None, NA).
+    """Return an array with NaN, or NaT for dates, where it is masked or an object in it is absent (None, NA).
 
-    Objects that are all numbers then become doubles.
+    If all objects are then numbers, they become doubles.
     """
     kind = numbers.dtype.kind
     if kind == "M":  # dates

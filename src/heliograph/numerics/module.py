@@ -98,11 +98,9 @@ FEW, SOME, LARGE = 4, 8, 20  # numbers of an array, items on a line, rows of a t
 
 
 def readable(kind: T) -> T:
-    """Give a class, and those made from it, the short `repr`, the table for notebooks and an `==` with one answer.
+    """Give a class and its subclasses the short `repr`, the table for notebooks, and an `==` with one answer.
 
-    A class that draws itself for notebooks, by a `_repr_html_` of its own, keeps that.
-
-    An attribute that there is not is refused with the names most like it.
+    A class with its own `_repr_html_` keeps it. An unknown attribute is refused with the most similar names.
     """
     if not hasattr(kind, "__getattr__"):
         kind.__getattr__ = refuse_attribute  # type: ignore[attr-defined]
@@ -113,9 +111,9 @@ def readable(kind: T) -> T:
 
 
 def _write_repr(self: object) -> str:
-    """Return the object as text: one line of up to WIDTH characters, or a line for each part, LINES at most.
+    """Return the object as text: one line of up to WIDTH characters, or at most LINES lines with one for each part.
 
-    A part is an entry or a field; DEPTH is how far parts of parts are shown.
+    A part is an entry or a field. DEPTH: how deep parts of parts are shown.
     """
     one_line = format_on_one_line(self, DEPTH)
     if len(one_line) <= WIDTH:
@@ -134,7 +132,7 @@ def _html(self: object) -> str:
 
 def _are_equal(self: object, other: object) -> bool:
     """Return whether both are of the same class and equal in every part; NaN equals NaN."""
-    # Of an object that is no container, what it would be copied from: attributes, also those in slots.
+    # Any object that is no container is compared by its state for copying: its attributes, also those in slots.
     if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
         return are_same(self.__getstate__(), other.__getstate__())
     return are_same(self, other)
@@ -183,7 +181,7 @@ def _is_ours(value: object) -> bool:
 
 
 def _list_parts(value: object) -> Iterable[tuple[str, object]]:
-    """Return the names and values of what an object holds and anybody may use: entries, fields or attributes."""
+    """Return the names and values of an object's public parts: entries, fields or attributes."""
     if isinstance(value, Mapping):
         return ((repr(key), entry) for key, entry in value.items())
     if is_dataclass(value):
@@ -195,7 +193,7 @@ def _list_parts(value: object) -> Iterable[tuple[str, object]]:
 
 
 def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
-    """Return up to FEW numbers as text; of more, or of traced or other ones, the type and shape, as float64[3,2]."""
+    """Return up to FEW numbers as text; for more, traced or other ones the type and shape, such as float64[3,2]."""
     if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     numbers = np.asarray(value).tolist()
@@ -212,7 +210,7 @@ def _round_numbers(numbers: object) -> str:
 def _join_first_items(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
     """Return the first SOME items as text between `start` and `end`, and how many more of `count` there are.
 
-    `of` gives an item's text. Below the last depth (`depth` 0) "…" stands for all of them.
+    `of`: returns an item's text. At depth 0 "…" stands for all of them.
     """
     if count and depth <= 0:
         return f"{start}…{end}"
@@ -226,7 +224,7 @@ def cut(text: str) -> str:
 
 
 def _format_table(value: object, depth: int) -> str:
-    """Return an object as a table of HTML, a row for each part (entry or field), whose own go `depth` tables deep."""
+    """Return an object as an HTML table with a row for each part (entry or field); tables nest `depth` deep."""
     rows = [
         f"<tr><th>{escape(name)}</th><td>{_format_cell(entry, depth - 1)}</td></tr>"
         for name, entry in _list_entries(value)
@@ -235,7 +233,7 @@ def _format_table(value: object, depth: int) -> str:
 
 
 def _list_entries(value: object) -> Iterable[tuple[str, object]]:
-    """Yield the first LARGE parts (entries or fields) of an object by name, and how many more there are."""
+    """Yield the first LARGE parts (entries or fields) of an object by name, and then how many more there are."""
     entries = iter(_list_parts(value))
     yield from islice(entries, LARGE)
     remaining_count = sum(1 for _ in entries)
@@ -244,9 +242,9 @@ def _list_entries(value: object) -> Iterable[tuple[str, object]]:
 
 
 def _format_cell(value: object, depth: int) -> str:
-    """Return a value as a cell of HTML: a line of text, which opens to a table of its parts if it is ours or a mapping.
+    """Return a value as an HTML cell: a line of text, which opens to a table of its parts if it has some.
 
-    Not below the last depth (0).
+    A mapping, or an object of this library, has parts. At depth 0 the cell is text alone.
     """
     text = escape(cut(format_on_one_line(value, depth)))
     has_parts = _is_ours(value) or (isinstance(value, Mapping) and value)

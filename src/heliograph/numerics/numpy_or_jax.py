@@ -19,12 +19,12 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 
 
 def is_traced(*values: object) -> bool:
-    """Return whether some number in these arrays or trees is traced: stands, in a JAX trace, for one not yet known."""
+    """Return whether some number in these arrays or trees is traced: it stands, in a JAX trace, for an unknown one."""
     return any(
         isinstance(leaf, jax.core.Tracer)
         for value in values
-        if not isinstance(value, np.ndarray | float | int)  # asked of each number of a model: known at a look
-        and not isinstance(value, Iterator)  # which is no tree of numbers to JAX
+        if not isinstance(value, np.ndarray | float | int)  # most values; this check is faster than listing leaves
+        and not isinstance(value, Iterator)  # an iterator is no tree of numbers to JAX
         for leaf in jax.tree.leaves(value)
     )
 
@@ -58,9 +58,9 @@ def find_rounded_to_single(value: object) -> tuple[float, float] | None:
 
 
 def warn_of_single(name: str, value: object) -> None:
-    """Warn, once in a process, of an array of single precision with a number that was rounded, as JAX makes 0.1.
+    """Warn, once in a process, of a single-precision array with a number that was rounded, such as JAX's 0.1.
 
-    `name` says which array it is; DOUBLE how to make one of double precision.
+    `name`: which array it is. DOUBLE: how to make an array of double precision.
     """
     if isinstance(value, jax.core.Tracer) or getattr(value, "dtype", None) != np.float32:
         return
@@ -90,7 +90,7 @@ def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[An
 
 
 def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
-    """Return the shape of a function's result, traced in double precision; warn of arrays it holds in single one."""
+    """Return the shape of a function's result, traced in double precision; warn of single-precision arrays in it."""
     constants_of_function, shape = constants(function, *arguments)
     for constant in constants_of_function:
         if isinstance(constant, jax.Array):
@@ -99,7 +99,7 @@ def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> 
 
 
 def as_real(value: object) -> jax.Array:
-    """Return what a user's function returned as an array of real numbers: whole numbers and flags as floats.
+    """Return the result of a user's function as an array of real numbers; whole numbers and flags become floats.
 
     Raises:
         TypeError: complex numbers.
@@ -127,9 +127,9 @@ CALLS = frozenset((
 
 
 def called_program(operation: JaxprEqn) -> ClosedJaxpr | None:
-    """Return the program that an operation of a traced function calls on its operands; None if it calls none.
+    """Return the program that an operation of a traced function calls on its operands, or None if it calls none.
 
-    CALLS are the operations that do: a jitted function within another, and one with a derivative of its own.
+    CALLS: the operations that call one, such as a jitted function, or a function with its own derivative.
     """
     if operation.primitive.name not in CALLS:
         return None
@@ -151,13 +151,13 @@ def stack_parts(parts: Sequence[object]) -> jax.Array | np.ndarray:
 
 
 def block_diagonal(blocks: Sequence[Any]) -> Any:
-    """Return a matrix with these matrices along its diagonal, and 0 elsewhere; by JAX where one is traced.
+    """Return a matrix with these matrices along its diagonal and 0 elsewhere; JAX makes it if one is traced.
 
-    SciPy's `block_diag` imports its whole library of linear algebra: a sixth of a second of a program's start.
+    SciPy's `block_diag` is not used, as it imports a whole library, which takes a sixth of a second at the start.
     """
     if is_traced(blocks):
         return jax.scipy.linalg.block_diag(*blocks)
-    # The first row and column of each block, and behind them the size of the whole.
+    # The first row and column of each block, followed by the size of the whole.
     *tops, height = np.cumsum([0, *(block.shape[0] for block in blocks)])
     *lefts, width = np.cumsum([0, *(block.shape[1] for block in blocks)])
     matrix = np.zeros((height, width))
@@ -172,9 +172,9 @@ def is_zero(value: Any) -> bool:
 
 
 def scatter(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
-    """Return an array of zeros of shape `size` with `values` added at `places` (an index of its leading axes).
+    """Return an array of zeros of shape `size` with `values` added at `places`, an index of its leading axes.
 
-    Values at repeated places add up.
+    Values at repeated places are added up.
     """
     if is_traced(values):
         return jnp.zeros(size).at[places].add(values)
@@ -195,9 +195,9 @@ def equal_to_rounding(a: Any, b: Any) -> bool:
 
 
 def within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
-    """Test whether probabilities `own`, each wrong by up to `room`, are all within a radius of the believed ones.
+    """Return whether probabilities `own`, each off by up to `room`, are within a radius of the believed ones.
 
-    False where that is not known: of traced ones, or of another shape.
+    It is False if that is not known, for traced numbers, or for another shape.
     """
     if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
         return False

@@ -30,9 +30,9 @@ def _entries_of(q: Array) -> tuple[Any, Any, Any, Any]:
 
 
 def quaternion_of(r: Array) -> Any:
-    """Return the unit quaternion (..., 4), cos(|r| / 2) first, of rotation vectors r (..., 3), in radians.
+    """Return the unit quaternions (..., 4) of rotation vectors r (..., 3) in radians, with cos(|r| / 2) first.
 
-    The rest is sin(|r| / 2) / |r| times r, by series where |r|^2 is below SMALL, where they are exact to rounding.
+    The rest is sin(|r| / 2) / |r| times r. If |r|^2 is below SMALL, series are used, which are exact to rounding there.
     """
     xp = _library(r)
     s = xp.sum(r * r, axis=-1, keepdims=True)  # |r|^2
@@ -46,16 +46,17 @@ def quaternion_of(r: Array) -> Any:
 
 
 def rotation_vector_of(q: Array) -> Any:
-    """Return the rotation vector (..., 3), at most pi long, of quaternions (..., 4) of any length; q and -q are one.
+    """Return the rotation vectors (..., 3), at most pi long, of quaternions q (..., 4) of any length; q and -q are one.
 
-    Of q = (w, v), the real part w first; up to SMALL, of (|v| / w)^2, by a series.
+    For q = (w, v), with the real part w, it is 2 atan2(|v|, w) v / |v|. If (|v| / w)^2 is below SMALL, a series is
+    used.
     """
     xp = _library(q)
     q = xp.where(q[..., :1] < 0, -q, q)
     w, v = q[..., :1], q[..., 1:]
     s = xp.sum(v * v, axis=-1, keepdims=True)  # |v|^2
     is_small = s < SMALL * w * w
-    # r = 2 atan2(|v|, w) v / |v|; where t = (|v| / w)^2 is small, by the series of the arc tangent, over w.
+    # For small t = (|v| / w)^2, atan2(|v|, w) / |v| is the series of the arc tangent divided by w.
     length, w_if_small = xp.sqrt(xp.where(is_small, 1.0, s)), xp.where(is_small, w, 1.0)
     t = xp.where(is_small, s, 0.0) / (w_if_small * w_if_small)
     series = (1 - t * (1 / 3 - t * (1 / 5 - t * (1 / 7 - t / 9)))) / w_if_small
@@ -63,7 +64,7 @@ def rotation_vector_of(q: Array) -> Any:
 
 
 def multiply_quaternions(q: Array, p: Array) -> Any:
-    """Return the product q p of quaternions (..., 4), the real part first: the turn p, and after it q."""
+    """Return the product q p of quaternions (..., 4) with the real part first: the turn p followed by q."""
     xp = _library(q, p)
     a, b, c, d = _entries_of(q)
     e, f, g, h = _entries_of(p)
@@ -87,9 +88,9 @@ def turn_between(r: Array, other: Array) -> Any:
 
 
 def matrix_of(r: Array) -> Any:
-    """Return the rotation matrix R (..., 3, 3) of rotation vectors (..., 3), from the body's axes to the world's.
+    """Return the rotation matrices R (..., 3, 3) of rotation vectors (..., 3).
 
-    R times a vector in the body's axes is the same vector in the world's.
+    R times a vector in the body's axes is the same vector in the world's axes.
     """
     xp = _library(r)
     w, x, y, z = _entries_of(quaternion_of(r))

@@ -27,7 +27,7 @@ def trace_settings() -> tuple[object, ...]:
 
 @contextmanager
 def write_short_programs(short: bool = True) -> Iterator[None]:
-    """Let functions traced within the block be written as short programs, if `short`: with loops in place of copies."""
+    """Within the block, trace functions as short programs, with loops instead of copies, if `short` is True."""
     token = _short.set(short)
     try:
         yield
@@ -47,9 +47,10 @@ def writes_short_programs() -> bool:
 
 
 def keep_for_derivatives(numbers: PyTree) -> PyTree:
-    """Return the numbers, marked to be kept by a derivative backwards over rows, which computes a row's others again.
+    """Return the numbers with the mark KEPT, so that a derivative backwards over rows keeps them.
 
-    For what most models have the same in every row, as factors of noises: it is then computed once. KEPT is the mark.
+    Such a derivative computes a row's other numbers again. The mark is for what most models have the same in every row,
+    such as factors of noises, which is then computed once.
     """
     mark: Callable[[Any, str], Any] = checkpoint_name  # untyped in JAX
     return jax.tree.map(lambda leaf: mark(leaf, KEPT), numbers)
@@ -57,9 +58,9 @@ def keep_for_derivatives(numbers: PyTree) -> PyTree:
 
 @contextmanager
 def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
-    """Let tolerances within the block be those of another precision than that of the arrays that are traced.
+    """Within the block, use the tolerances of this precision, whatever the precision of the traced arrays.
 
-    C in single precision is written from functions that are traced in double precision.
+    C code in single precision is written from functions that are traced in double precision.
     """
     token = _precision.set(precision)
     try:

@@ -120,14 +120,14 @@ def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
 
 
 def _compute_word_information(variance: float, encoder_range: float, gain: float) -> Float[np.ndarray, " bits"]:
-    """Return the information j(B) of words of B = 0 to MOST bits about the value that was measured.
+    """Return the information j(B) of words of B = 0 to MOST bits about the measured value; it is 0 for no bits.
 
-    j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)) with the step D = range / (2^B - 1) and U = D^2 (4^B - 1)/12, the variance
-    of uniform words; 0 of no bits.
+    j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)), with the step D = range / (2^B - 1), and U = D^2 (4^B - 1)/12 the variance
+    of uniform words.
 
     Args:
-        variance: R, of the sensor's noise.
-        encoder_range: of the values that the words cover.
+        variance: R, the variance of the sensor's noise.
+        encoder_range: width of the range of values that the words cover.
         gain: g = 1 - 2p of each bit, where p is the probability that it is flipped.
     """
     counts = np.arange(1, MOST + 1)
@@ -137,7 +137,11 @@ def _compute_word_information(variance: float, encoder_range: float, gain: float
 
 
 def _find_bit_gain(name: str, node: Node) -> float:
-    """Return the gain g = 1 - 2p of a node's link for one bit, p its error rate; ValueError unless that is constant."""
+    """Return the gain g = 1 - 2p of a node's link for one bit, where p is its error rate.
+
+    Raises:
+        ValueError: an error rate that is not constant, or another channel.
+    """
     link = node.channel
     if isinstance(link, Flips) and isinstance(link.error, Constant):
         return float(link.gain.moment(1))
@@ -154,8 +158,11 @@ def _information_of_bits(senders: _PlantAndSenders, bits: Sequence[int] | np.nda
 
 
 def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
-    """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j, X before them."""
-    # Words of no bits inform of nothing, and have no finite noise 1 / j.
+    """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j.
+
+    X is the covariance before the words, and c_i the row of sender i.
+    """
+    # Leave out senders of no bits, whose noise 1 / j is infinite.
     sends = j > 0
     A, Q, C = senders.transition, senders.process, senders.rows[sends]
     if not sends.any():
@@ -177,8 +184,7 @@ def _compute_steady_error(senders: _PlantAndSenders, j: Float[np.ndarray, " send
 def _compute_error_slopes(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
     """Return the derivatives of the steady trace by each j_i: -c_i' P Y P c_i, with Y = I + M' Y M.
 
-    P is the covariance after the words and M = (I - K C) A = P X^-1 A moves the error of one step to the next, X being
-    the covariance before the words.
+    P is the covariance after the words, X before them, and M = (I - K C) A = P X^-1 A maps the error from step to step.
     """
     A, Q = senders.transition, senders.process
     P = _compute_steady_covariance(senders, j)
@@ -214,12 +220,11 @@ def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarra
 
 
 def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
-    """Return a lower bound of the error of any bits of this total: the least of real bits with concave information.
+    """Return a lower bound of the error for any split of this total of bits, with real bits and concave information.
 
-    By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
-    nowhere above it, and its least value over all bits of this total is a bound.
-
-    `hulls`: the concave envelope of each sender's information over its bits, on which bits are real numbers.
+    The error is convex in j, so its tangent at any j is nowhere above it, and the tangent's least value over all splits
+    is a bound. The points j come from Frank and Wolfe's steps j + 2 / (k + 2) (best - j). `hulls`: the concave envelope
+    of each sender's information over its bits, on which bits may be real.
     """
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf
@@ -233,10 +238,10 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
 
 
 def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]]:
-    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as far as it rises."""
+    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as long as it rises."""
     corners = [(0, float(values[0]))]
     while corners[-1][0] < len(values) - 1:
-        # The next corner is the one to which the line rises most steeply.
+        # The next corner is the point to which the line from here rises most steeply.
         start, low = corners[-1]
         further = np.arange(start + 1, len(values))
         rises = (values[further] - low) / (further - start)

@@ -147,20 +147,19 @@ class ChangeWorth(NamedTuple):
 def worth_of_changes(
     best: PowerDesign, exponent: float | None = None, advance: Advance = _report_nothing
 ) -> list[ChangeWorth]:
-    """Return what each change of a design's network is worth: a sensor more, one less, a relay halfway of a hop.
+    """Return what each change of a design's network is worth: a sensor more, one less, or a relay within a hop.
 
-    The design is made again for each sensor added once more or left out, and for a relay in each hop.
-
-    A relay halfway makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
-    A change that a design refuses, such as a last sensor left out, is not listed.
+    The design is made again with each sensor doubled, with each left out, and with a relay halfway in each hop.
+    Such a relay makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
+    A change that cannot be designed, such as leaving out the only sensor, is not listed.
 
     Args:
         best: the design of a network.
-        exponent: exponent of the path loss; relays are not tried without.
+        exponent: exponent of the path loss; without it no relays are tried.
         advance: called with a word before each design (by default nothing is).
 
     Returns:
-        Changes by name, with the value of the design and what it saves, the most first.
+        Changes with their names, the value of the design and what it saves; the change that saves most comes first.
 
     Raises:
         ValueError: a design of anything but a Network.
@@ -224,10 +223,10 @@ def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> 
     """
 
     def insert_into_hop(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractRandomAffine:
-        """Return the hop called `name` as a chain of two, with a relay halfway; any other hop as it is.
+        """Return the hop called `name` as a chain of two hops with a relay halfway; any other hop stays as it is.
 
-        Both halves have the noise of the whole. `exponent`: of the path loss, by which half the distance multiplies E
-        g^k by 2^(exponent k / 2).
+        Both halves have the noise of the whole. Half the distance multiplies E g^k by 2^(exponent k / 2), with
+        `exponent` of the path loss.
         """
         if hop_name != name or not isinstance(hop, GainAndNoise):
             return hop

@@ -54,7 +54,7 @@ class DesignProblem:
         return Error() if self.error is None else self.error
 
     def replace_total(self, total: float) -> "DesignProblem":
-        """Return the problem of the least error with this total power, other limits of the budget staying.
+        """Return the problem of least error with this total power and the other limits of the budget.
 
         Args:
             total: largest mean power of all transmitters together.
@@ -91,8 +91,8 @@ class Certificate(NamedTuple):
     def words(self) -> str:
         """Sentence on what the numbers certify.
 
-        `bound`: no design has less; `unit`: what is made small, the error or else the power; `stationarity`:
-        how far from zero the slope at the best point is, NaN if that is not known.
+        `bound`: no design has less. `unit`: what is made small, "error" or "power". `stationarity`: how far the slope
+        at the best point is from zero, NaN if it is not known. `starts`: the number of starts of the search.
         """
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
@@ -134,11 +134,10 @@ class PowerDesign(Module):
 
     @property
     def network(self) -> Network:
-        """Design as a network that runs: every node with the filter "best", and "best" of all that they receive.
+        """Design as a network that runs: each node has a filter "best", and so has the centre of all nodes.
 
-        Of free numbers the network that their function returns. A period is repeated for about 100 steps.
-
-        `realised`: that of free numbers, None for powers.
+        A design of free numbers is the network that their function returns (`self.realised`, None for a design of
+        powers). A period is repeated for about 100 steps.
 
         Raises:
             ValueError: a design of independent paths, which belong to no network.

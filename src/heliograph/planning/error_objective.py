@@ -91,12 +91,12 @@ class Error(Module):
         return np.asarray(matrix)
 
     def criterion(self, states: tuple[str, ...]) -> "Criterion":
-        """Return the number that is to be small for a plant with these states, as a function of covariances.
+        """Return the number to be made small, as a function of covariances, for a plant with these states.
 
-        `matrix`: weight of the states' covariance. If the worst direction counts the error is the largest
-        eigenvalue, which is smoothed by an exponent: SHARPER has these, the sharpest last.
+        `self.matrix`: the weight of the states' covariance. If the worst direction counts (`self.worst`), the number is
+        the largest eigenvalue, smoothed by an exponent of SHARPER, the sharpest last.
         """
-        # The last step alone counts, or all alike.
+        # Only the last step counts, or all steps count alike.
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
         return Criterion(weight=weight, shares=shares, sharpness=SHARPER[-1] if self.worst else None)
@@ -114,20 +114,18 @@ class Criterion(NamedTuple):
     sharpness: int | None
 
     def smooth(self, p: Matrices) -> tuple[float, Matrices]:
-        """Return the number at covariances p (time, n, n), smoothed where it is an eigenvalue, and dnumber/dP of each.
+        """Return the number f at covariances p (time, n, n), smoothed if it is an eigenvalue, and each df/dP_k.
 
-        The search takes it for the error; `exact` is the error itself.
-
-        `shares`: the weight of each step in the error.
+        The search minimises this; `compute_exact_error` is the error itself. `self.shares`: the weight of each step.
         """
         values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
     def compute_exact_error(self, p: Matrices) -> float:
-        """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue.
+        """Return the error at covariances p (time, n, n), without smoothing of an eigenvalue.
 
-        It is the trace of W P, or where `sharpness` is set the largest eigenvalue of W^1/2 P W^1/2; `shares`:
-        the weight of each step.
+        It is the sum over steps, with weights `self.shares`, of the trace of W P. If `self.sharpness` is not None, it
+        is that of the largest eigenvalue of W^1/2 P W^1/2.
         """
         if self.sharpness is None:
             return self.smooth(p)[0]
@@ -135,10 +133,10 @@ class Criterion(NamedTuple):
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def make_tangent(self, p: Matrices) -> "Criterion":
-        """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere.
+        """Return the linear criterion <V, P> that is a lower bound of this one and meets it at p.
 
-        A linear criterion is its own tangent. Of a largest eigenvalue V is the smoothed one's derivative,
-        scaled to trace 1 in units of the weight's root: no average of eigenvalues exceeds the largest.
+        A linear criterion is its own tangent. For a largest eigenvalue, V is the derivative of the smoothed one, scaled
+        so that W^-1/2 V W^-1/2 has trace 1: it is then an average of eigenvalues, which never exceeds the largest.
         """
         if self.sharpness is None:
             return self
@@ -152,13 +150,14 @@ class Criterion(NamedTuple):
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
-        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step; f: the trace, or the smoothed eigenvalue.
+        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step: f is tr W P or the smoothed eigenvalue.
 
-        W: `weight` of each step; S = W^1/2 P W^1/2; q: `sharpness`, None for the trace.
+        W is `self.weight` of each step, S = W^1/2 P W^1/2, and q is `self.sharpness`, None for the trace. The smoothed
+        eigenvalue is tr(S^q)^(1/q).
         """
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
-        # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.
+        # The derivative is W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), in units of the largest eigenvalue against overflow.
         q, root = self.sharpness, _find_root(self.weight)
         eigenvalues, vectors = np.linalg.eigh(root @ p @ root)
         largest = eigenvalues[:, -1]

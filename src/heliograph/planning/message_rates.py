@@ -148,13 +148,12 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
 def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0.0) -> float:
     """Return the least mean square error of senders that transmit at most at this rate and know what arrived.
 
-    The curve of `prediction_error_rate`, whose thresholds are optimal for first-order plants: published for links
-    without loss (Lipsa and Martins 2011) and with losses that are acknowledged (Chakravorty and Mahajan 2020); here it
-    is computed, not proved.
+    It is computed with thresholds as in `prediction_error_rate`. They are optimal for first-order plants, as others
+    proved for links without loss (Lipsa and Martins 2011) and for acknowledged losses (Chakravorty and Mahajan 2020).
 
     Args:
-        plant: as of the rate.
-        sensor: as of the rate.
+        plant: the plant, as in `prediction_error_rate`.
+        sensor: its sensor, as there.
         rate: transmissions a step.
         loss: probability that a transmission is lost (default 0).
 
@@ -169,15 +168,14 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
 def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> float:
     """Return the transmissions a step of send-on-delta in the long run.
 
-    Losses do not change them, since a value is compared with the one sent last, arrived or not.
-
-    From the stationary law of (x, r), r the reference, as a Markov chain on two grids of cells, extrapolated: to 1e-3
-    of itself where one step in a hundred sends, to 1 % at one in 2,500.
+    Losses do not change the rate, since a value is compared with the last one sent, whether it arrived or not.
+    It comes from the stationary law of (x, last value sent) as a Markov chain on two grids of cells, extrapolated. The
+    relative error is 1e-3 if one step in 100 sends, and 1 % if one in 2,500 does.
 
     Args:
         plant: linear, of one state, stable, without inputs, with Gaussian noise.
         sensor: linear, of one output, with Gaussian noise.
-        delta: distance from the value sent last beyond which is sent, in the unit of y.
+        delta: a value is sent if it is further than this from the last value sent, in the unit of y.
 
     Raises:
         ValueError: another plant or sensor; a plant that is not stable; a delta so large
@@ -194,26 +192,26 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
 def _send_on_delta_rate(system: ScalarSystem, delta: float) -> float:
     """Return the rate of messages of send-on-delta, however small, extrapolated from two grids.
 
-    `system`: x+ = a x + w and z = c x + v, with the variances q of w and r of v.
+    `system`: x+ = a x + w and z = c x + v, with q = Var w and r = Var v.
     """
     if not abs(system.a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {system.a:g}")
-    # In units of the state: c is 1.
+    # Change to the unit of the state, so that c is 1.
     delta, system = delta / abs(system.c), system._replace(c=1.0, r=system.r / system.c**2)
     coarse_rate, coarse_cell = compute_rate_on_grid(system, delta, share=0.8)
     fine_rate, fine_cell = compute_rate_on_grid(system, delta, share=0.5)
-    if fine_rate == coarse_rate:  # where nothing is ever sent both grids are one, and say 0
+    if fine_rate == coarse_rate:  # if nothing is ever sent, both grids say 0
         return fine_rate
-    # The rectangle rule next to the cut at delta is wrong by a multiple of the cell's size squared: that is taken off.
+    # Take off the error of the rectangle rule at the cut at delta, which is a multiple of the cell's size squared.
     return float(fine_rate + (fine_rate - coarse_rate) * fine_cell**2 / (coarse_cell**2 - fine_cell**2))
 
 
 def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
-    """Return the delta with which send-on-delta transmits at a rate, by bisection of `send_on_delta_rate`.
+    """Return the delta at which send-on-delta transmits at this rate, by root finding on `send_on_delta_rate`.
 
     Args:
-        plant: as of the rate.
-        sensor: as of the rate.
+        plant: the plant, as in `send_on_delta_rate`.
+        sensor: its sensor, as there.
         rate: transmissions a step.
 
     Raises:
@@ -226,10 +224,10 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
 def _find_threshold(
     rate: float, rate_at: Callable[[float], float], system: ScalarSystem, accuracy: float = 1e-10
 ) -> float:
-    """Return the threshold delta at which `rate_at(delta)`, which falls as delta rises, is this rate."""
+    """Return the threshold delta at which the falling function `rate_at(delta)` has this rate."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
-    # The deviation by which a measured value changes in a step: a first guess of a threshold.
+    # The deviation of a measured value from one step to the next is a first guess of the threshold.
     unit = np.sqrt(system.q * system.c**2 + system.r)
     low = high = unit
     while rate_at(low) < rate:
@@ -262,9 +260,9 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
 
 
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss-Legendre nodes and weights on a line that is cut at `edges`, and into intervals of 8 units at most.
+    """Return Gauss-Legendre nodes and weights on a line that is cut at `edges`, and into intervals of at most 8 units.
 
-    On these NODES nodes suffice, as the integrand changes over a unit or more.
+    NODES nodes suffice on each interval, since the integrand changes over a unit or more.
     """
     intervals: list[tuple[float, float]] = []
     for begin, end in pairwise(edges):

@@ -132,7 +132,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
 
 
 def _check_paths(paths: Paths, problem: DesignProblem) -> None:
-    """Raise ValueError unless paths from arrays were made for the problem's error, and all their powers are free."""
+    """Raise ValueError unless paths that were made from arrays fit the problem's error, and all powers are free."""
     error, steps = problem.criterion, len(paths.kappa)
     if error.steps != steps or (error.horizon is None) != (paths.plants.start is None):
         raise fail("error", f"that over {steps} steps for which the paths were made", f"{error.steps}")
@@ -185,10 +185,10 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
 
 
 def _find_relay_power_limits(problem: DesignProblem) -> float | None:
-    """Return what all relays together may send in each slot, None without a limit.
+    """Return the power that all relays together may send in each slot, or None without a limit.
 
     Raises:
-        ValueError: another error than the steady trace, a target error, some relays free alone, limits of single ones.
+        ValueError: another error than the steady trace, a target error, only some relays free, limits of single relays.
     """
     if problem.free is not None or problem.target_error is not None:
         raise fail("design of relays that filter", "all relays free, and a budget or none", "free or target_error")
@@ -202,12 +202,12 @@ def _find_relay_power_limits(problem: DesignProblem) -> float | None:
 
 
 def _make_relay_network(relays: RelayNetwork, gains: Gains) -> Network:
-    """Return a network of the relays with these gains and the best receiver behind them, for COVERED steps or more."""
+    """Return a network of the relays with these gains and the best receiver behind them, for at least COVERED steps."""
     slots, n = len(relays.slots), len(relays.states)
     # The slots of a period are repeated until COVERED steps are reached.
     times = ceil(COVERED / slots)
     over_time = {name: np.tile(gain, (times, 1, 1)) for name, gain in gains.items()}
-    # A design has gains of the receiver too; its schedule is dropped for that of the best one.
+    # A design must have gains of the receiver; zeros will do, since the best receiver replaces its schedule.
     receiver_gains = {RECEIVER: np.zeros((times * slots, n, relays.received[-1]))}
     schedules = relay_schedules(relays, given_design(relays, over_time | receiver_gains))
     schedules.pop(RECEIVER)

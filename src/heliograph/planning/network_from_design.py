@@ -76,23 +76,23 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
 
 
 def repeat_network(network: Network) -> Network:
-    """Return the network with everything in it that is OverTime repeated, over as many steps as a run may have."""
+    """Return the network with everything that varies over time repeated, so that it lasts for a long run."""
 
     def repeat(leaf: object) -> object:
-        """Return an OverTime repeated for COVERED steps or more, anything else as it is."""
+        """Return an OverTime repeated to COVERED steps or more; anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
-        # COVERED: steps for which what is periodic is written down.
+        # Its arrays have a leading axis of steps.
         times = ceil(COVERED / leaf.steps)
         return OverTime(jax.tree.map(lambda over_steps: np.concatenate([over_steps] * times), leaf.values))
 
-    # An OverTime holds arrays with a leading axis over steps.
+    # An OverTime is repeated as a whole.
     covered: Network = jax.tree.map(repeat, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     return covered
 
 
 def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Return the powers (steps,) by transmitter; ValueError of unknown transmitters, other shapes, negative powers."""
+    """Return the powers (steps,) by transmitter; raise ValueError for unknown names, bad shapes, negative powers."""
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
     unknown = sorted(set(given) - known)
@@ -105,10 +105,9 @@ def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict
 
 
 def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
-    """Return the node with this channel, and only the best linear filter behind it.
+    """Return the node with this channel, and with the best linear filter behind it as its only filter.
 
-    Limits of what is received were made for the node's own channel; behind another only which values are invalid still
-    holds.
+    The node's limits were made for its own channel. Behind another channel, only its invalid values still hold.
     """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or are_same(channel, node.channel):
@@ -117,9 +116,9 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
 
 
 def _select_powers_of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
-    """Return the powers at step k of the transmitters of a node, by their names within it ("hop1").
+    """Return the powers at step k of a node's transmitters, by their names within the node ("hop1").
 
-    `powers`: of all transmitters, {"node.hop1": (steps,)}.
+    `powers`: powers of all transmitters, {"NODE.hop1": (steps,)}.
     """
     start = f"{name}."
     return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}

@@ -58,7 +58,7 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
 
 
 def require_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
-    """Return plant and noise of the first step; ValueError unless it is linear and its noise depends on no inputs."""
+    """Return the plant and noise of the first step; raise ValueError unless it is linear with noise of no inputs."""
     start = first(plant)
     if not isinstance(start, LinearPlant):
         raise fail("plant", "a LinearPlant", type(start).__name__)
@@ -68,9 +68,9 @@ def require_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]
 
 
 def require_design_plant(plant: AnyPlant) -> LinearPlant:
-    """Return the plant of the first step; ValueError unless it is one of which powers can be designed.
+    """Return the plant of the first step; raise ValueError unless its powers can be designed.
 
-    That is a linear one with constant noise, without inputs and angles.
+    The plant must be linear with constant noise, without inputs and angles.
     """
     start, _ = require_constant_noise(plant)
     if start.inputs:
@@ -124,7 +124,7 @@ def moments_with_one_over(
 
 
 def _compute_noise_moments(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
-    """Return the mean and covariance of the plant's noise w at inputs u; JAX may trace a noise that depends on them."""
+    """Return the mean and covariance of the plant's noise w at inputs u; JAX may trace a noise of inputs."""
     if isinstance(plant.noise, AbstractNoise):
         return plant.noise.mean, plant.noise.covariance
     with jax.enable_x64(True):

@@ -49,7 +49,7 @@ class Budget(Module):
 
 
 def make_budget(value: object) -> Budget:
-    """Return a budget; a plain number is one of the total power."""
+    """Return the value as a budget; a plain number is the limit of the total power."""
     if isinstance(value, Budget):
         return value
     try:
@@ -60,7 +60,7 @@ def make_budget(value: object) -> Budget:
 
 
 def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
-    """Return a checked limit of powers: a number for all transmitters, or {name: number} for some; None for none."""
+    """Return a checked limit of powers: a number for all transmitters, {name: number} for some, or None for none."""
     if value is None:
         return None
     if isinstance(value, Mapping):
@@ -121,28 +121,30 @@ class PowerLimits(NamedTuple):
         return limit
 
     def clip_powers(self, powers: Powers) -> Powers:
-        """Return the powers, cut at their peaks and then scaled down where a mean or the total is above its limit.
+        """Return the powers (steps, transmitters), cut at peaks and then scaled down to the limits of mean and total.
 
-        For powers that rounding, or a solver's accuracy, puts a little outside.
+        It is for powers that rounding, or a solver's accuracy, puts slightly outside. `self.mean` limits each
+        transmitter's mean over the steps, and `self.total` the sum of these means.
         """
         powers = np.clip(powers, 0.0, self.peak)
         mean = powers.mean(axis=0)
-        powers = powers * np.divide(self.mean, mean, out=np.ones_like(mean), where=mean > self.mean)
+        factor = np.divide(self.mean, mean, out=np.ones_like(mean), where=mean > self.mean)  # 1 within the limit
+        powers = powers * factor
         total = powers.mean(axis=0).sum()
         return powers * (self.total / total) if total > self.total else powers
 
     def make_limit_rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
-        """Return (rows, bounds): the finite limits of mean and total as rows @ powers.ravel() <= bounds.
+        """Return (rows, bounds): the finite limits of means and total as rows @ powers.ravel() <= bounds.
 
-        Each row is in units of its limit, so that bounds are 1, or 0 where nothing may be sent.
+        Each row is divided by its limit, so that its bound is 1, or 0 if nothing may be sent.
         """
         steps, count = self.peak.shape
-        # A row for the mean of each transmitter over the steps, then one for that of all together.
+        # One row for the mean of each transmitter over the steps, and a last one for the total.
         rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
         limits = np.append(self.mean, self.total)
         is_finite = np.isfinite(limits)
         rows, limits = rows[is_finite], limits[is_finite]
-        # A limit of 0 cannot be divided by.
+        # Do not divide by a limit of 0.
         unit = np.where(limits > 0, limits, 1.0)
         return rows / unit[:, None], limits / unit
 
@@ -185,15 +187,17 @@ def make_power_limits(
 
 
 def _check_fixed_powers(what: str, power: float, limit: float) -> None:
-    """Raise ValueError where transmitters that are not free send more than a limit; `what`: the limit, in words."""
-    # MET: the rounding within which a limit counts as met.
+    """Raise ValueError if transmitters that are not free already send more than a limit.
+
+    `what`: the limit, in words. A limit counts as met within the rounding MET.
+    """
     if power > limit * (1 + MET):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
         raise fail("budget", expected, f"{limit:.6g}")
 
 
 def _list_limits(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
-    """Return a limit for each transmitter in the order of `names`, infinite where there is none."""
+    """Return a limit for each transmitter in the order of `names`, infinite if it has none."""
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))

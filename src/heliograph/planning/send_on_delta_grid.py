@@ -27,8 +27,9 @@ class ScalarSystem(NamedTuple):
     def kalman_variance(self) -> float:
         """Error variance of the sender's Kalman filter in the long run.
 
-        Of x+ = a x + w with Var w = q, and z / c = x + v with Var v = r. The variance before a measurement is
-        the positive root of prior^2 + b prior - q r = 0.
+        The model is x+ = a x + w with Var w = q, and z / c = x + v with Var v = r. The variance before a measurement is
+        the positive root of prior^2 + b prior - q r = 0 with b = r (1 - a^2) - q; after it, it is prior r / (prior +
+        r).
         """
         a, q, r = self.a, self.q, self.r / self.c**2
         b = r * (1 - a * a) - q
@@ -93,10 +94,10 @@ def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> tu
         return np.asarray(T @ np.concatenate([below, half]))
 
     def step_law(vector: np.ndarray) -> np.ndarray:
-        """Return the rows of x >= 0 after a step, from those before it, as a vector: x moves by T, then is sent or not.
+        """Return the law's rows of x >= 0 after a step, from those before it, as a vector.
 
-        Without a message (probability `silence`) the value sent last stays; with one it is what was measured, x + v,
-        whose probabilities given x are `noise`.
+        First x moves (`move_law`), then it is sent or not. Without a message (probability `silence`) the value sent
+        last stays. With one it is the measured value x + v, whose probabilities given x are `noise`.
         """
         f = move_law(vector.reshape(-1, size))
         return np.asarray(f * silence + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
@@ -118,18 +119,18 @@ def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> tu
 
 
 def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
-    """Return the part of the law f that sends a message, after it: last sent is what is measured now.
+    """Return the law after a message, of the part of f that sends one: the value sent last is now the measured one.
 
     Args:
         f: [i, j] = P(x in cell i, last sent in cell j), before the message.
         noise: [i, z] = P(measured in cell z | x in cell i).
-        cells_of_delta: number of cells on either side of a measured one that are no further than delta from it.
+        cells_of_delta: number of cells on either side of a cell that are no further than delta from it.
     """
-    # So many cells have values more than delta above them; as many, at the other end, have such values below.
+    # The first `count` cells have cells more than delta above them, and the last `count` have such cells below.
     size = f.shape[1]
     count = max(size - cells_of_delta - 1, 0)
     mass_up_to = np.cumsum(f, axis=1)  # [i, j] = P(x in cell i, last sent in cell j or below)
-    # [i, z] = P(x in cell i, last sent more than delta from cell z): above it, then below.
+    # [i, z] = P(x in cell i, last sent more than delta from cell z), first above z and then below.
     mass_beyond_delta = np.zeros_like(f)
     mass_above = mass_up_to[:, -1:] - mass_up_to[:, size - count - 1 : -1]
     mass_beyond_delta[:, :count] = mass_above
@@ -138,9 +139,9 @@ def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta:
 
 
 def _compute_cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
-    """Return the probabilities [i, j] that a Gaussian of mean i falls into the cell around x[j].
+    """Return the probabilities [i, j] that a Gaussian with mean means[i] falls into the cell around x[j].
 
-    Cells end halfway between neighbours; the outermost reach to infinity.
+    Cells end halfway between neighbours. The outermost cells reach to infinity.
     """
     edges = np.concatenate([[-np.inf], (x[1:] + x[:-1]) / 2, [np.inf]])
     return np.diff(ndtr((edges - means[:, None]) / deviation), axis=1)

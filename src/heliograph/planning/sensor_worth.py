@@ -147,15 +147,15 @@ def worth_of_sensors(
 def _make_error_of_case(
     name: str, squares: Float[np.ndarray, "runs n"], complete: Float[np.ndarray, " n"] | None
 ) -> ErrorWithout:
-    """Return the root mean square error of a case, with its standard error and its ratio to that of all nodes.
+    """Return the root mean square error of a case, its standard error, and its ratio to the error with all nodes.
 
     Args:
-        name: of the case.
+        name: name of the case.
         squares: squared error of each state in each run, or its variance.
-        complete: error with all nodes (n,); None if this is that case.
+        complete: error with all nodes (n,); None if this is the case of all nodes.
     """
     error = np.sqrt(squares.mean(axis=0))
-    # The standard error of a root: sd(root m) = sd(m) / (2 root m).
+    # The standard error of a root is sd(sqrt(m)) = sd(m) / (2 sqrt(m)).
     spread = squares.std(axis=0) / np.sqrt(len(squares))
     uncertainty = np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)
     of_all = error if complete is None else complete
@@ -164,9 +164,9 @@ def _make_error_of_case(
 
 
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes; ValueError where more than a sensor and a link makes what they receive.
+    """Return the nodes; raise ValueError unless each receives one sensor over one link.
 
-    Refused are relays that filter, nodes that share a channel, triggers and encoders.
+    Relays that filter, nodes that share a channel, triggers and encoders are refused.
     """
     if network.relays is not None or network.common is not None:
         raise fail("network", "nodes that receive sensors through channels of their own", "relays that filter")
@@ -214,12 +214,9 @@ def _list_cases(
 
 
 def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
-    """Return the likelihood filter of all that the nodes receive: linear where plant, sensors and angles allow it.
-
-    `circular`: with angles, for which no linear filter is right.
-    """
-    # Of channels without memory the channel given arrival, since the filter skips what is lost (NaN). With memory, as
-    # of bursts, a loss tells of the next one: the channel stays.
+    """Return the likelihood filter of everything the nodes receive, linear if plant and sensors are, without angles."""
+    # The filter skips what is lost (NaN), so a channel without memory is taken given arrival. A channel with memory,
+    # such as bursts, stays as it is, since a loss tells something about the next one.
     plant = network.plant
     channels = [
         node.channel if first(node.channel).remembers else at_each_step(_condition_on_arrival, node.channel)

@@ -65,7 +65,7 @@ class SentPower(Module):
     def words(self) -> str:
         """Sentence on whether the power stays bounded.
 
-        `growth`: factor of the power from a step to the next in the long run; NaN or 1 where none is known.
+        `self.growth`: the factor of the power from step to step in the long run. It is NaN or 1 if it is not known.
         """
         if np.isnan(self.growth) or self.growth == 1:
             return "what is sent is known for these steps only"
@@ -140,7 +140,7 @@ def power(
 
 
 def _is_exact(network: Network, sources: Sources) -> bool:
-    """Return whether second moments are exact without draws: plant and sensors are linear without angles."""
+    """Return whether second moments are exact without random draws: plant and sensors are linear without angles."""
     plant = network.plant
     all_are_linear = all(is_linear(plant, sensor) for sensor, _ in sources.values())
     have_angles = first(plant).circular or any(first(sensor).circular for sensor, _ in sources.values())
@@ -150,7 +150,7 @@ def _is_exact(network: Network, sources: Sources) -> bool:
 def _compute_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None
 ) -> dict[str, Moments]:
-    """Return E (y, 1)(y, 1)' of each sensor's output at each step, in one batch, of a linear plant and sensors."""
+    """Return E (y, 1)(y, 1)' of each sensor's output (1, steps, m1, m1), as one batch, for a linear plant."""
     seconds = [steady_moment_with_one(plant)] if horizon is None else moments_with_one_over(plant, len(inputs), inputs)
     return {
         name: np.array([[measured_moment_with_one(sensor, x, k) for k, x in enumerate(seconds)]])
@@ -161,15 +161,15 @@ def _compute_moments(
 def _compute_hop_powers(
     channel: Channel, moments: Moments, horizon: int | None
 ) -> dict[str, Float[np.ndarray, "batch steps"]]:
-    """Return {hop: powers (batch, steps)} of a channel's hops, by E (y, 1)(y, 1)' of what goes into the channel."""
+    """Return {hop: powers (batch, steps)} of a channel's hops, from the moments E (y, 1)(y, 1)' of its input."""
     batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in moments]
     return {hop: np.array([[now[hop] for now in batch] for batch in batches]) for hop in batches[0][0]}
 
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
-    """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
+    """Return each hop's power at step k for `moment` = E (y, 1)(y, 1)', or in the long run if `horizon` is None."""
     link, _, told = separate_told_numbers(at(channel, k))
-    if told:  # to be told a link's gain or noise changes nothing of what is sent
+    if told:  # a link that tells its gain or noise sends the same power
         if not has_untold_law(link):
             raise fail("power of a link whose gain or noise is told", "a known law of what is told", "none")
         link = believe_untold(link)
@@ -177,7 +177,7 @@ def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: in
 
 
 def _list_sources(network: Network) -> Sources:
-    """Return sensor and channel of each node by its name, or those that all nodes share as "common".
+    """Return the sensor and channel of each node by name, or those that all nodes share as "common".
 
     A relay that filters is no source.
     """
@@ -254,9 +254,9 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
 def _draw_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], runs: int, seed: int
 ) -> dict[str, Moments]:
-    """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), a mean over each batch of drawn trajectories.
+    """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), as means over batches of drawn trajectories.
 
-    BATCHES: batches of as many trajectories each, whose differences show how exact the mean is.
+    There are BATCHES batches of equal size, whose differences show how exact the mean is.
     """
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}
@@ -292,10 +292,10 @@ def _draw_output_squares(
     key_of_start, key_of_steps = jax.random.split(key)
 
     def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Return the state after step k, and (y, 1)(y, 1)' of every sensor that measures it then.
+        """Return the state after step k, and (y, 1)(y, 1)' of every sensor, which measures it then.
 
-        x: the state; `row`: number of the step and inputs. `key_of_steps`: of the trajectory, from which each
-        step has keys of its own. `sensors`: by name.
+        `x`: the state before. `row`: number of the step, and the inputs. From outside: `key_of_steps`, the trajectory's
+        key, from which each step gets keys of its own, and `sensors` by name.
         """
         k, u = row
         key_of_noise, *keys_of_sensors = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))

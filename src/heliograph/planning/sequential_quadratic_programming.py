@@ -75,7 +75,7 @@ class ScaledProgramme:
     def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
         """Prepare a descent from a start, in coordinates z = x / unit, with this smoothing of the error (`sharpness`).
 
-        `size`: the objective at the start, by which it is divided, so that it is about 1.
+        `self.size`: the objective at the start. The objective is divided by it, so that it is about 1.
         """
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
         low, high = problem.low / problem.unit, problem.high / problem.unit
@@ -86,10 +86,7 @@ class ScaledProgramme:
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def evaluate_at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point z, None where it does not exist; the last one is cached.
-
-        z: the point in units of each coordinate; `sharpness`: exponent by which the error is smoothed.
-        """
+        """Return the evaluation at a point z = x / unit, or None if there is none; the last evaluation is cached."""
         point, (last_point, evaluation) = z.tobytes(), self._last
         if point != last_point:
             evaluation = self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
@@ -97,12 +94,10 @@ class ScaledProgramme:
         return evaluation
 
     def objective(self, z: Vector) -> tuple[float, Vector]:
-        """Return the error, or mean total power where there is a target, over the size, and its derivative by z.
+        """Return the objective at z = x / unit over `self.size`, infinite without an evaluation, and its derivative.
 
-        Infinite where the point does not exist.
-
-        `unit`: of each coordinate, x = unit z. Powers are summed over the steps, so that their mean is that
-        over `steps`.
+        The objective is the error, or the total mean power if there is a target error. Powers are summed over all
+        steps, so their sum is divided by the number of steps.
         """
         evaluation = self.evaluate_at(z)
         if evaluation is None:
@@ -113,10 +108,10 @@ class ScaledProgramme:
         return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
 
     def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
-        """Return the unused part of each limit at z, that of the target error last: negative where one is exceeded.
+        """Return the unused part of each limit at z, with the target error last; it is negative if a limit is exceeded.
 
-        Rows of limits are scaled so that a limit is 1 (or 0), hence 1 - powers / limit; the target gives
-        1 - error / target. All are -1 at a point without an evaluation, where the error grows without limit.
+        Limits are scaled to 1 (or 0), so the parts are 1 - powers / limit, and 1 - error / target. All are -1 at a
+        point without an evaluation, where the error grows without limit.
         """
         rows, most, target = self.limits.rows, self.limits.most, self.limits.target
         evaluation = self.evaluate_at(z)
@@ -143,14 +138,14 @@ class ScaledProgramme:
         return self.objective(z)[0] if self.is_feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
-        """Return the point where a sequential quadratic programme ends, or the start where that is better."""
+        """Return the point where sequential quadratic programming ends, or the start if that is better."""
         constraints = []
         if len(self.limit_room(z)):
             constraints = [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
         # The merit is the objective within the limits and infinite outside.
         merit_at_start = self.merit(z)
         end = self._minimize(self.objective, z, constraints, tolerance)
-        # Neither the start nor the end is within the limits: first back into them, then down again.
+        # If neither the start nor the end is within the limits, go back into them first, and then descend again.
         if np.isinf(merit_at_start) and not self.is_feasible(end):
             within_limits = self._minimize(self._compute_squared_excess, end, [], tolerance)
             return self._minimize(self.objective, within_limits, constraints, tolerance)

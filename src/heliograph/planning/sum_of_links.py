@@ -33,20 +33,21 @@ class SummedLinks(NamedTuple):
     present: Vector
 
     def information(self, amplitudes: Vector) -> Float[np.ndarray, "n n"]:
-        """Return the information J = B' a a' B / (a' D a + N) that one step gives about the state.
+        """Return the information J = B' a a' B / (a' D a + N) about the state that one step gives.
 
-        a: amplitudes, B: `rows`, row i what link i carries of the state; D: `noise`, covariance of what the
-        links add before they are summed; N: `floor`, variance of the receiver's noise.
+        a are the amplitudes. Row i of B (`self.rows`) is what link i carries of the state. D (`self.noise`) is the
+        covariance of what the links add before the sum, and N (`self.floor`) the variance of the receiver's noise.
         """
         signal = amplitudes @ self.rows
         noise = float(amplitudes @ self.noise @ amplitudes) + self.floor
         return np.outer(signal, signal) / noise if noise > 0 else np.zeros((len(signal),) * 2)
 
     def best_information(self, total: float) -> Float[np.ndarray, "n n"]:
-        """Return B' (D + N T / P)^-1 B, which no amplitudes of this total power exceed.
+        """Return B' (D + N T / P)^-1 B, which no amplitudes of this total power P exceed.
 
-        B: `rows`, what each link carries; D: `noise`, of the links; N: `floor`, variance of the receiver's
-        noise; T: diagonal, `unit`, the power of each link at amplitude 1; P: `total`.
+        B (`self.rows`) is what each link carries of the state. D (`self.noise`) is the covariance of the links' noise,
+        and N (`self.floor`) the variance of the receiver's. T = diag(`self.unit`) is the power of each link at
+        amplitude 1.
         """
         noise = self.noise + np.diag(self.floor * self.unit / total)
         bound: np.ndarray = self.rows.T @ np.linalg.solve(noise, self.rows)
@@ -103,10 +104,10 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
     """
 
     def amplitudes_at(nu: float) -> Vector:
-        """Return the best amplitudes under the limits of each alone, of D + nu T and N - nu P.
+        """Return the best amplitudes under the limits of each link, for the noises D + nu T and N - nu P.
 
-        `variances` is the diagonal of D, `links.unit` T, `links.floor` N, `total` P, `caps` the limits. They are
-        computed by sizes, as the best amplitude has the sign of its link's gain b.
+        `variances` is the diagonal of D. `links.unit` is T, `links.floor` N, `total` P, and `caps` the limits. Sizes
+        are computed first, since the best amplitude has the sign of its link's gain b.
         """
         sizes = _cap_amplitudes(np.abs(b), variances + nu * links.unit, links.floor - nu * total, caps)
         return np.asarray(np.sign(b) * sizes)

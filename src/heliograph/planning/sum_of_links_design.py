@@ -43,9 +43,9 @@ DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
 def is_sum_of_links(network: object) -> bool:
-    """Return whether a network is one node that receives a sum of links.
+    """Return whether a network is a single node that receives a sum of links.
 
-    `common` is set where nodes share a channel, `relays` where relays filter.
+    `network.common` is set if nodes share a channel, and `network.relays` if relays filter.
     """
     if not isinstance(network, Network) or network.relays is not None or network.common is not None:
         return False
@@ -79,11 +79,10 @@ class SumOfLinksTask(NamedTuple):
 
     @property
     def caps(self) -> Vector:
-        """Largest amplitude of each link: a power a^2 t below peak and mean limit where it is free, else the present.
+        """Largest amplitude a of each link: the power a^2 t stays below peak and mean limit for a free link.
 
-        The error is steady, so limits have one step.
-
-        `present`: the amplitude that a link has in the network; `unit`: t, the power at amplitude 1.
+        Other links keep their present amplitude (`links.present`). t is `links.unit`, the power at amplitude 1. Limits
+        have one step, since the error is steady.
         """
         links = self.links
         caps: Vector = np.abs(links.present)
@@ -101,9 +100,10 @@ class SumOfLinksTask(NamedTuple):
         return self.error(self.covariance(self.links.information(amplitudes)))
 
     def bound_error(self, total: float) -> float:
-        """Return a lower bound of the error of all amplitudes with this total power of the free links.
+        """Return a lower bound of the error for all amplitudes with this total power of the free links.
 
-        The error with an information that none of them exceeds; `fixed`: power of the links that are not free.
+        It is the error with an information that none of them exceeds. `self.fixed`: power of the links that are not
+        free.
         """
         all_links = total + self.fixed
         states = self.links.rows.shape[1]
@@ -131,10 +131,10 @@ class SumOfLinksTask(NamedTuple):
             raise fail("budget", "one that limits every transmitter", "no limit")
 
         def amplitudes_at(x: Vector) -> Vector:
-            """Return the amplitudes of all links at x, the free ones scaled down where they exceed the total.
+            """Return the amplitudes of all links at x, with the free ones scaled down if they exceed the total power.
 
-            x: amplitudes of the free links as shares of `scale`, from -1 to 1; other links keep their
-            `present` ones. `unit`: power at amplitude 1.
+            x: amplitudes of the free links in units of `scale`, from -1 to 1. Other links keep their present
+            amplitudes. `links.unit`: the power at amplitude 1.
             """
             a = np.clip(x, -1, 1) * scale
             power = float(a**2 @ links.unit[free])
@@ -230,7 +230,10 @@ def _make_task(
 
 
 def _find_least_error_amplitudes(task: SumOfLinksTask, total: float) -> tuple[Vector, Certificate]:
-    """Return the amplitudes (links,) of the least error with a total power of the free links, and the certificate."""
+    """Return the amplitudes (links,) of least error at a total power of the free links, and their certificate.
+
+    A formula gives them if it holds; otherwise they are searched for.
+    """
     solution = task.find_amplitudes_by_formula(total)
     if solution is not None:
         error = task.compute_error(solution)
@@ -266,7 +269,7 @@ def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[V
 
 
 def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vector:
-    """Return the best amplitudes at a power of the free links: by formula, else by one descent from `near`."""
+    """Return the best amplitudes at a power of the free links: by formula if it holds, else by descent from `near`."""
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
     solution = task.find_amplitudes_by_formula(power)
@@ -274,11 +277,10 @@ def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vec
 
 
 def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> float:
-    """Return the total power at which the lower bound of the error reaches the target: no less power can reach it.
+    """Return the total power at which the lower bound of the error reaches the target; no less power can reach it.
 
-    By bisection of the power of the free links, up to the total power `needed` that was found to reach it.
-
-    `fixed`: power of the links that are not free.
+    It is found by bisection of the free links' power, up to the total power `needed` that is known to reach the target.
+    `task.fixed`: power of the links that are not free.
     """
     low, high = 0.0, needed - task.fixed
     for _ in range(HALVINGS):
@@ -353,7 +355,7 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
 
 
 def _require_plain_sum(node: Node) -> tuple[LinearSensor, Superposed]:
-    """Return the sensor and the sum of a node; ValueError where a design has no formulas for them."""
+    """Return the sensor and the sum of links of a node; raise ValueError if the formulas of a design do not hold."""
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
         raise _make_no_formula_error("a sensor that varies, is not linear or has angles")
@@ -375,15 +377,15 @@ def _make_no_formula_error(got: str) -> ValueError:
 def steady_covariance_with_information(
     matrix: Float[np.ndarray, "n n"], process: Float[np.ndarray, "n n"], information: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "n n"]:
-    """Return the steady covariance after each step of a filter of x+ = A x + w that receives this information in each.
+    """Return the steady error covariance of a filter of x+ = A x + w that receives information J in each step.
 
     Args:
         matrix: A.
         process: Cov w.
-        information: J, taken as J = H' H, a measurement H x with noise of covariance I; zero where nothing is told.
+        information: J = H' H, as of a measurement H x with noise of covariance I; zero if nothing is received.
     """
     eigenvalues, vectors = np.linalg.eigh(information)
-    # ALIKE: share of the largest eigenvalue below which one is rounding.
+    # An eigenvalue up to the share ALIKE of the largest counts as rounding.
     is_above_rounding = eigenvalues > ALIKE * max(eigenvalues[-1], 0.0)
     if not is_above_rounding.any():
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))

@@ -38,7 +38,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Return the names of the transmitters, in order of appearance."""
-    # A dict in place of a set: it keeps the order, and each name once.
+    # A dict has each name once, like a set, but keeps the order.
     names: dict[str, None] = {}
 
     def note_name(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
@@ -51,12 +51,12 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
 
 
 def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
-    """Return the mask (names,) of the transmitters that are chosen, by name or by what stands before a dot.
+    """Return a mask (names,) of the chosen transmitters, named fully or by the part before a dot (the node).
 
-    `what`: what the choice is of, for messages.
+    `what`: what is chosen, for messages.
 
     Raises:
-        ValueError: a choice that is there under no name.
+        ValueError: a choice that matches no name.
     """
     chosen_mask = np.zeros(len(names), dtype=bool)
     for choice in chosen:
@@ -68,9 +68,9 @@ def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) 
 
 
 def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
-    """Return the power of each transmitter at a step, its mean square, by name; `second`: E (y, 1)(y, 1)' of the input.
+    """Return the power (mean square of what is sent) of each transmitter at a step, by name.
 
-    Exact: modes have the law of the step.
+    The channel's modes have their law at this step, so the power is exact. `second`: E (y, 1)(y, 1)' of the input y.
 
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
@@ -81,9 +81,9 @@ def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int
 
 
 def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
-    """Return {name: power} of each transmitter in the long run, in the stationary law of the channel's modes.
+    """Return {name: power} of each transmitter in the long run, under the stationary law of the channel's modes.
 
-    A start that is stationary is kept: where a chain has several closed classes, it says how probable each is.
+    If the initial law is stationary, it is used: with several closed classes, it says how probable each class is.
     `second`: E (y, 1)(y, 1)' of what goes into the channel.
     """
     joint = joint_modes(channel, order=2)
@@ -93,17 +93,17 @@ def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict
 
 
 def compute_powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
-    """Return the power of each transmitter of a channel by name, where the channel's modes have this law.
+    """Return the power of each transmitter of a channel by name, if the channel's modes have this law.
 
-    A channel without memory has one mode. The mean is that over the modes in which a transmitter is received: in the
-    others it sends as well, which the receiver does not notice.
+    A channel without memory has one mode. The power is a mean over the modes in which the transmitter is received. In
+    other modes it sends too, although nothing of it is received.
 
     Args:
         channel: the channel.
         second: E (y, 1)(y, 1)' of what goes into the channel.
         law: probability of each mode.
     """
-    # By transmitter: the sum of P(mode) power over modes in which it is received, and the sum of their P(mode).
+    # For each transmitter: sums of P(mode) power, and of P(mode), over the modes in which it is received.
     sums: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
     probabilities = dict(sums)
     for probability, mode_map in zip(law, joint_modes(channel, order=2).maps, strict=True):
@@ -121,11 +121,10 @@ def _list_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Sca
     powers: dict[str, Scalar] = {}
 
     def note_power(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
-        """Note what the hop sends, and leave it as it is.
+        """Note the power that the hop sends in `powers`, and return the hop as it is.
 
-        A: `hop.matrix`; E[y y']: `signal.second` without its last row and column, those of the constant 1;
-        `arrives`: probability that the hop has a signal to send. `powers` takes the result, tr A E[y y'] A'
-        times that.
+        The power is P(arrives) tr(A E[y y'] A') with A = `hop.matrix`. `signal.arrives`: the probability that the hop
+        has a signal to send. `signal.second`: E (y, 1)(y, 1)', whose last row and column belong to the constant 1.
         """
         assert signal is not None and isinstance(hop, GainAndNoise)
         if not hop.is_silent:
@@ -137,9 +136,9 @@ def _list_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Sca
 
 
 def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
-    """Return total / probability, a conditional mean; zero where the condition never holds."""
+    """Return total / probability, a conditional mean, or 0 if the probability is 0."""
     if is_traced(probability):
-        # Under JAX both branches are computed: no division by 0 may occur.
+        # JAX computes both branches, so that a division by 0 must be avoided.
         quotient: Scalar = total / library(probability).where(probability == 0, 1.0, probability)
         return quotient
     return 0.0 if is_zero(probability) else plain(total / probability)
@@ -170,10 +169,9 @@ def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float 
     """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
 
     def amplify(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
-        """Return the hop of this name amplified, any other as it is.
+        """Return the hop called `name` with its matrix times `factor`, and any other hop as it is.
 
-        `name`: of the hop that is changed; `factor`: None in place of a number sets its matrix to 1, so that it
-        sends just what it receives.
+        If `factor` is None, its matrix becomes I, so that it sends just what it receives.
         """
         if hop_name != name:
             return hop
@@ -187,7 +185,7 @@ def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float 
 def find_free_transmitters(
     names: Sequence[str], free: Sequence[str] | Mapping[str, object] | None
 ) -> Bool[np.ndarray, "hop"]:
-    """Return which transmitters are free, all unless some are named.
+    """Return which transmitters are free: those named in `free`, or all if it is None.
 
     Raises:
         ValueError: numbers instead of names, or no transmitter is left.

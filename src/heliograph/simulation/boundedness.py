@@ -62,7 +62,9 @@ class Boundedness(NamedTuple):
 
 
 def certify_boundedness(network: Network) -> Boundedness:
-    """Judge E P of the best filter that receives every node of `network`, linear in what arrives, knowing what arrived.
+    """Judge whether E P, the mean error covariance of the best linear filter of all nodes' messages, stays bounded.
+
+    The filter knows what arrived. U_i is the part of E P in state i of the losses, and `chain` holds their transitions.
 
     Certified: rho of U_j -> sum_i chain[i, j] (A - K_i C_i) U_i (A - K_i C_i)' is below 1 for some gains, which are
     searched first and then certified independently of the search. Only rows of known gain are used: a gain that is
@@ -70,8 +72,8 @@ def certify_boundedness(network: Network) -> Boundedness:
     impossible.
     Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
     are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
-    Nodes of which a trigger, limits or `stuck` decide what is used are not counted on: certified is what the others
-    show; impossible is what all could not show though they sent everything; all else is undecided.
+    Some nodes use a message only if a trigger, limits or `stuck` allow it. Certified is what holds without these nodes.
+    Impossible is what holds even if they send everything. All else is undecided.
 
     Args:
         network: linear, of nodes that receive their sensors over channels that do not vary.
@@ -212,10 +214,11 @@ class KnownGainSums(NamedTuple):
     random: bool
 
     def find_noise_of_sums(self, outcome: ArrivalOutcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
-        """Return Cov(D z) of one outcome of the losses, at x = 0, about the mean over all outcomes that look the same.
+        """Return Cov(D z) for one outcome of the losses at x = 0, about the mean of all outcomes that look the same.
 
-        D is `combine`. With z = G y, y = (v, 1) at x = 0, and M = `mean` that of G over these outcomes, it is
-        D E[(G y - M E y) (G y - M E y)'] D', where the last entry of y takes G's offset.
+        D is `self.combine`. What is received is z = G y with y = (v, 1): the sensors' noise v, and 1 for G's offset.
+        M is `self.mean`, the mean of G over the outcomes that look the same. The result is
+        D E[(G y - M E y) (G y - M E y)'] D'.
         """
         mean, gain_moments = second_moments(outcome.map)  # E G, and E[G_ia G_jb] as [i, j, a, b], in this outcome
         mean_signal = np.append(links.sensor_mean, 1.0)
@@ -265,9 +268,9 @@ def _find_known_sums(
 
 
 def _describe_certificate(transition: Float[np.ndarray, "n n"], radius: float) -> str:
-    """Return in words why errors stay bounded: a stable plant, or fixed gains of this spectral radius of the error.
+    """Return in words why the errors stay bounded: the plant is stable, or fixed gains bound them.
 
-    `transition`: the plant's transition matrix.
+    `transition`: the plant's transition matrix. `radius`: the spectral radius of the error under these fixed gains.
     """
     if spectral_radius(transition) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"

@@ -50,10 +50,10 @@ class MistakenBelief(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The same as a sentence: "filter 'f' believes another channel than node 'a'".
+        """Return the belief as a sentence such as "filter 'f' believes another channel than node 'a'".
 
-        FUSED: the name under which central filters stand; RANGE, UNSAID: parts of a belief, that limits refuse
-        readings and that the filter does not say what it believes.
+        FUSED is the name under which central filters stand. RANGE in `self.parts` says that limits refuse some
+        readings. UNSAID says that the filter does not tell which models it believes.
         """
         place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
         reason = ", where limits refuse some" if RANGE in self.parts else ""
@@ -67,9 +67,10 @@ def lower_claim(claim: Claim) -> Claim:
 
 
 def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
-    """Return a copy of the filter, and of those inside it, whose covariance claims "nominal" at most.
+    """Return a copy of the filter that claims "nominal" at most, as do the filters inside it.
 
-    It keeps the models that it was made for, and that its claim was lowered. "nominal": what the filter believes.
+    "nominal" means that the covariance is only what the filter believes. The copy remembers the models that it was made
+    for, and whether its claim was lowered.
     """
 
     def is_inner(leaf: object) -> bool:
@@ -86,11 +87,11 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
 
 
 def lower_claim_if_mistaken(own_models: Premise, filter: AbstractFilter) -> AbstractFilter:
-    """Return the filter as it is if it was made for the models where it stands, else one that claims "nominal" at most.
+    """Return the filter itself if it was made for `own_models`, else a copy that claims "nominal" at most.
 
     Args:
         own_models: the models at the place where it stands: plant, sensor, channel and trigger.
-        filter: the filter, which keeps its claim outside of the network.
+        filter: the filter, which itself keeps its claim.
     """
     # A claim of "nominal" or less need not be lowered, whatever the filter was made for.
     is_weak = lower_claim(filter.claim) == filter.claim
@@ -109,9 +110,9 @@ def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
 
 
 def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack.
+    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they can be stacked.
 
-    Those of filters that know a sender's heartbeat differ: the longest decides.
+    Only filters that know a sender's heartbeat differ in length; all are padded to the longest heartbeat.
     """
     all_filters = [filter for node in nodes.values() for filter in node.filters.values()]
     padded: dict[str, Node | ReceivingNode] = {}
@@ -122,9 +123,9 @@ def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, No
 
 
 def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
-    """Return what is fused, with each central filter's claim lowered to "nominal" that was made for other models.
+    """Return the network's fusions; central filters made for other models claim "nominal" at most.
 
-    A central filter receives all measurements; its models are the sensors and channels of all nodes together.
+    A central filter receives all measurements. Its models are the sensors and channels of all nodes together.
     """
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
@@ -138,7 +139,7 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
 
 
 def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with copies of their filters that claim "nominal" at most: what a filter believes, no bound."""
+    """Return the nodes with filters that claim "nominal" at most: what the filter believes, and no bound."""
     return {
         name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
         for name, node in network.nodes.items()
@@ -151,9 +152,9 @@ def make_fusions_nominal(network: HasNodes) -> dict[str, Fusion | AbstractFilter
 
 
 def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
-    """Return the node with other filters of the same names; itself where they are its own.
+    """Return the node with other filters of the same names, or the node itself if all are its own.
 
-    A copy without the constructor, which would check and compute all again.
+    The copy is made without the constructor, which would check and compute everything again.
     """
     if all(filters[name] is node.filters[name] for name in filters):
         return node
@@ -195,9 +196,9 @@ def find_premise(network: HasNodes, name: str) -> Premise:
 
 
 def find_common_premise(network: HasNodes) -> Premise:
-    """Return plant, sensors and channels of all nodes together, in their order: the models of a central filter.
+    """Return the models of a central filter: the plant, and the sensors and channels of all nodes in their order.
 
-    `common`: the one sensor and channel that all nodes share, where there is one.
+    `network.common`: the sensor and channel that all nodes share, or None.
     """
     if network.common is not None:
         return Premise(network.plant, network.common.sensor, network.common.channel)
@@ -206,11 +207,7 @@ def find_common_premise(network: HasNodes) -> Premise:
 
 
 def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
-    """Yield the filters made for other models than those where they stand, node after node, central ones last.
-
-    Args:
-        network: the network.
-    """
+    """Yield the filters made for other models than those of the place where they stand; central filters come last."""
     for name in network.names:
         if filters := network.nodes[name].filters:
             yield from _yield_mistaken_beliefs(name, find_premise(network, name), filters)
@@ -222,10 +219,10 @@ def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
 def _yield_mistaken_beliefs(
     node: str, own_models: Premise, filters: Mapping[str, AbstractFilter]
 ) -> Iterator[MistakenBelief]:
-    """Yield the filters of a node that claim something and were made for other models than `own_models`, the node's.
+    """Yield the filters of a node that claim a covariance but were made for other models than `own_models`, the node's.
 
-    Each with the parts of the models that differ. Filters that do not say for which models they were made (no
-    premise) are passed over, unless lowered already.
+    Each comes with the parts of the models that differ. A filter without a premise does not say which models it was
+    made for. It is passed over, unless its claim was lowered already.
     """
     for label, filter in filters.items():
         is_known = filter.premise is not None or filter.kept.lowered

@@ -43,7 +43,10 @@ def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[Abs
 
 
 def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
-    """Return the filters, also inside of others, that use flags: numbers behind the measurement that say a mode."""
+    """Return the filters that use flags, also those inside other filters.
+
+    A flag is a number after the measurement that tells the mode of a link.
+    """
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
     filters = [leaf for leaf in leaves if isinstance(leaf, kinds)]
@@ -51,7 +54,7 @@ def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | M
 
 
 def _reveals_mode(affine: AbstractRandomAffine, late: bool) -> bool:
-    """Return whether a map delivers the mode of a memory: that of the step before if `late`, else that of this step."""
+    """Return whether a map delivers the mode of a memory: that of the previous step if `late`, else of this step."""
     if late:
         return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)
     return isinstance(affine, ModeOutput)

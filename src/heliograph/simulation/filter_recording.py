@@ -136,9 +136,9 @@ def run(
 
 
 def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
-    """Warn of what a record shows: values that are no numbers, wide angles, doubtful estimates, data left out, remarks.
+    """Warn of doubtful things in a record: numbers that are not finite, wide angles, data left out, and remarks.
 
-    `state`: of all filters after the last row.
+    `state`: states of all filters after the last row.
     """
     warn_of_non_finite_numbers(record)
     doubts = *doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)
@@ -146,7 +146,7 @@ def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
 
 
 def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyTree, clock: np.ndarray) -> Record:
-    """Return the record of what all filters made of the rows (`outputs`), with its smoothed part where there is one.
+    """Return the record of all filters' outputs for the rows, with a smoothed part if there is a smoothing plan.
 
     `clock`: times of the rows.
     """
@@ -168,7 +168,7 @@ def _warn_of_each(lines: Sequence[str]) -> None:
 
 
 def _count_rows(measurements: ArrayLike) -> int:
-    """Return the number of rows of a node's measurements: 1 of a single number; raise ValueError where it is 0."""
+    """Return the number of rows of a node's measurements; raise ValueError if it is 0. A single number is 1 row."""
     steps = len(measurements) if rank("measurements", measurements) else 1  # type: ignore[arg-type]
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
@@ -206,7 +206,7 @@ def _make_forecast_origin(network: Network, record: Record, state: PyTree, u: np
 def _find_times(
     measured: Mapping[str, ArrayLike], other_tables: Mapping[str, object], time: ArrayLike | None, steps: int
 ) -> np.ndarray | None:
-    """Return the times of the rows: `time`, else the dates by which the tables know them; None where there are none.
+    """Return the times of the rows: `time`, or else the dates that the tables have; None if there are neither.
 
     `measured`: tables of measurements by node. `other_tables`: further tables by name. `steps`: number of rows.
     """
@@ -217,9 +217,9 @@ def _find_times(
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each output of which a filter that weighs what arrives left out most.
+    """Yield a line for each output that a filter mostly left out.
 
-    FUSED: the name under which filters of all nodes' measurements stand.
+    Only filters that weigh what arrives leave out any. FUSED is the name of filters of all nodes' measurements.
     """
     for node, filters in record.weighed.items():
         if node == FUSED:
@@ -236,9 +236,9 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
 
 
 def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
-    """Return what arrived in each step, by fusion, from recorded `reports`: at a centre, and between neighbours.
+    """Return what arrived in each step, for each fusion at a centre or between neighbours, from recorded `reports`.
 
-    `steps`: number of rows. What was not recorded is taken to arrive if it cannot get lost.
+    `steps`: number of rows. Messages that cannot get lost need not be recorded: they are taken to arrive.
     """
     reports = table("reports", reports, "reports by fusion")
     centre_arrivals: dict[str, PyTree] = {

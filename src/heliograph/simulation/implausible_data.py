@@ -75,15 +75,15 @@ def step_plausibly(
         return (turn == 0) | (turn == 1) & is_implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
-        """Return the next turn's number, and all filters stepped without what the turn before judged implausible.
+        """Return the next turn's number, and all filters stepped without what the previous turn judged implausible.
 
-        In turn 0 that is nothing. Closed over, the same in every turn: the network's `filters`, their `states` before
-        the step, its measurements z, inputs u and number k, and the losses `drawn` of the uplinks.
+        In turn 0 nothing is skipped. From outside, the same in every turn: the network's `filters`, their `states`
+        before the step, its measurements z, inputs u and number k, and the losses `drawn` of the uplinks.
         """
         turn, (_, outputs_before) = carry
         skip = read_refusal_reasons(outputs_before)
         after, outputs = _step_filters(filters, states, z, u, k, drawn, skip)
-        # The first turn judges all data, the second what is left of them: the first's judgements stay.
+        # Keep the judgements of the first turn, since only it judges all data.
         for name in ("judged", "judged_centrally"):
             outputs[name] = jax.tree.map(
                 lambda first, now: jnp.where(turn == 0, now, first), outputs_before[name], outputs[name]
@@ -111,9 +111,9 @@ class JudgementReader:
         return self._stack_judgements(outputs, self._places[node], not self._places[node])
 
     def read_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of all filters, those of the nodes by kind and then central ones.
+        """Return the judgements of all filters: first those of the nodes by kind, then those of central filters.
 
-        A kind is a stack of filters of one structure, (filter, node). The last axis: the fields of a Judgement.
+        A kind is a stack (filter, node) of filters of one structure. The last axis holds the fields of a Judgement.
         """
         places = []
         for kind, judgement in enumerate(outputs["judged"]):
@@ -124,10 +124,10 @@ class JudgementReader:
     def _stack_judgements(
         self, outputs: Mapping[str, PyTree], places: Sequence[EstimatePlace], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of these filters, and those of the centre behind them if `central`.
+        """Return the judgements of these filters, followed by those of the central filters if `central` is True.
 
-        `places`: (kind, filter, node) of each in the stacked outputs. Axes of the result: the recording's, filter,
-        field of a Judgement.
+        `places`: (kind, filter, node) of each filter in the stacked outputs. The result has the recording's axes, then
+        filters, then the fields of a Judgement.
         """
         judgements = [
             [field[..., place.filter, place.node] for field in outputs["judged"][place.kind]] for place in places
@@ -146,12 +146,11 @@ class JudgementReader:
 def find_refused_rows(
     network: Network, outcome: Mapping[str, PyTree]
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
-    """Return the rows whose values all filters of a node refuse, with the reason: by node, and of the central filters.
+    """Return the rows that all filters of a node refuse, with the reason; first by node, then for central filters.
 
-    A filter refuses a measurement that is implausible to it, by its judgement.
-
-    Nodes without filters of their own are judged by the central ones, all alike: the first tells for all. `outcome`:
-    what filtering the rows with judgements put out.
+    A filter refuses a measurement that it judges implausible. Central filters judge nodes that have no filters, all in
+    the same way, so the first of these nodes tells for all. `outcome`: the outputs of filtering the rows with
+    judgements.
     """
     reader, refused = JudgementReader(network), dict[str, dict[int, str]]()
     without_own = reader.without_own
@@ -244,9 +243,9 @@ class _NonFiniteFunctionFinder:
 
 
 def _find_flagged(judgements: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
-    """Return the numbers of the rows in which this field of some filter's judgement is over 0.
+    """Return the numbers of the rows in which this field of some filter's judgement is above 0.
 
-    `judgements`: the judgements, whose last axis are the fields of a Judgement.
+    `judgements`: their last axis holds the fields of a Judgement.
     """
     if not judgements.size:
         return []

@@ -23,7 +23,8 @@ def log_likelihood(
 ) -> Scalar:
     """Return log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
 
-    Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere.
+    It is exact for the Kalman filter of a linear Gaussian system. For other filters it is nominal, but a fit can still
+    maximise it.
     `jax.grad` passes through it, in any number that the filter is made of, in the precision of the trace
     (`jax.enable_x64`). Derivatives are right also where covariances are zero by the filters of `hg.kalman_filter` and
     `hg.linear_filter` themselves (known start, known law of a link without memory, no limits of states, no inputs of
@@ -48,7 +49,7 @@ def log_likelihood(
     if is_traced(arguments):
         return filter.trace_log_likelihood(_sum_log_likelihoods, *arguments[1:])
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
-    if total is not None:  # it could be done in chunks
+    if total is not None:  # None: the filter cannot be run in chunks
         return float(total)
     return float(compute_once(_sum_log_likelihoods, _sum_by_xla, arguments))
 

@@ -159,7 +159,9 @@ class Network(Module):
         """Raise ValueError unless nodes and filters fit the plant, and names' checksums, which seed draws, differ."""
         node_type = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
-            if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
+            if (
+                not isinstance(node, ReceivingNode) or node.filters
+            ):  # a ReceivingNode without filters may stand anywhere
                 check_type(f"node {name!r}", node, node_type)
             for label, filter in node.filters.items():
                 check_states(f"filter {label!r} of node {name!r}", filter, self)
@@ -180,7 +182,7 @@ class Network(Module):
                 find_received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
-        """Raise ValueError unless each fusion fits its nodes, and each central filter all that is received."""
+        """Raise ValueError unless each fusion fits its nodes, and each central filter receives what all nodes do."""
         for name, fusion in self.fused.items():
             check_states(f"fused {name!r}", fusion, self)
             if isinstance(fusion, Fusion):
@@ -275,14 +277,14 @@ class Network(Module):
         return Network(plant, nodes, fused, common=CommonReception(sensor, channel))
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
-        """Return the network of a recording with measurements of these nodes alone, without relays that have none.
+        """Return the network with only the nodes of these names; only relays may be left out.
 
         Raises:
-            ValueError: a node that is not a relay is lacking, or there is one too many.
+            ValueError: a node that is not a relay is missing, or a name is no node's.
         """
         measured_nodes = set(names)
         optional = set() if self.relays is None else set(self.relays.relays)
-        # Names that are given and no node's, or the reverse; relays alone may lack.
+        # Names without a node, and nodes without a name; only relays may be missing.
         mismatched = sorted((measured_nodes ^ set(self.nodes)) - (optional - measured_nodes))
         if mismatched:
             raise fail("measurements", f"arrays for the nodes {sorted(self.nodes)}", f"a mismatch in {mismatched}")
@@ -310,7 +312,7 @@ class Network(Module):
 
     @property
     def shared(self) -> dict[str, tuple[str, ...]]:
-        """Names of the nodes that share something, by its name: fading (`hg.shared`), or one channel for all."""
+        """Names of the nodes that share something, by its name: fading (`hg.shared`), or one channel for all nodes."""
         nodes_by_memory: dict[str, list[str]] = {}
         for name, node in self.nodes.items():
             for memory in memories(node.channel).values() if isinstance(node, Node) else ():
@@ -321,7 +323,7 @@ class Network(Module):
 
     @cached_property
     def angles(self) -> dict[str, Angles]:
-        """Places of the angles among the numbers that each node receives, of a channel of all its own `rows`."""
+        """Places of the angles among the numbers that each node receives, of a common channel its own `rows`."""
         if self.common is None:
             return {
                 name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
@@ -335,7 +337,7 @@ class Network(Module):
         return write_diagram(self)
 
     def claims(self) -> Claims:
-        """Return by node and filter what each estimate claims of its covariance; fused ones last, under "fused"."""
+        """Return what each estimate claims of its covariance, by node and filter; fused ones come last, under FUSED."""
         claims: Claims = {name: {} for name in (*self.names, *([FUSED] if self.fused else []))}
         for (node, name), claim in self.claimed.items():
             claims[node][name] = claim
@@ -346,7 +348,7 @@ class Network(Module):
         return tuple(yield_mistaken_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
-        """Return the network whose estimates claim "nominal" at most, as where digits are lost that nothing bounds."""
+        """Return the network whose estimates claim "nominal" at most, for where an unknown number of digits is lost."""
         lowered = copy(self)  # without the constructor, which would check all again
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
         # Fields are frozen.
@@ -356,12 +358,12 @@ class Network(Module):
         return lowered
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
-        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel.
+        """Return the sensor, channel and filter `name` of each node that has this filter and receives over a channel.
 
-        The sensor and channel are the node's own, or those common to all nodes; a node behind relays has neither.
+        Sensor and channel are the node's own, or common to all nodes. A node behind relays has neither and is left out.
         """
         nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
-        # Which object has the sensor and channel of each node: the node, or what all share; None behind relays.
+        # The owner of each node's sensor and channel: the node, or what all nodes share, or None behind relays.
         owners = {label: node if isinstance(node, Node) else self.common for label, node in nodes.items()}
         return {
             label: (owner.sensor, owner.channel, nodes[label].filters[name]) for label, owner in owners.items() if owner
@@ -375,18 +377,18 @@ class Network(Module):
     def screen_readings(
         self, measurements: dict[str, np.ndarray], inputs: np.ndarray, before: Mapping[str, Repeats]
     ) -> ScreenedRecording:
-        """Return measurements by node, without the readings that nodes refuse; `before`: equal ones in earlier rows."""
+        """Return measurements by node without the readings that nodes refuse; `before`: equal ones in earlier rows."""
         return screen_recording(self.nodes, self.inputs, measurements, inputs, before)
 
     def drop_refused_readings(self, measurements: dict[str, np.ndarray], inputs: np.ndarray) -> dict[str, np.ndarray]:
-        """Return measurements by node, (steps, received), without the readings that nodes refuse; warn of these."""
+        """Return the measurements by node (steps, received), without readings that nodes refuse, and warn of these."""
         screened = self.screen_readings(measurements, inputs, {})
         for line in screened.said:
             warnings.warn(line, stacklevel=3)
         return screened.measurements
 
     def check_sends_each_step(self, what: str) -> None:
-        """Raise ValueError if a node has a trigger: `what` is computed for senders that transmit at each step."""
+        """Raise ValueError if a node has a trigger, since `what` needs senders that transmit at each step."""
         deciding = [name for name, node in self.nodes.items() if isinstance(node, Node) and node.trigger is not None]
         if deciding:
             raise fail(what, "senders that transmit at each step", f"triggers of {deciding}")

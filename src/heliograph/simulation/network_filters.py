@@ -106,10 +106,11 @@ class AllFilters(Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """Return the states before the first step.
+        """Return the states before the first step, as a tuple.
 
-        A tuple: of the nodes' filters by kind; of central filters by name; of quantizers, by stack of fusions; of the
-        informed centres; of fusions by reports and between neighbours by name; and the fused estimates to be tested.
+        Its entries: states of the nodes' filters by kind; of central filters by name; of quantizers by stack of
+        fusions; of the informed centres; of fusions by reports and between neighbours by name; and the fused estimates
+        to be tested.
         """
         central = {name: initial_state(filter) for name, filter in self.central.items()}
         states = tuple(stacked.init() for stacked in self.alike)
@@ -123,10 +124,11 @@ class AllFilters(Module):
     def _init_centre(
         self, centre: FusionCentre | LinearisedCentre, states: Sequence[PyTree]
     ) -> CentreState | dict[str, LinearisedFusionState]:
-        """Return a centre's state before the first step, from the first means of the filters whose estimates it fuses.
+        """Return a centre's state before the first step, from the initial means of the filters that it fuses.
 
-        `states`: of the nodes' filters by kind, a stack of filters of one structure. Means of one kind are (filter and
-        node, n), filter after filter. `centre.sources`: (kind, number within the kind) of what it fuses.
+        `states`: states of the nodes' filters by kind, a stack of filters of one structure. The means of a kind are
+        rows (filter and node, n), filter after filter. `centre.sources`: (kind, number within the kind) of each filter
+        it fuses.
         """
         means = []
         for kind, filter in centre.sources:
@@ -136,7 +138,7 @@ class AllFilters(Module):
 
     @property
     def are_linear_and_unfused(self) -> bool:
-        """Whether all filters are linear, with gains that depend on no data, and no estimates of theirs are fused."""
+        """Whether all filters are linear with gains that depend on no data, and none of their estimates is fused."""
         filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
         are_fused = self.fusions or self.centres or self.reporting or self.meshes
         return not are_fused and all(filter.is_linear for filter in filters)
@@ -147,10 +149,10 @@ class AllFilters(Module):
         return tuple(centre for centre in self.centres if isinstance(centre, FusionCentre))
 
     def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
-        """Return the matrices of step k of the filters whose estimates a centre fuses, for each of its sources.
+        """Return the matrices of step k of the filters that a centre fuses, one entry for each of its sources.
 
-        `states`: of the nodes' filters by kind, before the step. The matrices depend on covariances alone, so that
-        measurements of zero do.
+        `states`: states of the nodes' filters by kind, before the step. The matrices depend on covariances alone, so
+        the measurements are set to zero.
         """
         matrices = []
         for kind, filter in centre.sources:
@@ -254,7 +256,8 @@ class AllFilters(Module):
     def _list_details(self) -> list[tuple[str, str, str]]:
         """Return which further results of a step are put out: those for smoothing, and judgements of measurements.
 
-        Each as (field of `StepOutput`, its name among the outputs of the nodes' filters, and of central filters).
+        An entry is (field of `StepOutput`, its name in the outputs of the nodes' filters, its name in those of central
+        ones).
         """
         judgements = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
         steps = [("steps", "smoother_steps", "central_steps")]
@@ -369,9 +372,9 @@ def initial_states(filters: AllFilters) -> PyTree:
 def centre_filter(network: Network, name: str) -> CentreFilter:
     """Return the filter of the centre that fuses all nodes' reports, for the fusion `name` by `AllReports`.
 
-    The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
-    that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
-    the bound on its error. Claim: as the fusion's.
+    Its measurement joins what arrives of this step's reports, node after node in the network's order. If links may be
+    late, what arrives of the previous step's reports follows, and so on. What did not arrive is NaN. A quantizer enters
+    by the bound on its error. The filter's claim is that of the fusion.
 
     Args:
         network: the network.
@@ -379,7 +382,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
     Raises:
         ValueError: no fusion of this name, or one by another rule; nodes that lose measurements, since their reports
-            do not say which arrived.
+            do not say which measurements arrived.
 
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
     """

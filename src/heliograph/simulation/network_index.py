@@ -27,9 +27,9 @@ class EstimatePlace(NamedTuple):
 def find_estimate_places(
     groups: Sequence[Sequence[str]], kinds: Sequence[AlikeFilters]
 ) -> dict[tuple[str, str], EstimatePlace]:
-    """Return the place of each estimate in the stacks of filters, by node and name of the filter.
+    """Return the place of each estimate in the stacks of filters, by (node, name of the filter).
 
-    `groups`: names of the nodes of one structure. `kinds`: filters of one structure at the nodes of a group.
+    `groups`: names of the nodes of each structure. `kinds`: filters of one structure at the nodes of a group.
     """
     return {
         (node, name): EstimatePlace(kind=k, filter=f, node=i)
@@ -40,7 +40,7 @@ def find_estimate_places(
 
 
 def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Return names in groups of items that differ in numbers alone, in order of first appearance."""
+    """Return the names in groups, in order of first appearance; models of one group differ only in their numbers."""
     names_by_structure: dict[object, list[str]] = {}
     for name, model in items:
         names_by_structure.setdefault(structure_key(model), []).append(name)
@@ -50,9 +50,10 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
 def list_alike_filters(
     groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]
 ) -> tuple[AlikeFilters, ...]:
-    """Return the kinds of filters, those of one structure at the nodes of one group, group after group.
+    """Return the kinds of filters, group after group; a kind is filters of one structure at the nodes of one group.
 
-    `filters`: of each node, by node and name; nodes of a group have alike ones, so its first node tells for all.
+    `filters`: the filters of each node, by node and name. Nodes of a group have alike filters, so the first node of a
+    group tells for all.
     """
     return tuple(
         AlikeFilters(g, alike)
@@ -62,9 +63,9 @@ def list_alike_filters(
 
 
 def list_alike_meshes(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[AlikeFilters, ...]:
-    """Return each fusion between neighbours at each group of nodes that takes part in it, as a kind of one filter.
+    """Return a kind of one filter for each fusion between neighbours and each group of nodes that takes part in it.
 
-    Sorted by name, as compiled code has them. `meshes`: names of the fusions of each node.
+    The fusions are sorted by name, as in compiled code. `meshes`: names of the fusions of each node.
     """
     all_meshes = sorted({mesh for of_node in meshes.values() for mesh in of_node})
     return tuple(
@@ -79,10 +80,10 @@ def find_rows_of_nodes(received: Mapping[str, int]) -> dict[str, range]:
 
 
 def find_measurement_order(groups: Iterable[Sequence[str]], rows: Mapping[str, range]) -> np.ndarray | None:
-    """Return the order that brings measurements joined group after group into that of the nodes.
+    """Return the order that brings measurements joined group after group into the order of the nodes.
 
-    `rows`: where each node's measurements stand in the latter. None where the two are the same: no gather is compiled
-    then.
+    `rows`: where each node's measurements stand in the order of the nodes. The result is None if both orders are the
+    same, so that no gather is compiled.
     """
     position_by_group = np.concatenate([rows[name] for names in groups for name in names])  # in the nodes' order
     order = np.argsort(position_by_group)

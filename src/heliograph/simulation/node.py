@@ -130,9 +130,9 @@ class Node(Module):
 
     @property
     def predictor(self) -> str | None:
-        """Name of the filter with whose prediction the sender compares what it measured, to decide whether to send.
+        """Name of the filter whose prediction the sender compares with its measurement, to decide whether to send.
 
-        None where it compares with none.
+        It is None if the sender compares with no prediction.
         """
         if self.trigger is None or self.trigger.reference != "prediction":
             return None
@@ -152,15 +152,15 @@ class Node(Module):
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement: values, side information, then dithers "dither_OUTPUT".
 
-        A dither is noise that an encoder adds before rounding, and the receiver subtracts. FLAG: a number that carries
-        no output.
+        A dither is noise that an encoder adds before rounding and the receiver subtracts. FLAG marks a number that
+        carries no output.
         """
         channel = first(self.channel)
         if self.encoder is None or not self.encoder.subtracts:
             return name_received_values(self.outputs, channel, self.received - channel.outputs)
         dithers = [f"dither_{self.outputs[place]}" for place in find_carried_components(channel) if place != FLAG]
         values = name_received_values(self.outputs, channel, self.received - channel.outputs - len(dithers))
-        # Of an output that arrives several times, such as over two links, the dithers are numbered.
+        # Number the dithers of an output that arrives several times, such as over two links.
         repeated = {name for name in dithers if dithers.count(name) > 1}
         numbers = [dithers[: i + 1].count(name) for i, name in enumerate(dithers)]  # among those of one name
         return values + tuple(
@@ -268,9 +268,9 @@ def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
 
 
 def check_received(name: str, filter: AbstractFilter, received: int) -> None:
-    """Raise ValueError for a filter of another number of components than arrive, unless it uses no measurements.
+    """Raise ValueError if a filter receives another number of components than arrive, unless it uses no measurements.
 
-    `name`: of the filter, for errors. `received`: how many arrive.
+    `name`: of the filter, for errors. `received`: how many components arrive.
     """
     if filter.received not in (0, received):  # 0: it uses no measurements
         expected = f"one that receives the {received} numbers that arrive"
@@ -322,7 +322,7 @@ def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:
-    """Raise ValueError for objects that are no filters, or that do not receive as many components as their node."""
+    """Raise ValueError for an object that is no filter, or that does not receive as many components as its node."""
     for name, filter in filters.items():
         check_type(f"filter {name!r}", filter, AbstractFilter)
         if isinstance(filter, AbstractFilter):
@@ -332,7 +332,7 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
 def get_parts_of_reception(node: Node | ReceivingNode) -> object:
     """Return the parts of a node that determine its measurements.
 
-    Nodes where these have one structure, and differ in numbers alone, are simulated as a group.
+    Nodes whose parts have one structure and differ only in numbers are simulated as a group.
     """
     if isinstance(node, Node):
         carried = None if node.encoder is None else find_carried_components(node.channel)

@@ -17,9 +17,10 @@ from heliograph.smoothing.forward_and_backward_pass import plan_with_smoother_st
 
 
 def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
-    """Return the filters with all that depends on no data, such as gains, computed before for inputs u.
+    """Return the filters with everything that depends on no data, such as gains, computed ahead for the inputs u.
 
-    Only of filters whose nodes always receive all data (`complete`, by group); central filters receive all nodes'.
+    This is done only for nodes that always receive all data (`filters.complete`, by group). Central filters receive all
+    nodes, so they need that all groups are complete.
     """
     stacks = [_precompute_stack(stack, u) if filters.complete[stack.group] else stack for stack in filters.alike]
     central_planned = filters.central if all(filters.complete) else {}
@@ -32,9 +33,9 @@ def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -
 
 
 def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
-    """Return a stack of filters with all that depends on no data computed before, for the steps of inputs u.
+    """Return a stack of filters with everything that depends on no data computed ahead, for the inputs u.
 
-    By one program for all: this library's native code, or XLA's where that refuses.
+    One program computes all filters: this library's native code, or XLA if native code refuses them.
     """
     count = alike.count * alike.nodes
     arguments = alike.filters, u, alike.smooths
@@ -42,7 +43,7 @@ def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
         choice = choose_code(_precompute_filter, arguments, differs_by_run=(True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
-    # What is the same for all filters is computed once, and repeated for each.
+    # What is the same for all filters was computed once, and is repeated for each filter.
     planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 

@@ -13,9 +13,10 @@ Number = int | jax.Array | np.ndarray
 
 
 def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax.Array:
-    """Return the key of one draw of a run: step k, source and purpose are folded in, so that draws are independent.
+    """Return the key of one draw of a run: step k, source and purpose are folded into the run's key.
 
-    `source`: checksum of the name of what draws; `purpose`: number of what is drawn.
+    Different draws have different keys and are independent. `source`: checksum of the name of what draws. `purpose`:
+    number of what is drawn.
     """
     key = run_key
     for number in (k, source, purpose):

@@ -52,10 +52,10 @@ class FilteringTask(NamedTuple):
         return self.filters.init() if self.begin is None else jax.tree.map(jnp.asarray, self.begin.states)
 
     def rows(self, z: tuple[np.ndarray, ...]) -> tuple[PyTree, ...]:
-        """Return the rows, with a leading axis of steps: their numbers, inputs, measurements z, and what arrived.
+        """Return the rows, with a leading axis of steps: step numbers, inputs, measurements z, and what arrived.
 
-        Numbers begin at 0, or go on from the last step of an earlier recording (`begin`). What arrived: of reports to a
-        centre and between neighbours.
+        Step numbers begin at 0, or continue those of an earlier recording (`self.begin`). What arrived
+        (`self.arrivals`) are the reports to a centre and the messages between neighbours.
         """
         numbers: Array = jnp.arange(len(self.u))
         if self.begin is not None:
@@ -64,15 +64,16 @@ class FilteringTask(NamedTuple):
 
 
 def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> Origin:
-    """Return where the rows of a record ended, with the states there of these filters.
+    """Return where the rows of a record ended: the time, the step and the states of these filters.
 
     Args:
-        filters: of the network.
-        after: record of the rows before.
-        smooths: whether estimates are to be smoothed.
+        filters: the filters of the network.
+        after: the record of the earlier rows.
+        smooths: True if estimates are to be smoothed.
 
     Raises:
-        ValueError: no such record; smoothing, which needs all rows; a fusion whose messages may come rows later.
+        ValueError: a record without the states, or of another network; smoothing, which needs all rows; a fusion
+            whose messages may come rows later.
     """
     origin = instance("after", after, Record, EXPECTED).origin
     if origin is None:
@@ -89,36 +90,35 @@ def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> O
 
 
 def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
-    """Return the times of rows (`clock`) behind that of the last row before them, where `origin` has one.
+    """Return the times of the rows (`clock`), with the time of the last earlier row before them if there is one.
 
     Raises:
-        ValueError: their first time is before it, or is a date where that is a number, or the reverse.
+        ValueError: the first time is before that row, or only one of both is a date.
     """
-    if origin is None:  # nothing is before them
+    if origin is None:  # there are no earlier rows
         return clock
     last_time, first_time = np.asarray(origin.time), clock[0]
-    if (
-        last_time.dtype.kind != clock.dtype.kind or first_time < last_time
-    ):  # a date and a number, or times that go backwards
+    are_date_and_number = last_time.dtype.kind != clock.dtype.kind
+    if are_date_and_number or first_time < last_time:
         raise fail("time", f"rows behind {origin.time}, the last one before them", str(first_time))
     return np.append(last_time, clock)
 
 
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
-    """Return what all filters made of a recording's rows, as NumPy arrays: what `AllFilters.step` puts out, by row.
+    """Return the outputs of `AllFilters.step` for all rows of a recording, as NumPy arrays.
 
-    Beside that stand "measurements", z, and "state", the last one; with a smoother it is what
-    `NetworkSmoother.smooth_run` returns. It is computed in chunks side by side, by native code, or by XLA.
+    With a smoother, the results are those of `NetworkSmoother.smooth_run`. Two entries are added: "measurements", z,
+    and "state", the filters' last states. They are computed in chunks side by side, by native code, or by XLA.
 
     Args:
-        task: filters and all else.
+        task: the filters, inputs, and what else filtering needs.
         z: measurements (steps, node, received) by group.
-        judged: leave out what is implausible.
+        judged: True to leave out measurements that filters judge implausible.
     """
     results = None if judged else _filter_in_chunks(task, z)
     if results is not None:
         return results
-    # XLA for a joint covariance: the graph, an argument here, decides where its blocks are stored.
+    # Native code cannot store a joint covariance here, since its layout depends on the graph, an argument.
     by_xla = any(mesh.has_long_step or mesh.needs_joint for mesh in task.filters.meshes.values())
     return _scan_in_parts(task, z, judged) if by_xla else compute_once(_scan_all_rows, _by_xla, (task, z, judged))
 
@@ -139,13 +139,13 @@ class NetworkRecursion(Recursion):
 
 
 def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree | None:
-    """Return what `filter_rows` does, of rows in chunks side by side; None where that cannot be.
+    """Return what `filter_rows` does, computed in chunks of rows side by side, or None if that is not possible.
 
-    All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
+    It needs linear filters whose estimates are not fused, no smoothing, and many rows.
     """
     if task.smoother is not None or not task.filters.are_linear_and_unfused:
         return None
-    # Where rows are more of a recording, they begin at its last states and step.
+    # Rows that continue a recording begin at its last states and step.
     begin = task.begin or RecordingStart(initial_states(task.filters), np.asarray(0))
     recursion = NetworkRecursion(task.filters, begin.step)
     filtered = scan_in_chunks(recursion, to_numpy(begin.states), (z, task.u))
@@ -193,10 +193,11 @@ def _scan_rows(
     """
 
     def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Return the states of all filters after one row, and what they made of it.
+        """Return the states of all filters after one row, and their outputs.
 
-        The row: step, inputs, measurements, what arrived of reports, and a flag: False leaves the states as they are,
-        as for rows that only fill up a scan; None: all rows count. `judged`: what is implausible is left out.
+        The row holds the step, inputs, measurements, what arrived of reports, and a flag. If the flag is False, the
+        states stay as they are, as for rows that only fill up a scan. If it is None, all rows count. `judged`: True to
+        leave out measurements that are judged implausible.
         """
         (k, u_k, z_k, arrivals), row_is_counted = row
         step = step_plausibly if judged else AllFilters.step
@@ -212,9 +213,9 @@ def _scan_rows(
 def _collect_results(
     smoother: NetworkSmoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
 ) -> PyTree:
-    """Return what `filter_rows` does: the filters' `results` by row, measurements z and their last `state`.
+    """Return what `filter_rows` does, from the filters' `results` by row, the measurements z and the last `state`.
 
-    With a smoother the results are smoothed, but for the judgements of measurements ("judged"), which stay as they are.
+    A smoother smooths the results, except for the judgements of measurements ("judged"), which stay as they are.
     """
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
@@ -234,9 +235,9 @@ def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> P
     """
 
     def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Return the states of all filters after a row, and those of the central filters before it.
+        """Return the states of all filters after a row, and the states of the central filters before it.
 
-        The row: step, inputs, measurements, and what arrived of reports.
+        The row holds the step, inputs, measurements, and what arrived of reports.
         """
         k, u_k, z_k, arrivals = row
         after, _ = step_plausibly(task.filters, states, z_k, u_k, k, arrivals)

@@ -85,16 +85,16 @@ def _describe_refused(
     refused: Int[np.ndarray, "steps m"],
     node: Node | ReceivingNode,
 ) -> str:
-    """Return how many readings a node refused for one reason, and which they are in the first such row, in words.
+    """Return in words how many readings a node refused for one reason, and those of the first such row.
 
     Args:
         reason: the reason.
-        limits: of the node.
+        limits: limits of the node's readings.
         z: its measurements, NaN where nothing arrived.
         refused: number of the reason of each reading, 0 where it is kept.
         node: the node.
     """
-    # The readings that were refused for this reason alone, in the first row that has some.
+    # Keep only readings refused for this reason, and find the first row that has some.
     refused_so = np.where(refused == number_of_reason(reason), refused, 0)
     row = int(np.argmax(refused_so.any(axis=1)))
     shares = f"{np.count_nonzero(refused_so)} of {np.count_nonzero(~np.isnan(z))} values"

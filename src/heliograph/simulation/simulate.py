@@ -142,7 +142,7 @@ def _has_long_step(network: "Network") -> bool:
 
 
 def _return_with_warnings(result: Result, network: Network) -> Result:
-    """Return the result as it is; warn where it is a record with values that are no numbers or states beyond limits."""
+    """Return the result as it is; warn if it is a record with values that are not finite or states beyond limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
@@ -151,9 +151,9 @@ def _return_with_warnings(result: Result, network: Network) -> Result:
 
 
 def _warn_beyond_limits(record: Record, network: Network) -> None:
-    """Warn where a simulated state is beyond the limits that the plant states, and filters use.
+    """Warn if a simulated state leaves the limits that the plant declares and filters use.
 
-    A simulation does not enforce them: the plant's transition and noise have to.
+    A simulation does not enforce limits: the plant's transition and noise must keep them.
     """
     for name, (low, high) in first(network.plant).limits if record.truth is not None else ():
         x = np.asarray(record.truth)[..., network.states.index(name)]
@@ -166,9 +166,9 @@ def _warn_beyond_limits(record: Record, network: Network) -> None:
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
-    """Raise ValueError for counts that are no positive integers, and for a first run within a block of BLOCK runs.
+    """Raise ValueError unless counts are positive integers and `first_run` is a multiple of BLOCK.
 
-    Runs are simulated in blocks, so that results do not depend on where a series of runs was begun.
+    Runs are simulated in blocks of BLOCK, so that results do not depend on where a series of runs began.
     """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
@@ -177,9 +177,9 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
 
 
 def _warn_of_numbers_lost_in_float32(network: Network) -> None:
-    """Warn if all numbers of some array of plant and sensors, not all 0, are too small for single precision.
+    """Warn if some array of plant and sensors has only numbers too small for single precision, and not only zeros.
 
-    They would count as 0.
+    In single precision these numbers count as 0.
     """
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
@@ -244,7 +244,7 @@ def _simulate_lane(todo: tuple[_SimulationJob, PyTree], carry: PyTree) -> tuple[
 
 
 def _simulate_blocks(job: _SimulationJob, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Return the carry, the sums so far, with those of some blocks of runs, and what is collected of these.
+    """Return the carry (the sums so far) with the sums of some blocks of runs added, and what is collected of these.
 
     `blocks`: numbers of the runs (block, BLOCK). Blocks are summed one after another, so that no bit depends on how
     runs are dealt to calls.
@@ -272,9 +272,10 @@ def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree,
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     def sum_by_batch(leaf: jax.Array) -> PyTree:
-        """Return the sums over each batch of runs (..., batch) of `leaf` (run, ...), without runs beyond the last.
+        """Return the sums of `leaf` (run, ...) over the runs of each batch (..., batch).
 
-        `valid`: which runs count, `start`: batch of the first. What all runs share, (1, ...), is not summed.
+        From outside: `valid`, which runs count, and `start`, the batch of the first run. A leaf that all runs share,
+        (1, ...), is not summed.
         """
         if len(leaf) < len(runs):
             return SharedResult(leaf[0].astype(float))
@@ -286,7 +287,7 @@ def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree,
 
 
 def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
-    """Return all outputs of one block of runs, (run, time, ...), in double precision, whichever simulated them.
+    """Return all outputs of one block of runs (run, time, ...), in double precision whatever the precision of the runs.
 
     `runs`: their numbers.
     """
@@ -326,13 +327,14 @@ def _estimate_memory(job: _SimulationJob, runs: int, chunk: int) -> NeededMemory
 
 
 def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
-    """Return values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none.
+    """Return sums over batches (..., batch) of values (..., run) of consecutive runs; batches without runs are 0.
 
-    Each run goes to the next batch, and runs beyond the last batch (BATCHES) go on from the first: one row of batches,
-    with what is beyond its end added to its begin.
+    The first run goes to batch `start`, each further run to the next batch, and after the last batch (BATCHES) it goes
+    on from the first.
     """
     *leading_axes, runs = values.shape
     zeros = (0,) * len(leading_axes)  # the first index along all leading axes
+    # Write the runs into one long row of batches, and add what is beyond its end to its beginning.
     row = jnp.zeros((*leading_axes, BATCHES + runs - 1), values.dtype)
     row = jax.lax.dynamic_update_slice(row, values, (*zeros, start))
     batches, beyond = row[..., :BATCHES], row[..., BATCHES:]

@@ -34,10 +34,11 @@ class World(Module):
     filters: AllFilters
 
     def init(self, key: jax.Array) -> PyTree:
-        """Return the state before the first step of the run with this key.
+        """Return the state before the first step of the run with this key, as a tuple.
 
-        A tuple: state x of the plant (n,); of the medium, which is all channels; of all filters; of the links between
-        neighbours, by fusion; of the plant's memories, its modes.
+        Its entries: the state x (n,) of the plant; the state of the medium, which is all channels; the states of all
+        filters; the states of the links between neighbours, by fusion; and the states of the plant's memories, its
+        modes.
         """
         plant = at(self.plant, k=0)
         if isinstance(plant, ModalPlant) and plant.rates is not None:
@@ -92,7 +93,10 @@ class World(Module):
 
 
 def _turn_angles_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
-    """Return the estimates with angles within half a turn of the truth, so that x - xhat is the error."""
+    """Return the outputs with estimated angles moved by full turns to within half a turn of the truth x.
+
+    Then x - xhat is the error of an angle.
+    """
     if not plant.circular:
         return outputs
 

@@ -111,7 +111,7 @@ def _turn_angles_to_truth(
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-    """Return the fused estimates (time, ...) by name, of estimates (time, filter, node, ...) by kind."""
+    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by kind."""
 
     def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
         """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by kind."""
@@ -124,10 +124,10 @@ def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) ->
 
 
 def reduce_run(reducer: AbstractReducer[Result], smoother: NetworkSmoother | None, outputs: PyTree) -> OfStep:
-    """Return what a reducer makes of a run's `outputs` (time, ...); with a smoother, pairs: of filtered, of smoothed.
+    """Return what a reducer makes of a run's `outputs` (time, ...).
 
-    `smoother` smooths a whole run. The sums then end with those of the NIS, the normalised innovations squared, by
-    which the filters are tested.
+    With a smoother, which smooths a whole run, it is a pair for filtered and smoothed estimates. The sums then end with
+    sums of the NIS, the normalised innovations squared, by which the filters are tested.
     """
     if smoother is None:
         return reduce_rows(reducer, outputs)
@@ -201,9 +201,9 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
 
 
 def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
-    """Return the claim of a filter's smoothed estimates, what their covariance promises, as a smoother step has it.
+    """Return the claim of a filter's smoothed estimates (what their covariance promises), read from a smoother step.
 
-    Only the shape of a step is computed, so that measurement and input may be zeros.
+    Only the shape of the step is computed, so that measurement and input may be zeros.
     """
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
@@ -220,9 +220,9 @@ def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | Abstract
 
     Args:
         network: the part of the network that is smoothed.
-        name: of the fusion.
-        fusion: the fusion.
-        claims: of the nodes' smoothed estimates, by node and filter.
+        name: name of the fusion.
+        fusion: the fusion, or a central filter.
+        claims: claims of the nodes' smoothed estimates, by node and filter.
 
     Raises:
         ValueError: a fusion that has no smoothed form.
@@ -238,9 +238,9 @@ def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | Abstract
 
 
 def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
-    """Warn of filters that are not consistent, from sums of the NIS as `smooth_run` returns them, over all runs.
+    """Warn of filters that are not consistent, from sums of their NIS over all runs, as `smooth_run` returns them.
 
-    The NIS, the normalised innovation squared, is about its number of components where a filter's claim is right.
+    The NIS, the normalised innovation squared, is on average the number of components if a filter's claim is right.
     """
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for filter_index, name in enumerate(names):
@@ -261,7 +261,7 @@ def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: Py
     """
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
-    # The smoothed part may be of the last rows alone.
+    # The smoothed part may have only the last rows.
     length = outputs["smoothed"]["measurements"][0].shape[0]
     smoothed = trajectories_record(smoothing.network, {"truth": None, **outputs["smoothed"]}, time[-length:])
     return Trajectories().others(filtered, smoothed, smoothing.claims)

@@ -47,11 +47,10 @@ class Graph(NamedTuple):
         return np.stack([self.senders[receiver, column + 1], receiver], axis=1)
 
     def buckets(self) -> "list[Graph]":
-        """Return parts of the rows, few neighbours first, without the padding that these do not need.
+        """Return parts of the rows, those with few neighbours first, without padding that they do not need.
 
-        Arithmetic on a row costs by its length, up to its cube, and a graph's longest rows are few.
-
-        FEW: nodes whose rows stay together (64); PARTS: shares of the nodes up to the longest row of each part.
+        Arithmetic on a row costs up to the cube of its length, and a graph has few long rows. Up to FEW (64) nodes stay
+        together. PARTS: the shares of nodes up to the longest row of each part.
         """
         counts = self.present.sum(axis=1)
         widths = {counts.max()}
@@ -66,13 +65,14 @@ class Graph(NamedTuple):
 
 
 def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
-    """Return by node the names of the nodes whose messages it receives, checked.
+    """Return for each node the checked names of the nodes whose messages it receives.
 
     Args:
-        value: a table of these, or a graph of networkx, whose edges lead from sender to receiver, or both ways.
+        value: a table {node: names of its senders}, or a networkx graph, whose edges go from sender to receiver, or
+            both ways without direction.
 
     Raises:
-        ValueError: neither of them, names that are no texts, a node as its own neighbour, or one twice.
+        ValueError: neither of them, names that are no texts, a node as its own neighbour, or a neighbour twice.
     """
     senders_by_node = _list_senders(value) if isinstance(value, GraphLike) else value
     expected = "names of those whom a node receives (or a networkx graph of names)"
@@ -88,9 +88,9 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
 
 
 def _list_senders(graph: GraphLike) -> dict[Any, list[Any]]:
-    """Return by node of a graph the nodes from which an edge leads to it; both ends' of an edge without direction.
+    """Return for each node of a networkx graph the nodes from which an edge leads to it.
 
-    `graph`: one of networkx, whose edges are pairs (sender, receiver).
+    An edge is a pair (sender, receiver); without direction, it leads both ways.
     """
     pairs = [tuple(pair[:2]) for pair in graph.edges()]
     if not graph.is_directed():
@@ -102,7 +102,7 @@ def _list_senders(graph: GraphLike) -> dict[Any, list[Any]]:
 
 
 def _check_senders(name: str, value: object) -> tuple[str, ...]:
-    """Return the names of those whom a node receives: texts, each once, and not its own."""
+    """Return the names of a node's senders; raise ValueError unless they are texts, distinct and not its own."""
     what = f"neighbours of {name!r}"
     senders = tuple(items(what, value, "names"))
     no_names = [sender for sender in senders if not isinstance(sender, str)]
@@ -156,9 +156,9 @@ def neighbours_within(
 
 
 def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> Graph:
-    """Return the graph of these nodes by place; each of the neighbours is among them.
+    """Return the graph of these nodes with names replaced by indices; all neighbours are among the nodes.
 
-    Rows (node, degree): the index of each node itself, then of those it receives, then itself as padding, which
+    A row (degree,) has the index of the node itself, those of the nodes it receives, and then its own as padding, which
     `present` marks False.
     """
     index = {name: i for i, name in enumerate(nodes)}

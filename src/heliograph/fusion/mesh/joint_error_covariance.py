@@ -18,12 +18,10 @@ from heliograph.numerics.types import Array, Bool, Float, Int
 
 
 def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Array, "node degree n n"]:
-    """Return M_ij of all neighbours, e_i+ = sum_j M_ij e_j + noise, after that of the node itself.
+    """Return M_ij of e_i+ = sum_j M_ij e_j + noise, for each node i: first of itself, then of its neighbours.
 
-    M_ii = F_i A - sum_j M_ij. `gains` has a leading axis of nodes.
-
-    e_i: error of node i; F_i: what a correction leaves of it; A = `matrix` of the plant. A gain is a front factor times
-    a part.
+    e_i is the error of node i. M_ij is the gain of neighbour j's estimate, a front factor times a part. M_ii is F_i A -
+    sum_j M_ij, with A = `matrix` of the plant and F_i what a correction leaves of an error (`gains.innovation`).
     """
     parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
     others = (gains.front[:, None] @ parts)[:, 1:]
@@ -35,9 +33,9 @@ def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Ar
 def measurement_weights(
     gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]
 ) -> Float[Array, "node degree n n"]:
-    """Return W_i of the measurements that arrived, zero for the others.
+    """Return W_i for the measurements that arrived, and zeros for the others.
 
-    W_i: the gain of node i, the same for the measurements of all its neighbours.
+    W_i is the gain of node i, the same for the measurements of all its neighbours.
     """
     weights: Float[Array, "node degree n n"] = library(gain, arrived).where(
         arrived[..., None, None], gain[:, None], 0.0
@@ -48,9 +46,10 @@ def measurement_weights(
 def scatter_blocks(
     blocks: Float[Array, "node degree n n"], senders: Int[Array, "node degree"], present: Bool[Array, "node degree"]
 ) -> Any:
-    """Return the matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced.
+    """Return the matrix (N, N) with these blocks at (node, sender) where present; it is sparse unless it is traced.
 
-    `senders`: index of each neighbour in a node's row, the node itself as padding (not `present`). N: nodes times n.
+    `senders`: index of each neighbour in a node's row, with the node itself as padding (not `present`). N: nodes times
+    n.
     """
     nodes, _, n, _ = blocks.shape
     if is_traced(blocks):
@@ -59,7 +58,7 @@ def scatter_blocks(
         zeros = jnp.zeros((nodes, nodes, n, n))
         by_node_and_sender = zeros.at[np.arange(nodes)[:, None], senders].add(masked)
         return by_node_and_sender.swapaxes(1, 2).reshape(nodes * n, nodes * n)
-    row_ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])  # as the format of block sparse rows has them
+    row_ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])  # `indptr` of the block sparse row format
     blocks_columns_and_ends = np.asarray(blocks)[present], senders[present], row_ends
     return scipy.sparse.bsr_array(blocks_columns_and_ends, shape=(nodes * n, nodes * n), blocksize=(n, n))
 

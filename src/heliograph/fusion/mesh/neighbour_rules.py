@@ -52,9 +52,9 @@ class TraceIntersection(AbstractIntersection):
         self.improvements = check_count("improvements", improvements, 0)
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Return the shares of all of several estimates.
+        """Return the shares of several estimates, all of which are present.
 
-        Shares are larger for smaller traces, to a `power`, and then improved so many times. All estimates are there.
+        Shares are larger for smaller traces, to the power `self.power`, and then improved `self.improvements` times.
         """
         traces = jnp.trace(covariances, axis1=1, axis2=2)
         all_are_there = jnp.ones(len(covariances), dtype=bool)
@@ -170,8 +170,8 @@ class FrozenWeights(_NeighbourRule):
     def placed(self, graph: Graph) -> "FrozenWeights":
         """Return the rule with the blocks (degree, n, degree, n, row) of the graph's rows.
 
-        Blocks are joint covariances of a node and its neighbours, (nodes, degree, n, degree, n) as given; the axis of
-        rows goes last.
+        A block is the joint covariance of a node and its neighbours. Blocks were given as (nodes, degree, n, degree,
+        n); here the axis of rows is last.
         """
         width = graph.senders.shape[1]
         if len(self.blocks) != len(graph.nodes) or np.shape(self.blocks)[1] < width:
@@ -185,11 +185,10 @@ class FrozenWeights(_NeighbourRule):
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
 
     def weights_ahead(self, arrived: Bool[np.ndarray, "step row degree"]) -> Ahead | None:
-        """Return the weights of many steps by native code, parts and covariances (step, row, ...); None without it.
+        """Return parts and covariances (step, row, ...) of the weights of many steps by native code; None without it.
 
-        They depend on what arrives at a step alone, so that a node's blocks are read once for all of them.
-
-        `blocks`: joint covariances of each node and its neighbours, with the nodes along the last axis.
+        Weights depend only on what arrives at a step, so a node's block is read once for all steps. `self.blocks`:
+        joint covariances of each node and its neighbours, with nodes along the last axis.
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
@@ -203,12 +202,12 @@ class FrozenWeights(_NeighbourRule):
 def _weigh_neighbours(
     rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the parts and covariances (step, ...) of one node's weights.
+    """Return the parts and covariances (step, ...) of one node's weights for many steps.
 
-    `joint`: Cov(e_i, e_j) of the node and its neighbours; `arrived`: which estimates came in each step.
+    `joint`: Cov(e_i, e_j) of the node and its neighbours. `arrived`: which estimates came at each step.
     """
     degree, n = joint.shape[:2]
-    # Rules of best weights read the joint covariance alone.
+    # Rules of best weights only read the joint covariance, so that the other fields are zeros.
     believed = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
 
     def body(_: None, present: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
@@ -220,9 +219,9 @@ def _weigh_neighbours(
 
 
 def _check_shares(name: str, row: object) -> dict[str, float]:
-    """Return the shares that a node gives to others, by name.
+    """Return the shares that a node gives to others by name; raise ValueError unless they are valid.
 
-    They are not negative, and their sum is at most 1; it is 1 where the node's own share is among them.
+    Shares are not negative. Their sum is at most 1, and it is 1 if the node's own share is among them.
     """
     what = f"diffusion shares of {name!r}"
     unchecked = table(what, row, "shares by neighbour")

@@ -72,9 +72,10 @@ class NodeGains(NamedTuple):
 
 
 def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
-    """Return gains of the step with these weights of the estimates: fuse what was believed, predict once, correct.
+    """Return the gains of a step that fuses estimates with these weights, predicts once, and corrects.
 
-    A gain of an estimate is front times its part; `innovation` F = I - P S is what a correction leaves of an error.
+    The gain of an estimate is `front` times its part. `innovation`, F = I - P S, is what a correction leaves of an
+    error.
     """
     a = jnp.asarray(step.matrix)
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
@@ -92,9 +93,9 @@ def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
 def correct_by_information(
     predicted: Float[jax.Array, "n n"], information: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, "n n"], Float[jax.Array, "n n"]]:
-    """Return P = (Pb^-1 + S)^-1 and F = I - P S of a predicted Pb, which may be singular, and of information S.
+    """Return P = (Pb^-1 + S)^-1 and F = I - P S from a predicted Pb, which may be singular, and information S.
 
-    With S = L diag(d) L' the measurements that were made say as much as L' x + v, Cov v = diag(d)^-1.
+    With S = L diag(d) L', the measurements tell as much as L' x + v with Cov v = diag(d)^-1.
     """
     n, factors = len(predicted), eliminate(information)
     rows = jnp.diag(square_root(factors.weights)) @ factors.matrix.T  # diag(d)^1/2 L', of unit noise

@@ -72,13 +72,13 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
 
 
 def _are_rows(network: Network, entries: object) -> bool:
-    """Return whether the entries of a list are the rows of one recording, and not recordings.
+    """Return whether the entries of a list are the rows of one recording, rather than recordings.
 
-    They are where each is a number, or has as many numbers as the only node receives: what `tolist` makes of an array.
+    They are rows if each is a number, or has as many numbers as the only node receives, as in `array.tolist()`.
     """
     try:
         values = np.asarray(entries)
-    except ValueError:  # of other lengths
+    except ValueError:  # entries of different lengths
         return False
     if len(network.names) > 1 or not values.size or values.dtype.kind not in "biuf":
         return False
@@ -86,7 +86,7 @@ def _are_rows(network: Network, entries: object) -> bool:
 
 
 def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:
-    """Return the inputs of recording number `index` of several: its own where `inputs` is a list, else those of all."""
+    """Return the inputs of recording number `index`: its entry if `inputs` is a list, else those of all recordings."""
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):
@@ -145,10 +145,10 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
 
 
 def _arrange_by_node(network: Network, recording: Any, held: Any) -> Mapping[str, Any]:
-    """Return the measurements `held` by a recording as {node: measurements}; a plain array is the only node's.
+    """Return the measurements `held` by a recording as {node: measurements}; a plain array is that of the only node.
 
     Raises:
-        ValueError: an array where there are several nodes, or other nodes than the network's.
+        ValueError: an array although there are several nodes, or other nodes than the network's.
     """
     if not isinstance(held, Mapping) and len(network.names) > 1:
         raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
@@ -181,35 +181,35 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """Return the arrays of all nodes by run: arrays (runs, steps, received) are cut into runs, others are one run."""
+    """Return the arrays of all nodes by run: arrays (runs, steps, received) are cut into runs, others are one."""
     if all(value.ndim == 3 for value in values):
         return [list(run) for run in zip(*values, strict=True)]
     return [values]
 
 
 def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
-    """Return the array (rows, columns) with rows added up to a length: of `filler`, or if None copies of the last."""
+    """Return the array (rows, columns) padded to a length, with rows of `filler` or, if it is None, of the last row."""
     missing = length - len(values)
     added_row = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
     return np.concatenate([values, np.repeat(added_row, missing, axis=0)]) if missing else values
 
 
 def _check_enough_data(data: LikelihoodData, free: int) -> None:
-    """Raise ValueError if the data have fewer than FEWEST numbers for each of `free` ones, or nothing in them varies.
+    """Raise ValueError if data have fewer than FEWEST (10) numbers for each free one, or nothing in them varies.
 
-    What counts are the true states where these are learned from, else the measurements that arrived.
-
-    FEWEST: 10 numbers for each free one.
+    The numbers counted are the known true states if these are learned from, else the measurements that arrived. `free`:
+    how many numbers are free.
     """
     counted = data.measurements if data.truth is None else data.truth
     count = int(np.count_nonzero(~np.isnan(counted)))
     if count < FEWEST * free:
         known = "that arrived" if data.truth is None else "of the truth"
         raise fail("recording", f"at least {FEWEST * free} numbers {known} for {free} free ones", count)
-    # By component what arrived of it in all recordings, of those of which something did.
+    # For each component of which something arrived, all its values in all recordings.
     components = data.measurements.reshape(-1, data.measurements.shape[-1]).T
     arrived = [values[~np.isnan(values)] for values in components]
     arrived = [values for values in arrived if len(values)]
-    if arrived and all(np.ptp(values) == 0 for values in arrived):
+    is_constant = bool(arrived) and all(np.ptp(values) == 0 for values in arrived)
+    if is_constant:
         value = array("m", arrived[0], (None,))[0]
         raise fail("recording", "measurements that vary", f"{value:g} throughout")

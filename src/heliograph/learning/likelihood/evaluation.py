@@ -106,13 +106,13 @@ def _sum_rows(rows: Evaluation) -> Evaluation:
 
 
 def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: LikelihoodData) -> Evaluation:
-    """Return the evaluation of all recordings, row by row, at all points x (points, p): each pair side by side.
+    """Return the evaluation of all recordings, row by row, at all points x (points, p), each pair side by side.
 
-    By our own compiled code where `choose_code` finds some for these arguments, else by XLA, pair by pair.
-    `halves`: information of the first and of the second half of the rows, summed over recordings.
+    Our own compiled code computes it if `choose_code` finds some for these arguments, else XLA, pair by pair.
+    `halves`: the information in the first and in the second half of the rows, summed over recordings.
     """
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
-    # Each point with each recording: points in the outer loop, recordings in the inner one.
+    # Pair each point with each recording, point after point.
     count, copies = len(data.measurements), (len(x), 1, 1)
     pairs = np.repeat(x, count, axis=0), *(np.tile(rows, copies) for rows in data_rows)
     choice = choose_code(evaluate_recording, (objective, *pairs), differs_by_run=[False, *(True for _ in pairs)])
@@ -152,13 +152,13 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
     e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
 
     def add_row(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Return the halves' information with that of a row added, and the row's log density and score.
+        """Return the information of both halves with that of a row added, and the row's log density and score.
 
-        `half`: the row with which the second half begins. `row`: its number k, error e with covariance s and
-        their derivatives, and what is compared with the prediction: the measurement, or the true state.
+        `half`: the row at which the second half begins. `row`: its number k, the error e with covariance s and their
+        derivatives, and `compared`, the measurement or true state that is compared with the prediction.
         """
         k, e, s, de, ds, compared = row
-        # e is the difference of `compared` and its prediction; z may end in the modes of a channel, not predicted.
+        # A measurement may end in the modes of a channel, which are not predicted, so e may be shorter.
         compared = compared[: len(e)]
         size = jnp.abs(compared) + jnp.abs(compared - e)
         density, score, information = differentiate_log_density(e, s, (de, ds), size, ~jnp.isnan(e))
@@ -192,7 +192,7 @@ def _differentiate_errors(
 
 @lru_cache
 def _find_linear_filter(objective: Objective) -> Any:
-    """Return the filter of the objective, at or near its start, if it is linear and has `score_rows`; else None."""
+    """Return the objective's filter, at or near its start, if it is linear with a score recursion; else None."""
     description, is_linear = objective.description, objective.form == "linear"
     network = choose_typical_network(description) if is_linear else description.start
     filter = make_filter_of_form(network, objective.form)

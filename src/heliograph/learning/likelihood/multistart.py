@@ -101,18 +101,17 @@ class MaximumSearch:
         return top
 
     def _prove_maximum(self, climbed: ClimbEnds) -> HighestPoint:
-        """Return the best of some climbs, once it is a maximum, with numbers put at the ends of their domains.
+        """Return the best of some climbs once it is a maximum; numbers may be put at the ends of their domains.
 
-        While it is none it climbs again, ROUNDS times at most; then the point says why it is none.
-
-        A point is a maximum if g' H^-1 g is nothing among the numbers inside their domains, with the gradient g of the
-        log-likelihood l and the Hessian H of -l, which is not indefinite; and if l does not rise inwards at any end.
+        It climbs again while the point is no maximum, at most ROUNDS times, and then says why it is none. A point is a
+        maximum if two conditions hold. Inside the domains, g' H^-1 g is negligible and H is not indefinite, with g the
+        gradient of the log-likelihood l and H the Hessian of -l. And l does not rise inwards from any end.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best_climb(climbed, no_ends)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
-            # `again`: points from which to climb on; None where there are none.
+            # `again`: points from which to climb again, or None.
             again, reason = self._choose_restarts(top) if top.converged else (None, top.reason)
             if again is None:
                 reason = self._explain_unbounded(top) or reason
@@ -123,16 +122,15 @@ class MaximumSearch:
     def _draw_starts_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Return `count` points drawn around a maximum, and one more near each end of a domain.
 
-        Logarithms and logits are within SPREAD of it, real numbers some standard errors away.
-
-        AWAY: how many; LOWERED: how far towards an end, as steps of a logarithm or logit; INWARDS: distances
-        from an end that are tried; SEEN: nats by which the likelihood has fallen where a number matters.
+        Logarithms and logits are within SPREAD of it, real numbers within AWAY standard errors. A point near an end
+        lies LOWERED steps of a logarithm or logit towards it. INWARDS: distances from an end that are tried. SEEN: the
+        fall of the likelihood, in nats, from which on a number matters.
         """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
         with_ends = np.flatnonzero(self.surface.domains.single)
         drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(with_ends), len(top.x)))
-        # A number at an end is drawn around the point furthest inside at which the likelihood has not fallen by SEEN.
+        # Draw a number at an end around the innermost point where the likelihood has not fallen by SEEN.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
             _, rise = self._evaluate_inwards_of_end(top, int(index))
@@ -170,15 +168,15 @@ class MaximumSearch:
         return ClimbEnds(**by_start)
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> ClimbEnds:
-        """Return the ends of climbs from all starts (starts, p), coordinates at an end (not 0 in `ends`) held there.
+        """Return the ends of climbs from all starts (starts, p); coordinates that are not 0 in `ends` are held fixed.
 
         The best point so far is kept at each step.
         """
 
         def keep_best(now: ClimbEnds) -> None:
-            """Keep the best point so far in `self.best`, as not converged, and pass the climbs on to `self.watch`."""
+            """Keep the best point so far in `self.best`, as not converged, and call `self.watch` with the climbs."""
             top = _take_best_climb(now, ends)
-            if self.best is None or not top.total < self.best.total:
+            if self.best is None or not top.total < self.best.total:  # `not <` also if the earlier total is NaN
                 self.best = top._replace(converged=False, reason="")
             self.watch(now)
 
@@ -207,13 +205,11 @@ class MaximumSearch:
         return _take_best_climb(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
-        """Return points from which to climb again if `top` is no maximum, or None; and why it is none, else "".
+        """Return points from which to climb again if `top` is no maximum, or None, and why it is none, or "".
 
-        A maximum has neither points nor a reason. Of each number at the end of its domain the likelihood is looked at
-        on the way back inside. At a saddle climbs begin to both sides of it.
-
-        SAME: nats that are no rise; SADDLE: a curvature, below 0, under which the point is a saddle; NEAR: gain
-        of a step by the Hessian that counts as none.
+        A maximum has neither points nor a reason. From each end of a domain the likelihood is looked at on the way back
+        inside. At a saddle, climbs begin on both sides of it. SAME: nats that count as no rise. SADDLE: a curvature
+        below it (negative) makes a saddle. NEAR: a gain of a step by the Hessian below it counts as none.
         """
         for index in np.flatnonzero(top.ends):
             points, rise = self._evaluate_inwards_of_end(top, int(index))
@@ -227,12 +223,11 @@ class MaximumSearch:
         return None, ""
 
     def _explain_unbounded(self, top: HighestPoint) -> str:
-        """Return a sentence where the likelihood has no maximum, as the network reproduces the data exactly; else "".
+        """Return a sentence if the likelihood has no maximum because the network reproduces the data exactly, else "".
 
-        A climb may end there all the same, where rounding is what is left. The log-likelihood for each number is about
-        -log of the size of its innovation.
-
-        EXACTLY: logarithm of the data's size over that of the innovations beyond which these are rounding.
+        A climb may still end there, where only rounding is left. The log-likelihood of each number is about -log of the
+        size of its innovation. EXACTLY: log(size of the data / size of innovations) above which innovations are
+        rounding.
         """
         data = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         log_likelihood_of_number = top.total / np.count_nonzero(~np.isnan(data))
@@ -242,12 +237,10 @@ class MaximumSearch:
         return ""
 
     def _evaluate_inwards_of_end(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is there.
+        """Return points (INWARDS, p) from the end of a number's domain inwards, and how much higher l is there.
 
-        `index`: coordinate of the number; `top`: the point at the end.
-
-        INWARDS: distances from the end, 0 to 40 steps of a logarithm or logit. l: log-likelihood, here -inf
-        where it is NaN.
+        `index`: coordinate of the number. `top`: the point at the end. INWARDS: distances from the end, 0 to 40 steps
+        of a logarithm or logit. The log-likelihood l counts as -inf where it is NaN.
         """
         points = np.repeat(top.x[None], len(INWARDS), axis=0)
         points[:, index] -= top.ends[index] * INWARDS
@@ -255,11 +248,10 @@ class MaximumSearch:
 
 
 def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
-    """Return the best of the climbs, with why it stopped if it did not converge.
+    """Return the best of the climbs, with the reason why it stopped if it did not converge.
 
-    `ends`: -1 or 1 where a coordinate was held at an end of its domain, else 0 (p,).
-
-    `climbed.order`: climbs from the highest down; `remaining`: nats that a further step still promises.
+    `ends` (p,): -1 or 1 if a coordinate was held at an end of its domain, else 0. `climbed.order`: numbers of the
+    climbs from the highest down. `climbed.remaining`: nats that a further step would still gain.
     """
     best = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[best]), float(climbed.remaining[best])
@@ -274,7 +266,7 @@ def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
 
 
 def _explain_unconverged_climb(remaining: float) -> str:
-    """Return in words why a climb ended that did not converge, by what a further step still promises in nats."""
+    """Return in words why a climb ended without converging, from the nats that a further step still promises."""
     if not np.isfinite(remaining):
         return "the likelihood has no finite derivatives there"
     return f"after {MOST_STEPS} steps a further one promises {remaining:.2g} of log-likelihood"

@@ -27,14 +27,14 @@ from heliograph.simulation.node import Node
 
 
 def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
-    """Return the plant, and sensor and channel of all nodes together, in their order, given that all packets arrive.
+    """Return the plant, and the sensor and channel of all nodes together in their order, if all packets arrive.
 
     Raises:
         ValueError: relays that filter and forward.
     """
     if network.relays is not None:
         raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
-    # Nodes that receive one channel together.
+    # All nodes receive through one common channel.
     if network.common is not None:
         return network.plant, network.common.sensor, _condition_on_arrivals(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
@@ -46,9 +46,9 @@ def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
 
 
 def _condition_on_arrivals(channel: Channel) -> Channel:
-    """Return the channel given that packets arrive, since lost rows are left out; one with memory as it is.
+    """Return the channel given that packets arrive, since lost rows are left out; a channel with memory stays as it is.
 
-    With memory a loss tells the mode of the channel.
+    With memory a loss tells something about the channel's mode.
     """
     if first(channel).remembers or not first(channel).erases:
         return channel
@@ -81,7 +81,7 @@ class Objective:
         return hash((_list_code_and_closure(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
-        """Return a tuple of all by which one objective may differ from another, to be compared."""
+        """Return a tuple of everything by which two objectives may differ, to compare them."""
         description = self.description
         return (
             self.form,
@@ -105,10 +105,10 @@ class Objective:
         filter = self.filter(x)
 
         def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return a row's innovation and its covariance, NaN after which the filter has no estimate.
+            """Return a row's innovation and its covariance, or 0 and NaN if the filter has lost its estimate (NaN).
 
-            `filter`: at the values of the free numbers. A lost estimate, NaN, makes the likelihood NaN, and not that of
-            a row where nothing arrived.
+            The NaN makes the likelihood NaN. An innovation of NaN would count as a row where nothing arrived. `filter`:
+            the filter at the values of the free numbers.
             """
             is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
             value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
@@ -118,10 +118,10 @@ class Objective:
         return innovations
 
     def compute_errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
-        """Return the estimates' errors (steps, n), NaN where no truth is known, and the covariances they claim.
+        """Return the errors (steps, n) of the estimates by the filter at x (p,), and the covariances that they claim.
 
-        Of the filter at x (p,), with measurements z (steps, received), inputs u (steps, inputs) and true states (steps,
-        n).
+        Errors are NaN where the truth is not known. z: measurements (steps, received). u: inputs (steps, inputs).
+        `truth`: true states (steps, n).
         """
         filter, angles = self.filter(x), first(self.description.start.plant).angles
 
@@ -135,7 +135,10 @@ class Objective:
 
 
 def _list_code_and_closure(build: Build) -> tuple[object, ...]:
-    """Return what makes two functions the same, their code and all that they close over; of another callable itself."""
+    """Return what makes two functions equal: their code, defaults and the values they close over.
+
+    Any other callable is compared by itself.
+    """
     if not isinstance(build, FunctionType):
         return (build,)
     cells = [cell.cell_contents for cell in build.__closure__ or ()]
@@ -143,11 +146,11 @@ def _list_code_and_closure(build: Build) -> tuple[object, ...]:
 
 
 def make_objectives(network: Description, by_truth: bool = False) -> list[Objective]:
-    """Return the objectives that the network allows, the linear one first; `by_truth` the density of true states alone.
+    """Return the objectives that the network allows, the linear one first, or with `by_truth` that of true states.
 
-    Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
-    whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
-    random gain both are the same, the first.
+    The linear form takes the spread of a random gain from the state's unconditional moments, for linear plants; its
+    score has mean zero whatever the laws are. The conditional form takes it from the state's moments given the data,
+    for channels without memory or delay. Without a random gain both are the same: only the linear one is returned.
 
     Raises:
         ValueError: a network whose likelihood no filter here knows.
@@ -165,9 +168,9 @@ def _reuse_equal_objective(objective: Objective) -> Objective:
 
 
 def choose_typical_network(description: Description) -> Network:
-    """Return the network at its start, but near it if a gain is random there that is known at the start itself.
+    """Return the network at its start, or near it if a gain is random there but not at the start itself.
 
-    So is one whose spread is free and 0 at the start, as that of two free gains which begin as one.
+    A gain is so if its spread is free and starts at 0, as that of two free gains which start equal.
     """
     start = description.start
     if _has_random_gain(start) or not _has_random_gain(description.near_start):
@@ -184,8 +187,8 @@ def _has_random_gain(network: Network) -> bool:
 def list_forms(description: Description) -> list[Form]:
     """Return the forms of the likelihood that a network allows, "linear" before "conditional".
 
-    `circular`: with angles; `past`: packets come late; `remembers`: a channel with memory. Linear: by the unconditional
-    moments of the state; conditional: by those given the data.
+    The linear form uses the unconditional moments of the state, the conditional form those given the data. `circular`:
+    whether there are angles. `link.past`: by how many steps packets may be late.
     """
     plant, sensor, channel = join_all_nodes(description.start)
     link = first(channel)
@@ -193,12 +196,12 @@ def list_forms(description: Description) -> list[Form]:
         if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    # Without a random gain both forms are the same; behind memory or delay there is no conditional one.
+    # Without a random gain both forms are the same. With memory or delay there is no conditional form.
     return ["linear", "conditional"] if _has_random_gain(choose_typical_network(description)) else ["linear"]
 
 
 def make_filter_of_form(network: Network, form: Form) -> AbstractFilter:
-    """Return the filter of all that a network receives with a likelihood of this form; "truth": the network's own."""
+    """Return the filter of all that a network receives whose likelihood has this form, or its own for "truth"."""
     if form == "truth":
         return find_sole_filter(network)
     plant, sensor, channel = join_all_nodes(network)
@@ -206,10 +209,10 @@ def make_filter_of_form(network: Network, form: Form) -> AbstractFilter:
 
 
 def find_sole_filter(network: Network) -> AbstractFilter:
-    """Return the only filter of a network, which is of all that arrives and of all states.
+    """Return the only filter of a network, which receives all that arrives and estimates all states.
 
     Raises:
-        ValueError: none, several, one of a part of the states, or one that claims no covariance.
+        ValueError: no filter, several, one of only some of the states, or one that claims no covariance.
     """
     nodes = list(network.nodes.values())
     filters = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}

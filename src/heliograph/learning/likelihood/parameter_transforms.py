@@ -13,8 +13,9 @@ from heliograph.numerics.types import Array, Float, PyTree
 def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
     """Return the start `value` of the free number `name` as unbounded coordinates (size,).
 
-    Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
-    by row, those on the diagonal by their logarithms.
+    A number of an interval becomes v, its logarithm log(v - low) or its logit, as the interval has ends. A simplex
+    becomes log(p_i / p_last). A covariance becomes the entries of its Cholesky factor, row after row, with logarithms
+    on the diagonal.
 
     Raises:
         ValueError: a start that is not inside the domain.
@@ -61,15 +62,22 @@ def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
 
 
 def _map_to_simplex(shape: tuple[int, ...], x: Array) -> Array:
-    """Return probabilities p_i = exp(x_i) / sum_j exp(x_j) over the last axis, of which the last has x = 0."""
+    """Return probabilities p_i = exp(x_i) / sum_j exp(x_j) over the last axis, where the last one has x = 0.
+
+    `shape`: of the probabilities.
+    """
     rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
     logs = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
-    weights = jnp.exp(logs - jnp.max(logs, axis=-1, keepdims=True))  # the largest is 1, so that none overflows
+    # Subtract the maximum so that exp cannot overflow.
+    weights = jnp.exp(logs - jnp.max(logs, axis=-1, keepdims=True))
     return weights / jnp.sum(weights, axis=-1, keepdims=True)
 
 
 def to_line(domain: Domain, value: PyTree) -> PyTree:
-    """Return a number of an interval on the line: as logit, logarithm or itself, by the ends that the interval has."""
+    """Return a number of an interval on the unbounded line: its logit if the interval has two ends, else its logarithm.
+
+    The logarithm is of the distance from the only end. Without ends the number stays as it is.
+    """
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
     if np.isfinite(domain.low):
@@ -78,7 +86,7 @@ def to_line(domain: Domain, value: PyTree) -> PyTree:
 
 
 def from_line(domain: Domain, value: PyTree) -> PyTree:
-    """Return the number of the interval that `to_line` maps to this value; an end of it for infinite values."""
+    """Return the number of the interval that `to_line` maps to this value; infinite values give an end of it."""
     with np.errstate(over="ignore"):
         if np.isfinite(domain.low) and np.isfinite(domain.high):
             return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -118,7 +126,7 @@ def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
 
 
 def _factorise_start(name: str, value: np.ndarray) -> np.ndarray:
-    """Return Cholesky's factor L of the start L L' of the free number `name`; raise if it is not positive definite."""
+    """Return the Cholesky factor L of the start L L' of the free number `name`; raise ValueError if there is none."""
     try:
         return np.linalg.cholesky(value)
     except np.linalg.LinAlgError:

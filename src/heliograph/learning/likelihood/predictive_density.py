@@ -28,9 +28,10 @@ Map = TypeVar("Map", bound=AbstractRandomAffine)
 def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
     """Return a law of `count` gains with probabilities that approximates this one, far into its tails.
 
-    int f(g) dF(g) = int f(F^-1(Phi(t))) phi(t) dt by the trapezoidal rule on |t| <= REACH, Phi the normal distribution
-    function: its error falls as exp(-2 pi^2 / h^2) with the distance h of the nodes. A law of finitely many values is
-    itself. Of a user's law, which has no F^-1, the nodes are quantiles of samples (`AbstractLaw.quantile`).
+    It computes int f(g) dF(g) = int f(F^-1(Phi(t))) phi(t) dt by the trapezoidal rule on |t| <= REACH, with Phi and phi
+    the normal distribution function and density. The error falls as exp(-2 pi^2 / h^2) with the nodes' distance h.
+    A law of finitely many values is returned as it is. A user's law has no F^-1, so its nodes are quantiles of samples
+    (`AbstractLaw.quantile`).
 
     Raises:
         ValueError: fewer than 2 nodes, a law that cannot be sampled.
@@ -45,7 +46,7 @@ def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
-    """Return the channel with each gain's law replaced by `count` values; constant gains stay."""
+    """Return the channel with the law of each random gain replaced by `count` values; constant gains stay."""
 
     def is_law(leaf: object) -> bool:
         """Return whether a part of the channel is a law, which is replaced as a whole."""
@@ -63,10 +64,9 @@ def discretise_laws(channel: Map, count: int) -> Map:
 
 @cache
 def _make_normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Phi(t), the normal distribution function, at `count` nodes t of equal distance, and their weights.
+    """Return Phi(t), the normal distribution function, at `count` equally spaced nodes t in |t| <= REACH, and weights.
 
-    REACH: the last node, in standard deviations. The weights are the normal density at the nodes, scaled to sum to
-    1.
+    The weights are the normal density at the nodes, scaled to sum to 1.
     """
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
@@ -91,7 +91,7 @@ class Predictive(NamedTuple):
     pit: Float[np.ndarray, "steps received"]
 
     def uniform(self) -> tuple[float, float]:
-        """Test all transforms for uniformity: Kolmogorov's distance, and its p-value if the law is right.
+        """Test all transforms for uniformity: return Kolmogorov's distance and its p-value if the law is right.
 
         Raises:
             ValueError: nothing arrived.
@@ -104,7 +104,7 @@ class Predictive(NamedTuple):
 
 
 def make_signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
-    """Return the filter that predicts what the sensor sends (`expect_signals`), of a plant and a sensor without modes.
+    """Return the filter that predicts what the sensor sends (`expect_signals`).
 
     Raises:
         ValueError: a plant or sensor with modes, or an unknown start.
@@ -176,18 +176,18 @@ class ChannelDensities(tuple[StackPartDensity, ...]):
 
     @staticmethod
     def of(channel: AbstractRandomAffine, nodes: int) -> "ChannelDensities":
-        """Return a channel as the combinations of gains of each of its parts, each gain's law taken as `nodes` values.
+        """Return a channel as combinations of gains for each of its parts, each gain's law taken as `nodes` values.
 
-        A stack has several parts, anything else is one.
+        A stack has several parts; any other channel is one part.
         """
         parts = channel.in_parallel
         return ChannelDensities(_stack_combinations(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 
 
 def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
-    """Return the components of one part of a channel as arrays, one axis over them.
+    """Return the components of one part of a channel as arrays with a first axis of components.
 
-    A component is one combination of values of its gains and noises, with the weight of its probability; those of
+    A component is one combination of values of the gains and noises, weighted by its probability. Components of
     probability zero are left out.
     """
     possible = [component for component in components if component.weight > 0]
@@ -207,7 +207,7 @@ def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], par
         parts: the combinations of gains of each part of the channel.
     """
     y, spread, z = expected
-    # ROWS steps at a time, so that memory stays bounded; one empty block where there are no steps.
+    # Score ROWS steps at a time, so that memory stays bounded. Without steps there is one empty block.
     blocks = [
         _score_stack_parts(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
         for i in range(0, max(len(z), 1), ROWS)
@@ -278,10 +278,10 @@ def _weigh_combinations(
 def _correct_signal(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean (t, p) and covariance (t, p, p) of the signal given the components of this part too.
+    """Return mean (t, p) and covariance (t, p, p) of the signal given this part's measurements too.
 
-    They are those of the mixture over the combinations a: each is a Kalman update with mean m_a and covariance P_a, and
-    the mixture has the mean m = sum_a w_a m_a and the covariance sum_a w_a (P_a + (m_a - m) (m_a - m)').
+    Each combination a of gains gives a Kalman update with mean m_a and covariance P_a. Their mixture has the mean
+    m = sum_a w_a m_a and the covariance sum_a w_a (P_a + (m_a - m) (m_a - m)').
 
     Args:
         y: mean of the signal (t, p).
@@ -297,6 +297,6 @@ def _correct_signal(
     # m_a - y of each combination, and m - y.
     moves = np.einsum("tapm,tam->tap", updated.gain, value)
     mean_move = np.einsum("ta,tap->tp", weight, moves)
-    # A column more in the root adds the square of the distance from the mean.
+    # A further column m_a - m in the root of P_a adds (m_a - m) (m_a - m)' to it.
     with_distance = np.append(updated.root, (moves - mean_move[:, None])[..., None], axis=-1)
     return y + mean_move, np.einsum("ta,tapq->tpq", weight, covariance_of_root(with_distance))

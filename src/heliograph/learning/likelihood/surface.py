@@ -48,17 +48,17 @@ class LikelihoodSurface:
 
     @cached_property
     def domains(self) -> OpenEnds:
-        """Return which coordinates are logarithms and logits, and at which side their domains end."""
+        """Return which coordinates end at minus infinity (`low`) and at infinity (`high`): logarithms and logits.
+
+        `single`: which of these belong to a number of an interval.
+        """
         every = self.objective.description.parameters.every
         low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))
         single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
         return OpenEnds(low=low, high=high, single=single & (low | high))
 
     def of_first_rows(self) -> "LikelihoodSurface | None":
-        """Return the likelihood of the first rows of long recordings alone; None where they are not long.
-
-        LONG: rows from which on a recording is long; FIRST: rows of it that are kept.
-        """
+        """Return the likelihood of only the first FIRST rows of recordings, or None if they are shorter than LONG."""
         data = self.data
         if data.measurements.shape[1] < LONG:
             return None
@@ -71,7 +71,7 @@ class LikelihoodSurface:
         return LikelihoodSurface(self.objective, first_rows)
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Return l, scores and information at each point (points, p); the result for the last points is kept."""
+        """Return l, scores and information at each point (points, p); the last result is kept for equal points."""
         if self._last:
             last_points, last_evaluation = self._last[0]
             if np.array_equal(last_points, x):
@@ -81,9 +81,12 @@ class LikelihoodSurface:
         return evaluation
 
     def evaluate_rows(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Return the evaluation at points with densities and scores by row, which are not cached of long recordings."""
+        """Return the evaluation at points (points, p) with densities and scores by row.
+
+        Results by row are not kept for long recordings.
+        """
         whole = self.evaluations(x)
-        # What is kept has every row, unless recordings are long.
+        # The kept result has every row, unless recordings are long.
         if whole.density.shape[2] == self.data.measurements.shape[1]:
             return whole
         return evaluate_at_points(self.objective, np.asarray(x), self.data, by_row=True)
@@ -144,9 +147,9 @@ class LikelihoodSurface:
     def move_to_finite_likelihood(
         self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "points p"]:
-        """Return the points with finite l, and others moved towards `near` (p,), where it is finite, until it is.
+        """Return the points, each moved towards `near` (p,), where l is finite, until l is finite at the point too.
 
-        Each turn moves them halfway; after HALVINGS turns they are returned where they are.
+        Each turn halves the distance. After HALVINGS turns the points are returned as they are.
         """
         points = points.copy()
         for _ in range(HALVINGS):
@@ -242,10 +245,10 @@ class LikelihoodSurface:
 def _choose_next_distances(
     newton: np.ndarray, distance: np.ndarray, inside: np.ndarray, outside: np.ndarray, furthest: float
 ) -> np.ndarray:
-    """Return the distances to look at next (lanes,): Newton's where it lies inside the bracket, else its middle.
+    """Return the distances to look at next (lanes,): Newton's if it lies inside the bracket, else the bracket's middle.
 
-    Where no `outside` is known yet (infinite), the bracket ends at three times the last `distance`, which is taken in
-    place of a middle; nothing is further than `furthest`.
+    If `outside` is not known yet (infinite), the bracket ends at three times the last `distance`, and this end replaces
+    the middle. No distance is above `furthest`.
     """
     is_closed = np.isfinite(outside)
     bracket_end = np.minimum(np.where(is_closed, outside, 3 * distance), furthest)
@@ -257,8 +260,8 @@ def _choose_next_distances(
 def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
     """Return which coordinates of a free number reach an end of its domain at minus infinity, and which at infinity.
 
-    Logits, as of probabilities, have both ends, logarithms the first; a covariance has those of its diagonal's
-    logarithms.
+    Logits (such as of probabilities) have both ends. Logarithms have the end at minus infinity; a covariance has them
+    on its diagonal.
     """
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":

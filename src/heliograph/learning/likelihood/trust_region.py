@@ -104,7 +104,7 @@ class _Lanes(NamedTuple):
     joined: np.ndarray
 
     def ends(self, steps: int) -> ClimbEnds:
-        """Return where the lanes (searches side by side) are after so many steps; one that joined another is there."""
+        """Return where the lanes (searches side by side) are after `steps` steps; `joined`: the lane each joined."""
         lane = self.joined
         for _ in range(len(lane)):  # a lane may join one that joins a third
             lane = lane[lane]
@@ -180,9 +180,9 @@ def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domai
 
 
 def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Return for each lane (lanes,) whether log-likelihood, gradient and information are finite, by what moves alone.
+    """Return for each lane whether log-likelihood, gradient and information are finite in moving coordinates.
 
-    `total` (lanes,), `gradient` and `moving` (lanes, p), `information` (lanes, p, p).
+    Shapes: `total` (lanes,), `gradient` and `moving` (lanes, p), `information` (lanes, p, p).
     """
     finite_gradient = np.all(np.isfinite(gradient) | ~moving, axis=1)
     finite_information = np.isfinite(information) | ~(moving[:, :, None] & moving[:, None, :])
@@ -190,10 +190,10 @@ def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray,
 
 
 def _mark_arrived(state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
-    """Return the state with those lanes done that have arrived, or whose radius has become as small as rounding.
+    """Return the state with lanes marked as done that have arrived, or whose radius is below SMALLEST_RADIUS.
 
-    Twice what is left to gain, g' I^-1 g, is less than `close` in a lane that has arrived. Where the radius is so
-    small rounding hides the gain, and NEAR is close enough to count as converged.
+    A lane has arrived if g' I^-1 g, twice what is left to gain, is below `close`. At so small a radius rounding hides
+    the gain; the lane then counts as converged if the gain is below NEAR.
     """
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
@@ -205,14 +205,14 @@ def _mark_arrived(state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: f
 
 
 def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "lanes p"]:
-    """Return which coordinates are at an end of their domain, (lanes, p): on the way there l gains less than AT_LIMIT.
+    """Return which coordinates count as at an end of their domain (lanes, p), as l gains less than AT_LIMIT to it.
 
-    A number v = exp(x) has its end v = 0 at x = -inf (`low`); where `high` too, as of a logit, its other end is at
-    x = inf. To first order what the log-likelihood l has left to gain is l(0) - l(v) = -v l'(v) = -dl/dx.
+    A number v = exp(x) has its end v = 0 at x = -inf (`domains.low`). A logit also has one at x = inf (`domains.high`).
+    To first order, the log-likelihood l gains l(0) - l(v) = -v l'(v) = -dl/dx up to the end.
 
     Args:
         x: points (lanes, p).
-        gradient: of l there (lanes, p).
+        gradient: gradient of l there (lanes, p).
         domains: coordinates whose domains end at infinity.
     """
     outward = np.where(domains.high & (x > 0), 1.0, np.where(domains.low, -1.0, 0.0))
@@ -321,7 +321,7 @@ def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
 
 
 def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _Lanes) -> Evaluated:
-    """Return log-likelihood, gradient and information at x (lanes, p) in lanes `going` on; in others the last ones."""
+    """Return log-likelihood, gradient and information at x (lanes, p) in lanes `going` on, the last ones elsewhere."""
     arrays = state.total.copy(), state.gradient.copy(), state.information.copy()
     for array, new_values in zip(arrays, evaluate(x[going]), strict=True):
         array[going] = new_values

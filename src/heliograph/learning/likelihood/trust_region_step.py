@@ -72,10 +72,10 @@ def trust_region_step(
 
 
 def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U B U (lanes, p, p) of each model B, U = diag(unit); of the information where B is huge or not finite.
+    """Return U B U (lanes, p, p) for each lane's model B, or for its information if B is huge or not finite.
 
-    `unit`: standard errors (lanes, p), a lane being one of several searches side by side. LARGEST: curvature in
-    these units beyond which a model is but rounding.
+    U = diag(unit), with the standard errors `unit` (lanes, p). A lane is one of several searches side by side. LARGEST:
+    a curvature beyond it, in these units, is only rounding.
     """
     scaled_model = _scale_both_sides(model, unit)
     is_usable = np.all(np.abs(scaled_model) < LARGEST, axis=(1, 2))  # neither huge nor NaN
@@ -104,11 +104,10 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
 
 
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return (B + s D^2)^-1 r of each lane (lanes, p); 0 along directions in which the matrix is singular.
+    """Return (B + s D^2)^-1 r of each lane (lanes, p), or 0 along directions in which the matrix is singular.
 
-    `b`: B (lanes, p, p); `shift`: s (lanes,); `d`: the diagonal of D (lanes, p); `right`: r (lanes, p).
-
-    A lane is one of several searches side by side. ROUNDING: share of the largest eigenvalue below which one is 0.
+    `b`: B (lanes, p, p). `shift`: s (lanes,). `d`: the diagonal of D (lanes, p). `right`: r (lanes, p). A lane is one
+    of several searches side by side. An eigenvalue below ROUNDING times the largest counts as 0.
     """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
@@ -120,11 +119,10 @@ def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.nd
 def expected_gain(
     gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
 ) -> Float[np.ndarray, " lanes"]:
-    """Return g' I^-1 g (lanes,), twice what a full step gains, by gradient g (lanes, p) and information (lanes, p, p).
+    """Return g' I^-1 g (lanes,), twice what a full step gains: gradient g (lanes, p), information I (lanes, p, p).
 
-    Only coordinates that are `counting` (lanes, p), and directions that are identified, add to it.
-
-    FLAT: eigenvalue, in units of standard errors, up to which a direction is not identified.
+    Only coordinates marked in `counting` (lanes, p) and identified directions count. A direction with an eigenvalue of
+    at most FLAT, in units of standard errors, is not identified.
     """
     unit, _ = find_errors_and_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
@@ -136,13 +134,13 @@ def expected_gain(
 
 
 def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each coordinate's standard error if the others were known, (lanes, p), and directions without information.
+    """Return each coordinate's standard error if all others were known (lanes, p), and the flat directions.
 
-    The errors are 0 of coordinates that stay (not `moving`). Directions are columns (lanes, p, p), in units of these
-    errors; the other columns are zeros.
+    A flat direction has no information. Directions are columns (lanes, p, p) in units of the errors; all other columns
+    are zeros. Errors are 0 for coordinates that are not `moving`.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    # LEAST: information so small that its square would underflow.
+    # Information below LEAST counts as none, since its square would underflow.
     has_information = moving & (diagonal > LEAST) & np.isfinite(diagonal)
     errors = np.where(has_information, 1 / np.sqrt(np.where(has_information, diagonal, 1.0)), 0.0)
     scaled = _scale_both_sides(information, errors)

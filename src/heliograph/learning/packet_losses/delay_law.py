@@ -41,10 +41,10 @@ class Delays:
         )
 
     def __str__(self) -> str:
-        """One line: each delay in seconds with its probability and interval.
+        """Return one line with each delay in seconds, its probability and its interval.
 
-        `shares`: probability of each delay in steps; `step`: seconds of a step; `early`: measurements logged before
-        their time, which are not counted.
+        `self.shares`: probability of each delay in steps. `self.step`: seconds of a step. `self.early`: number of
+        measurements logged before their time, which are not counted.
         """
         shares = [f"{steps * self.step:g} s {s.estimate:.3g} ({s.low:.2g} to {s.high:.2g})"
                   for steps, s in self.shares.items()]  # fmt: skip
@@ -55,12 +55,12 @@ class Delays:
 def learn_delays(late: "Float[ArrayLike, ' measurements']", step: "Float[ArrayLike, '']") -> Delays:
     """Learn the law of delays from how late each measurement was logged, in the order of measuring.
 
-    The share of each delay is its most likely probability. Its interval is Wilson's, where N measurements whose
-    neighbours are alike with correlation a count as N (1 - a) / (1 + a): a link is late for a while at a time.
+    The share of each delay is its most likely probability, and its interval is Wilson's. A link is late for a while at
+    a time, so N measurements with correlation a between neighbours count as N (1 - a) / (1 + a).
 
     Args:
-        late: seconds from measuring to logging of each.
-        step: seconds of a step, to whole numbers of which delays are rounded.
+        late: seconds from measuring to logging, for each measurement.
+        step: seconds of a step; delays are rounded to whole steps.
 
     Raises:
         ValueError: no measurement that was logged after its time, a step that is not positive.

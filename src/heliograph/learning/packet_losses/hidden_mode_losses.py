@@ -49,7 +49,10 @@ class HiddenModeLosses(AbstractLossLaw):
         whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
-            """Return log P(fates) - log P(ends arrive) at logits x, and its gradient; `ends`: None if none are."""
+            """Return log P(fates) - log P(ends arrive) at the logits x, and its gradient.
+
+            The second term is for stretches that were chosen to end with an arrival; `ends` is None if there are none.
+            """
             value, gradient = whole.likelihood(x)
             if ends is None:
                 return value, gradient
@@ -102,9 +105,9 @@ class FateRuns:
     """
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
-        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has.
+        """Store for each kind which runs have it, their distinct lengths, and which of these lengths each run has.
 
-        A run: packets in a row of one kind, the fate that they share, or one START. `length`: its number of
+        A run is a row of packets of one kind: a fate that they share, or a single START. `length`: its number of
         packets.
         """
         self.kind = kind
@@ -115,19 +118,19 @@ class FateRuns:
 
     @staticmethod
     def of(fates: Fates) -> "FateRuns":
-        """Return the runs of stretches of fates (packets,), one after another, each behind a START."""
-        # Fates as whole numbers: 0 arrived, 1 lost, and UNKNOWN.
+        """Return the runs of equal fates in some stretches (packets,), each stretch after a START."""
+        # Write fates as whole numbers: 0 arrived, 1 lost, or UNKNOWN.
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         begins_run = np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)])
         starts = np.flatnonzero(begins_run)
         return FateRuns(kind=code[starts], length=np.diff(np.append(starts, len(code))))
 
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log-likelihood l at logits x of (loss when good, when bad, fail, recover), and its gradient (4,).
+        """Return the log-likelihood l and its gradient (4,) at logits x of (loss when good, when bad, fail, recover).
 
-        By complex steps: the imaginary part of l(x + i h) is h dl/dx, its square being nothing (h = STEP).
+        The gradient comes from complex steps: the imaginary part of l(x + i h) is h dl/dx for a tiny h = STEP.
         """
-        # Rows 0 to 3 have a step in one logit each, row 4 none.
+        # Rows 0 to 3 have a step in one logit each, and row 4 has none.
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)
         shifted[np.arange(4), np.arange(4)] += 1j * STEP
         total = self._compute_log_likelihoods(1 / (1 + np.exp(-shifted)))
@@ -171,11 +174,14 @@ def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 
 def _rescale_matrices(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm (...)."""
+    """Return matrices (..., 2, 2) divided by their largest real part, and its logarithm (...).
+
+    Without this, products of many matrices would underflow.
+    """
     largest_of_columns = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
     largest = np.maximum(largest_of_columns[..., 0], largest_of_columns[..., 1])
     scale = np.where(largest > 0, largest, 1.0)
-    return matrix * (1 / scale)[..., None, None], np.log(scale)  # a division by a real number would be a complex one
+    return matrix * (1 / scale)[..., None, None], np.log(scale)  # multiplied, since NumPy divides as by complex numbers
 
 
 def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,9 +206,10 @@ def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray
 
 
 def _multiply_runs(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the logarithm of its scale.
+    """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the log of its scale.
 
-    The product is the returned matrix (sets, 2, 2) times its scale (sets,). Pair by pair: each turn halves the number.
+    The product is the returned matrix (sets, 2, 2) times its scale (sets,). Each turn multiplies pairs, which halves
+    the number of matrices.
     """
     log_scale = np.zeros(len(matrices))
     while matrices.shape[1] > 1:

@@ -160,12 +160,15 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 
 
 def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
-    """Return the names of laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them."""
+    """Return the names of the laws that a likelihood ratio test prefers to independent losses.
+
+    All tests together have the level LEVEL.
+    """
     level = LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
     significant = set[str]()
     for name, law in laws.items():
-        # Independent losses have one number: a law has as many more degrees of freedom as further numbers.
+        # Independent losses have one number, so a law's further numbers are its degrees of freedom.
         ratio, freedom = 2 * (total[name] - total[INDEPENDENT]), len(law.shares()) - 1
         if name != INDEPENDENT and scipy.stats.chi2.sf(ratio, freedom) < level:
             significant.add(name)
@@ -173,9 +176,9 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
 
 
 def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
-    """Return the law of the largest held-out likelihood, by name, among the significant ones and independent losses.
+    """Return the name of the law with the largest held-out likelihood, among independent losses and significant laws.
 
-    Without scores it is "hidden" where that is significant.
+    Without scores it is HIDDEN if that law is significant, else INDEPENDENT.
     """
     if not held_out:
         return HIDDEN if HIDDEN in significant else INDEPENDENT
@@ -186,8 +189,8 @@ def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> st
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for.
 
-    Of the Markov laws one looks back over one packet, the other over LONG; HIDDEN has a good and a bad mode that are
-    not seen; RUNNING follows the share of losses as it drifts.
+    One Markov law looks back over one packet, the other over LONG packets. HIDDEN has a good and a bad mode that are
+    not seen. RUNNING follows the share of losses as it drifts.
     """
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
@@ -199,12 +202,13 @@ def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
 
 
 def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
-    """Return by name the scores of the laws on later packets, each given all before it, when fitted to the first `cut`.
+    """Return the scores of the laws on later packets by name, when the laws are fitted to the first `cut` trials.
 
-    `parts`: stretches of fates; `known`: which packets are trials, of all stretches one after another.
+    Each later packet is predicted from all packets before it. `parts`: stretches of fates. `known`: which packets are
+    trials, stretch after stretch.
     """
     is_held_out = known & (np.cumsum(known) > cut)
-    # Later fates are hidden as unknown, so that the laws are fitted to the first `cut` alone.
+    # Hide later fates as unknown, so that the laws are fitted to the first `cut` trials.
     fates_to_fit = np.where(is_held_out, np.nan, np.concatenate(parts))
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
     laws = _fit_laws(CheckedFates(np.split(fates_to_fit, ends)), intervals=False)
@@ -258,7 +262,7 @@ class RunningRateLosses(AbstractLossLaw):
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
-            # A share p has the derivative p (1 - p) by its logit.
+            # The derivative of a share p by its logit is p (1 - p).
             share = expit(x)
             total, gradient = 0.0, np.zeros(len(x))
             for stretch, trial_mask in zip(parts, trials, strict=True):
@@ -274,20 +278,20 @@ class RunningRateLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("base", "weight", "step")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability of each loss by the running rate; an unknown fate leaves it where it is."""
+        """Return the probability of each loss by the running rate, which an unknown fate does not change."""
         known = ~np.isnan(fate)
         base, weight, step = (share.estimate for share in self.shares().values())
-        # The probability after each number of known fates: 0, 1, ..., all.
+        # The probability of loss after 0, 1, ..., all known fates.
         after_known, _ = _predict_losses(np.append(fate[known], 0.0), base, weight, step)
         known_before = np.cumsum(known) - known  # of each packet, how many known fates are before it
         return np.asarray(after_known[known_before])
 
 
 def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
-    """Return P(lost) of each packet by the running rate r, and its derivatives in base, weight and step (3, packets).
+    """Return P(lost) of each packet by the running rate, and its derivatives by base, weight and step (3, packets).
 
-    With d = r - base: P(lost) = base + weight d, and d+ = (1 - step) d + step (lost - base) from d = 0 on; so its
-    derivatives are recursions of the same kind, run as linear filters. `lost`: the fates, 1 where a packet was lost.
+    P(lost) = base + weight d, where d+ = (1 - step) d + step (lost - base) follows the fates, from d = 0 on. Its
+    derivatives follow recursions of the same form, so all run as linear filters. `lost`: the fates, 1 for a loss.
     """
     last_fate = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
     keep = [1.0, step - 1.0]
@@ -300,11 +304,11 @@ def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> t
 def _sum_log_probabilities(
     lost: Packets, predictions: tuple[Packets, Packets], trials: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Return the log-likelihood of the fates `lost` that are trials, and its gradient in base, weight and step (3,).
+    """Return the log-likelihood of the fates `lost` at `trials`, and its gradient by base, weight and step (3,).
 
     `predictions`: P(lost) of each packet, and its derivatives (3, packets).
     """
     p, slope = predictions
-    p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are numbers
+    p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are finite
     logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
     return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)

@@ -57,12 +57,11 @@ class AbstractLossLaw(Module):
         return np.concatenate([self._score_stretch(stretch) for stretch in check_fates(fates)])
 
     def _score_stretch(self, fate: Packets) -> Packets:
-        """Return log P(fate | those before) of each packet of a stretch (packets,); NaN where the fate is unknown.
+        """Return log P(fate | earlier fates) of each packet of a stretch (packets,), or NaN if the fate is unknown.
 
-        Of a stretch that was chosen for its ends the last one has log P(arrived | those before) - log P(arrived | the
-        first), so that the sum is the log-likelihood given both ends.
-
-        CHOSEN: the fate of a packet that arrived, and is an end of its stretch for that reason.
+        A stretch may have been chosen because its ends arrived; its last fate is then CHOSEN. Its last entry becomes
+        log P(arrived | earlier fates) - log P(arrived | first fate), so that the sum is the log-likelihood given both
+        ends.
         """
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
@@ -72,7 +71,7 @@ class AbstractLossLaw(Module):
         return logs
 
     def _compute_return_probability(self, steps: int) -> float:
-        """Return P(arrived after so many steps | arrived now), whatever became of the packets between."""
+        """Return P(arrived after this number of steps | arrived now), with the fates of the packets between unknown."""
         fate = np.full(steps + 1, np.nan)
         fate[0] = 0.0
         return 1.0 - float(self.predicted(fate)[-1])
@@ -94,7 +93,7 @@ class IndependentLosses(AbstractLossLaw):
         """Return the law of the share of losses, by counting.
 
         Raises:
-            ValueError: what is no fates.
+            ValueError: an argument that is no fates.
         """
         known = np.concatenate(check_fates(fates))
         return IndependentLosses(int(np.sum(known == 1)), int(np.sum(find_trials(known))))
@@ -127,15 +126,14 @@ class MarkovLosses(AbstractLossLaw):
 
     @staticmethod
     def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
-        """Return the law by counts over packets of which the last `order` fates are known.
+        """Return the law from counts over packets whose last `order` fates are known.
 
-        A stretch may have been cut so that it begins and ends with an arrival: what follows then is taken given that
-        its end arrives. For order 1 the counts have the shares that make this likelihood largest, and are of as many
-        packets as tell so much; intervals are by its profile. For higher orders only packets between the ends are
-        counted.
+        A stretch may have been cut so that it begins and ends with an arrival. For order 1 the likelihood is then taken
+        given that the end arrives: the shares maximise it, and intervals come from its profile. For higher orders only
+        packets between the ends are counted.
 
         Raises:
-            ValueError: what is no fates, or an order that is not from 1 to 12.
+            ValueError: an argument that is no fates, or an order that is not from 1 to 12.
         """
         if check_count("order", order) > 12:
             raise fail("order", "at most 12 packets back", order)
@@ -143,8 +141,8 @@ class MarkovLosses(AbstractLossLaw):
         stretches = check_fates(fates)
         for stretch in stretches:
             past, length = _number_last_fates(fill_ends(stretch), order)
-            # Of order 1 the chain is taken given its end, so that the step to the end counts as well. A past that comes
-            # several times is counted each time.
+            # For order 1 the likelihood is taken given the end, so that the step to the end counts too. `np.add.at`
+            # counts a past each time that it comes.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
         spans = _measure_spans(stretches)
@@ -156,13 +154,11 @@ class MarkovLosses(AbstractLossLaw):
         return len(self.counts).bit_length() - 1
 
     def shares(self) -> dict[str, Share]:
-        """Return P(lost | arrived) as "fail" and P(arrived | lost) as "recover" with Wilson's intervals.
+        """Return P(lost | arrived) as "fail" and P(arrived | lost) as "recover" with intervals, for order 1.
 
-        Of a higher order P(lost | past) of each past. Between ends that were chosen for arriving the intervals are the
-        likelihood's.
-
-        `given_ends`: both shares, where stretches were cut so that they end with an arrival; else None. `counts`:
-        (arrived, lost) after each past.
+        For a higher order it is P(lost | past) of each past. `self.counts`: (arrived, lost) after each past, from which
+        Wilson's intervals come. `self.given_ends`: both shares with intervals by the likelihood, if stretches were cut
+        so that they end with an arrival, else None.
         """
         if self.given_ends is not None:
             return dict(zip(("fail", "recover"), self.given_ends, strict=True))
@@ -173,10 +169,10 @@ class MarkovLosses(AbstractLossLaw):
         return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability (k + 1/2) / (n + 1) of each loss: k of n packets with the same past were lost.
+        """Return the probability (k + 1/2) / (n + 1) of each loss, if k of n packets with the same past were lost.
 
-        The past are the last fates, at most `order`, as many as are known without a gap: a number whose lowest bit is
-        the latest fate (1: lost). `self.counts` has (arrived, lost) after each past.
+        The past is the last fates that are known without a gap, at most `order`, as a number whose bit 0 is the latest
+        fate (1: lost). `self.counts`: (arrived, lost) after each past.
         """
         past, length = _number_last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
@@ -189,10 +185,9 @@ class MarkovLosses(AbstractLossLaw):
         return probabilities
 
     def _compute_return_probability(self, steps: int) -> float:
-        """Return P(arrived after so many steps | arrived now), whatever became of the packets between.
+        """Return P(arrived after this number of steps | arrived now), with the fates of the packets between unknown.
 
-        Of order 1 in closed form, (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived), b = P(arrived |
-        lost).
+        For order 1 it is (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived) and b = P(arrived | lost).
         """
         if self.order > 1:
             return super()._compute_return_probability(steps)
@@ -268,14 +263,13 @@ class _LikelihoodBetweenEnds(NamedTuple):
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return l = sum n log p - sum_spans log P_m, and its gradient (2,), at the logits x (2,) of (a, b).
 
-        a: P(lost | arrived before), b: P(arrived | lost before). P_m = (b + a (1 - a - b)^m) / (a + b): the probability
-        to arrive again after m steps. It is divided by since arriving at the end is why the stretch ends there.
-
-        n: `counts` of arrivals and losses after either fate, p: the probability of each; m: `spans`, the steps from the
-        first to the last packet of each stretch that was cut at arrivals.
+        a = P(lost | arrived before) and b = P(arrived | lost before). n are the `counts` of arrivals and losses after
+        either fate, and p their probabilities. m are the `spans`, the steps from first to last packet of stretches cut
+        at arrivals. P_m = (b + a (1 - a - b)^m) / (a + b), the probability to arrive after m steps, is divided out,
+        because stretches end there since it arrived.
         """
         a, b = shares = 1 / (1 + np.exp(-x))
-        # P_m = again / total, with power = (1 - a - b)^m, whose derivative in a, and in b, is `slope`.
+        # P_m = again / total. The derivative of power = (1 - a - b)^m by a, and by b, is `slope`.
         kept = 1 - a - b
         power, slope = kept**self.spans, -self.spans * kept ** (self.spans - 1.0)
         again, total = b + a * power, a + b
@@ -284,19 +278,19 @@ class _LikelihoodBetweenEnds(NamedTuple):
         (stayed, failed), (recovered, lost) = self.counts
         value = stayed * np.log1p(-a) + failed * np.log(a) + recovered * np.log(b) + lost * np.log1p(-b)
         score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
-        # By the logits: dp / d logit p = p (1 - p).
+        # The derivative by a logit has the factor dp / d logit p = p (1 - p).
         return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
 
 
 def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last fates before each packet as a number, and how many are known without a gap, (packets,) each.
+    """Return the fates before each packet as a number, and how many of these are known without a gap, (packets,) each.
 
-    The number's lowest bit is the latest fate, 1 for lost; it has as many bits as are known, `order` at most.
+    Bit 0 of the number is the latest fate, 1 for a loss. It has as many bits as are known, at most `order`.
     """
     number = np.zeros(len(fate), dtype=int)
     length = np.zeros(len(fate), dtype=int)  # how many of the last fates are known
     for back in range(1, order + 1):
-        # The fate `back` packets ago counts where all later ones are known too.
+        # The fate `back` packets ago counts only if all later ones are known.
         earlier = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]
         is_unbroken = (length == back - 1) & ~np.isnan(earlier)
         number += np.where(is_unbroken, np.nan_to_num(earlier).astype(int) << (back - 1), 0)

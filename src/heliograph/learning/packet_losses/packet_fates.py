@@ -40,7 +40,7 @@ class BetweenArrivals(np.ndarray):
 
     @staticmethod
     def of(fates: np.ndarray) -> "BetweenArrivals":
-        """Return fates (packets,) marked as those of a stretch that was chosen to begin and end with an arrival."""
+        """Return fates (packets,), marked as a stretch that was chosen to begin and end with an arrival."""
         marked = fates.view(BetweenArrivals)
         marked.chosen = True
         return marked
@@ -97,16 +97,16 @@ def fates_of_sequence(
 
 
 def _split_at_restarts(received: np.ndarray, jump: int, may_be_copies: bool) -> list[list[int]]:
-    """Return the sequence numbers (packets,) in rising stretches, each from one start of the sender to the next.
+    """Return the sequence numbers (packets,) as rising stretches, split where the sender restarted.
 
     Args:
-        received: sequence numbers in order.
-        jump: leap ahead that means a restart.
-        may_be_copies: whether numbers that come again may be copies, which are dropped, and no restart.
+        received: sequence numbers in the order of arrival.
+        jump: a leap ahead by this much or more means a restart.
+        may_be_copies: True if repeated numbers may be copies, which are dropped, and no restart.
     """
     stretches: list[list[int]] = [[]]
     for run in _split_rising(received):
-        # Numbers at the begin of a rising run that are not above the last one.
+        # Numbers at the beginning of a rising run that are not above the last number of the stretch.
         repeated = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
         if repeated and not (may_be_copies and _are_copies(repeated, run, stretches[-1])):
             stretches.append([])
@@ -125,12 +125,12 @@ def _split_rising(received: np.ndarray) -> list[list[int]]:
 
 
 def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
-    """Return whether numbers that came again, at the begin of a rising run, are copies, and not of a restarted sender.
+    """Return whether repeated numbers at the beginning of a rising run are copies, rather than from a restarted sender.
 
-    A few (FEW) are, if all came within the last COPY. More are where all that came from a number on comes again, and
-    the run goes on from there, as from a broker that was not told of their arrival; but not from the first number on.
-    After 5, 6, 7, 8 come 7, 8, 9: `stretch` [5, 6, 7, 8] came before, `run` [7, 8, 9] rises from the break on, and
-    `again` [7, 8] are those of it that had come.
+    Example: after 5, 6, 7, 8 come 7, 8, 9. Then `stretch` is [5, 6, 7, 8], `run` is [7, 8, 9] and `again` is [7, 8].
+    All must be among the last COPY numbers. At most FEW are always copies. More are copies if everything from some
+    number on comes again and the run then goes on, as from a broker that missed the acknowledgements. This number may
+    not be the first of the stretch.
     """
     lately = stretch[-COPY:]
     if not set(again) <= set(lately):
@@ -140,7 +140,7 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
 
 
 def _mark_gaps(received: np.ndarray) -> BetweenArrivals:
-    """Return the fates of all packets from the first received number to the last: the missing ones were lost.
+    """Return the fates of all packets from the first received number to the last; missing numbers were lost.
 
     `received`: rising sequence numbers.
     """
@@ -154,7 +154,7 @@ def fates_by_node(
     sequence: "Float[ArrayLike, ' packets']",
     sent: "Float[ArrayLike, ' packets'] | None" = None,
 ) -> dict[str, Fates]:
-    """Return {sender: fates of its packets} of the packets of a log, as `fates_of_sequence` finds them.
+    """Return {sender: fates of its packets} for a log of packets, as `fates_of_sequence` finds them.
 
     Args:
         node: sender of each packet (packets,).
@@ -206,10 +206,10 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
 
 
 def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *received']]") -> dict[str, Fates]:
-    """Return the fates of what each node of a recording should have received at each step, where NaN is a loss.
+    """Return the fates of each node's packets in a recording, one packet a step, where NaN is a loss.
 
-    Components of a node that come and go together are one packet, under the node's name; else each has a name of its
-    own, NODE.0, NODE.1, ... A component that never arrived was not sent.
+    If all components of a node arrive together, they are one packet under the node's name. Otherwise each component is
+    a packet of its own, NODE.0, NODE.1, ... A component that never arrived counts as not sent.
 
     Args:
         measurements: {node: (steps, received)} or (steps,), NaN where a component did not arrive.
@@ -262,7 +262,7 @@ def check_fates(value: object) -> Fates:
 
 
 def _list_stretches(value: object) -> list[Any]:
-    """Return the stretches of `value`: its members if all of them have one axis, else itself as the only one."""
+    """Return the stretches of `value`: its members if all of them have one axis, else `value` as the only one."""
     is_sequence = isinstance(value, Sequence) or rank("fates", value) > 0
     members: list[Any] = list(cast(Sequence[Any], value)) if is_sequence else [value]
     are_stretches = len(members) > 0 and all(rank("fates", member) == 1 for member in members)
@@ -270,7 +270,7 @@ def _list_stretches(value: object) -> list[Any]:
 
 
 def _mark_chosen_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Return the fates (packets,) with CHOSEN for the first and the last."""
+    """Return the fates (packets,) with the first and the last replaced by CHOSEN."""
     ends = np.zeros(len(fate), dtype=bool)
     ends[[0, -1]] = True
     return np.where(ends, CHOSEN, fate)

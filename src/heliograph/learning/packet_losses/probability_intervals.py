@@ -43,12 +43,11 @@ def maximise_over_shares(
 
 
 def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
-    """Return the shares at the maximum `top` (logits) of a log-likelihood, whose value there is `value`.
+    """Return the shares at the maximum `top` (logits) of a log-likelihood, which is `value` there.
 
-    Each has the interval at whose ends its profile has fallen by FALL, or NaN in place of it unless `intervals`. A
-    share at 0 is "0, below the high end", one at 1 "1, above the low end"; then FALL_AT_END counts.
-
-    Profile: the log-likelihood with this share held, maximised over the others. FALL: 1.92, for intervals of 95 %.
+    The profile of a share is the log-likelihood with this share held, maximised over the others. Its interval ends
+    where the profile has fallen by FALL (1.92, for 95 %). The ends are NaN unless `intervals` is True. A share at 0 or
+    at 1 has one open side, and FALL_AT_END counts on the other.
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
@@ -56,12 +55,12 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 
 
 def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: float, i: int) -> Share:
-    """Return share i at the maximum `top` (logits), with the interval at whose ends its profile has fallen by FALL.
+    """Return share i at the maximum `top` (logits), with the interval where its profile has fallen by less than FALL.
 
-    `value`: the log-likelihood at the maximum. Of a share at 0 or 1 one side of the interval is open, and its fall
-    is FALL_AT_END. END: the largest logit of the search.
+    `value`: the log-likelihood at the maximum. If the share is 0 or 1, the interval has one end, with the fall
+    FALL_AT_END. END: the largest logit of the search.
     """
-    # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
+    # A logit near the bounds of the search means a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
     low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, side=-1)
@@ -90,10 +89,10 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
     @cache  # from another start a search may end elsewhere, so that an end of a bracket has to keep its value
     def height_above_level(logit: float) -> float:
-        """Return how far the profile is above `level`: the log-likelihood, largest over the other logits, at this one.
+        """Return how far the profile is above `level` when logit number i is held at `logit`.
 
-        `function` is the log-likelihood of all logits, of which number i is held at `logit`. The search over the
-        others begins at `start_of_others`, which are kept from the last point above the level.
+        The profile is the log-likelihood `function`, maximised over the other logits. The search begins at
+        `start_of_others`, which is the last result above the level.
         """
         nonlocal start_of_others
         function_of_others = _fix_logit(function, i, logit, others)
@@ -115,10 +114,10 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
 
 def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray) -> LogLikelihood:
-    """Return the log-likelihood as a function of the `others` alone (indices of logits), where logit i is `fixed`."""
+    """Return the log-likelihood as a function of the logits with indices `others`, with logit i held at `fixed`."""
 
     def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log-likelihood with logit i held, and its gradient by the others, `free` being their values."""
+        """Return the log-likelihood with logit i held and the others at `free`, and its gradient by the others."""
         x = np.zeros(len(free) + 1)
         x[i], x[others] = fixed, free
         value, gradient = function(x)

@@ -134,9 +134,10 @@ class DrivenTransition(Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
+        """Return the next state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
 
-        E is `self.coupling`, by which the biases drive the plant; u_b are the inputs at `self.places`, which move them.
+        E is `self.coupling`, through which the biases drive the plant. u_b are the inputs at `self.places`, which move
+        the biases.
         """
         n = len(self.plant.states)
         state, biases = x[:n], x[n:]
@@ -202,7 +203,10 @@ def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, E: np.ndarray, 
         return jnp.block([[A, jnp.asarray(E)], [jnp.asarray(zeros), F]])
 
     def input_matrix(u: jax.Array) -> jax.Array:
-        """Return [B; B_b] under the inputs u: of the plant, and of the bias, which `inputs_of_bias` @ u moves."""
+        """Return [B; B_b] under the inputs u: the input matrices of the plant and of the bias.
+
+        `inputs_of_bias` @ u are the inputs that move the bias.
+        """
         B = matrix_under_inputs(plant.input_matrix, u)
         of_bias = matrix_under_inputs(bias.input_matrix, inputs_of_bias @ u)
         return jnp.concatenate([B, of_bias @ inputs_of_bias])
@@ -218,12 +222,15 @@ class BiasedMeasurement(Module):
     states: int = eqx.field(static=True)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Return the expected outputs."""
+        """Return the expected outputs h(x) + D b, with D = `self.loading` and x, b the two parts of the argument."""
         return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
 def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
-    """Return the sensor y = h(x) + D b + v of the state [x; b], b the biases, D `loading`, `states` the length of x."""
+    """Return the sensor y = h(x) + D b + v of the state [x; b] with biases b.
+
+    `loading`: D. `states`: the length of x.
+    """
     if not isinstance(sensor, LinearSensor):
         return Sensor(BiasedMeasurement(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
     stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
@@ -231,7 +238,7 @@ def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int
 
 
 def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
-    """Return a list of `count` values, one for each bias, from one value for all or from as many."""
+    """Return a list of `count` values, one for each bias, from a single value or from `count` values."""
     number_or_sequence: Any = value
     values = list(number_or_sequence) if rank(name, value) else [number_or_sequence] * count
     if len(values) != count:

@@ -49,10 +49,10 @@ class StampedSensor(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """Return h(x) - o dh/dt: to first order h when the clock, o ahead, showed the time; h(x) for a right clock.
+        """Return h(x) - o dh/dt: to first order, what h was when the clock, which is o ahead, showed the present time.
 
-        `states`: how many states h takes; `motion`: their rate of change, a matrix or a function (None: the clock is
-        right); `offset`: the place of o among the states.
+        `self.states`: how many states h takes. `self.motion`: their rate of change, as a matrix or a function; None if
+        the clock is right, which gives h(x). `self.offset`: the place of o among the states.
         """
         state = jnp.asarray(x)[: self.states]
         if self.motion is None:
@@ -108,12 +108,12 @@ def with_clocks(
 
 
 def _read_step_length(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
-    """Return the time of a step, not negative, or the name of the plant's input that says it, checked."""
+    """Return the checked time of a step, which is not negative, or the name of the plant's input that holds it."""
     if not isinstance(dt, str):
         return scalar("time of a step", dt, 0.0)
     if dt not in plant.inputs:
         raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
-    return plant.inputs[plant.inputs.index(dt)]  # the plant's own text, with the unit that it may hold
+    return plant.inputs[plant.inputs.index(dt)]  # the plant's own name, which may carry a unit
 
 
 def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:

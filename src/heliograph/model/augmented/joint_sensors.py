@@ -127,8 +127,8 @@ def join_links(sensors: Mapping[str, AnySensor], channels: Sequence[Channel]) ->
     """Return the sensors and the channels of several nodes as one sensor behind one channel, over time if one varies.
 
     Args:
-        sensors: by node, in their order; the outputs are named NODE_OUTPUT.
-        channels: of the nodes, in the same order.
+        sensors: the sensors by node; outputs of the joint sensor are named NODE_OUTPUT.
+        channels: the channels of the nodes, in the same order.
     """
 
     def join_sensors_of_step(*sensors_of_step: AbstractSensor) -> AbstractSensor:

@@ -20,9 +20,10 @@ from heliograph.random_affine.shaped_noise import Shaped
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
     """Return plant, sensor and channel with the states (x_k, y_k, y_{k-1}, ..., y_{k-D}), all sent without delay.
 
-    y+ = C (A x + B u + w) + v is a state with its noise, so that one y received twice is known to be one. Past states x
-    instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
-    The new channel takes y_k, ..., y_{k-D} and draws as the late one does; any filter of linear plants takes the three.
+    The state y+ = C (A x + B u + w) + v includes the noise v, so that a y received twice counts once. With past x as
+    states, its noise would count as two independent ones, and the claimed covariance would be too small. Before the
+    first step zeros were sent. The new channel takes y_k, ..., y_{k-D} and draws like the late one. Any filter of
+    linear plants takes the three.
 
     Args:
         plant: linear.

@@ -43,7 +43,7 @@ def describe_non_finite_function(filter: PyTree, before: Estimate, u: Float[np.n
 
 
 def _yield_trial_states(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
-    """Yield the states at which a model's functions are tried: the mean, and one deviation from it along each state."""
+    """Yield states at which to try a model's functions: the mean, and one deviation from it to each side by state."""
     mean = np.asarray(before.mean)
     variances = np.diag(np.asarray(before.covariance))
     yield mean
@@ -58,7 +58,7 @@ def _plant_fits(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
 
 
 def _measure(sensor: AbstractSensor, x: np.ndarray) -> np.ndarray:
-    """Return h(x); no numbers, an empty array, where the sensor takes a state of another length."""
+    """Return h(x), or an empty array if the sensor cannot take a state of this length."""
     try:
         return np.asarray(sensor.measure(jnp.asarray(x)))
     except (TypeError, ValueError, IndexError):

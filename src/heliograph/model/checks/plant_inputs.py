@@ -60,7 +60,7 @@ def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> TimeStepFault | Non
 
 
 def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:
-    """Raise ValueError unless each time step, the input "dt", is a number from 0 to 2^53 and no counter that wrapped.
+    """Raise ValueError unless each time step (input "dt") is from 0 to 2^53 and not from a counter that wrapped.
 
     Args:
         names: names of the inputs.
@@ -75,10 +75,10 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
 
 
 def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
-    """Return whether each number can be a time step: from 0 to 2^53 (LONGEST), and no counter that wrapped.
+    """Return whether each number can be a time step: from 0 to LONGEST (2^53), and not from a counter that wrapped.
 
-    One below zero that unsigned counters of 32 bits give reads just below 2^32: within NEAR for whole numbers, or
-    within CLOSE where dt has SMALLER = 1e3 or 1e6 counts in a unit. `precision`: type of the numbers.
+    A negative difference of unsigned 32-bit counters reads as just below 2^32. That means within NEAR for whole
+    numbers, or within CLOSE if dt has SMALLER = 1e3 or 1e6 counts in a unit. `precision`: type of the numbers.
     """
     has_wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
     for counts_in_unit in SMALLER:
@@ -120,7 +120,7 @@ def check_inputs(
 
 
 def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
-    """Yield the sensors in models that depend on inputs, all of them among `names`, with their places in `names`."""
+    """Yield the sensors in `models` that depend on inputs, all of which are in `names`, with their places there."""
     for sensor in yield_models_of_class(models, AbstractSensor):
         own = first(sensor).inputs
         if own and set(own) <= set(names):
@@ -134,7 +134,7 @@ def yield_plants(models: PyTree) -> Iterator[AnyPlant]:
 
 
 def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
-    """Yield the models of a class, such as sensors, that a model object holds, constant or over time."""
+    """Yield all models of a class, such as sensors, within a model object, whether constant or varying over time."""
 
     def is_part(part: object) -> bool:
         """Return whether an object is of the class, constant or over time."""
@@ -218,9 +218,9 @@ def _evaluate_in_blocks_of_steps(
 def _evaluate_at_steps(
     plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
 ) -> Any:
-    """Return the matrices of each function at each step, (steps, n, m), under the inputs u of that step.
+    """Return the matrices of each function at each step (steps, n, m), under the inputs u of that step.
 
-    Compiled, for operation by operation is slow.
+    It is compiled, since computing one operation after another is slow.
     """
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
@@ -238,7 +238,7 @@ def _shorten(value: np.ndarray) -> str:
 
 
 def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
-    """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
+    """Return which matrices (steps, n, n) are not covariances, by the tolerances of `check.covariance`."""
     is_finite = np.isfinite(values).all(axis=(1, 2))
     finite_values = np.where(is_finite[:, None, None], values, 0.0)
     deviations = standard_deviations(finite_values)  # so that tolerances do not depend on the states' units
@@ -275,7 +275,7 @@ def do_inputs_spoil(
 
 
 def _returns_invalid_value(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
-    """Decide whether a matrix that a model computes from its inputs u is no covariance, or not finite.
+    """Return whether some matrix that a model computes from its inputs u is not finite, or no covariance.
 
     COVARIANCES: names of the matrices that must be covariances. `precision`: type of the numbers, for tolerances.
     """

@@ -42,10 +42,10 @@ def number_of_reason(reason: Reason) -> int:
 
 
 def count_by_reason(refused: Int[np.ndarray, "time m"]) -> dict[Reason, Int[np.ndarray, " m"]]:
-    """Count the refused readings of each component (m,), by reason; reasons for which none was refused are left out.
+    """Count the refused readings of each component (m,), by reason; reasons without refusals are left out.
 
     Args:
-        refused: the number of the reason of each reading, 0 of one that is kept (time, m).
+        refused: the number of each reading's reason (time, m), 0 if it is kept.
     """
     counts = {reason: np.count_nonzero(refused == number_of_reason(reason), axis=0) for reason in REASONS}
     return {reason: count for reason, count in counts.items() if count.any()}

@@ -15,10 +15,10 @@ ONE_STEP = "a plant without the input dt takes each for one; insert the rows tha
 
 
 def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
-    """Return the dates in the index of tables (datetime64[ns], UTC), which must agree; None where no table has any.
+    """Return the dates in the tables' indices (datetime64[ns], UTC), which must agree, or None if there are none.
 
     Args:
-        tables: measurements and inputs by what they are called in errors.
+        tables: tables of measurements and inputs, by their names for errors.
 
     Raises:
         ValueError: dates that are missing, that go backwards, or that differ from those of another table.
@@ -38,7 +38,7 @@ def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
 
 
 def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> None:
-    """Warn where times are not equally spaced, but the plant, without the input dt, takes each row for one step.
+    """Warn if times are not equally spaced although the plant has no input dt, so that each row is one step to it.
 
     Args:
         inputs: names of the plant's inputs.
@@ -52,11 +52,11 @@ def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> No
 
 
 def read_row_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
-    """Return the dates of the rows of tables; warn where their steps differ and the plant has no input dt to say so.
+    """Return the dates of the tables' rows; warn if they are not equally spaced and the plant has no input dt.
 
     Args:
         inputs: names of the plant's inputs.
-        tables: measurements and inputs by what they are called in errors.
+        tables: tables of measurements and inputs, by their names for errors.
 
     Raises:
         ValueError: dates that are missing, that go backwards, or that differ from those of another table.
@@ -67,9 +67,9 @@ def read_row_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.nd
 
 
 def _count_frames_up_to_user() -> int:
-    """Return the `stacklevel` with which a warning of the caller points at the user's line, outside this package.
+    """Return the `stacklevel` with which the caller's warning points at the user's line, outside this package.
 
-    It counts the frames of this package from here up.
+    It is the number of frames of this package from here upwards.
     """
     package, depth, frame = __name__.split(".")[0], 0, inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:

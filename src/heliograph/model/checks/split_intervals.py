@@ -23,15 +23,15 @@ def find_indivisible_part(
     channel: Channel | None = None,
     trigger: AbstractTrigger | None = None,
 ) -> str:
-    """Return the part of a model whose law goes by steps, not by time, in words for an error; "" if there is none.
+    """Return in words, for an error, the part of a model whose law counts steps and not time; "" if there is none.
 
-    A row inserted in between would change such a law.
+    Inserting a row would change such a law.
 
     Args:
-        plant: the plant; each of these may be None, where it is not asked about.
+        plant: the plant; this and the others may be None, and are then not looked at.
         sensor: its sensor.
-        channel: what brings its signal.
-        trigger: rule of the sender.
+        channel: the channel of its signal.
+        trigger: the rule by which the sender decides to send.
     """
     if plant is not None and memories(plant):
         return "a plant with modes, whose law a row that is inserted would change"
@@ -86,9 +86,10 @@ def _predict_over_intervals(
     """
 
     def integrate(intervals: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean, transition matrix and noise covariance after intervals of these lengths, one after another.
+        """Return the mean, transition matrix and noise covariance after intervals of these lengths, one after another.
 
-        x: the mean before them; `dt`: the number of the input that is the length, all other inputs being 1.
+        From outside: `x`, the mean before them, and `dt`, the number of the input that is the length. All other inputs
+        are 1.
         """
         n = len(x)
         mean, matrix, covariance = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))

@@ -74,11 +74,12 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
 
 
 def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
-    """Return the models `own` of a node with past signals as states, where the filter was made for such a larger plant.
+    """Return the models of a node with past signals as states if the filter was made for such a larger plant.
 
     Args:
         believed: the models that the filter was made for.
-        own: plant, sensor and channel where it stands; returned as they are unless the channel is late (`past` steps).
+        own: plant, sensor and channel where it stands. They are returned unchanged if the channel is not late
+            (`past` is 0) or the filter's plant has no more states.
     """
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
@@ -114,9 +115,9 @@ def restrict_premise_to_rows(premise: Premise, rows: Sequence[int]) -> Premise:
 
 
 def _agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
-    """Decide by `agree(a, b, order)` whether two models agree at each step; a constant one is the same at all of them.
+    """Return whether two models agree at each step by `agree(a, b, order)`; a constant model is the same at all steps.
 
-    `order`: of the moments that a filter uses, None for the whole law.
+    `order`: the order of the moments that a filter uses, None for the whole law.
     """
     if are_same(a, b):
         return True
@@ -127,7 +128,7 @@ def _agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order:
 
 
 def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
-    """Return whether noises agree in what a filter uses of them: all of their law, or mean and covariance (`order`)."""
+    """Return whether noises agree in what a filter uses of them: mean and covariance (`order`), or the whole law."""
     if are_same(a, b):
         return True
     if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
@@ -164,9 +165,9 @@ def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
 
 
 def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
-    """Return whether two plants' process noises agree, as laws, or by covariances as functions of the inputs.
+    """Return whether two plants' process noises agree, as laws or as covariances that are functions of the inputs.
 
-    `order`: of the moments that a filter uses, None for the whole law.
+    `order`: the order of the moments that a filter uses, None for the whole law.
     """
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         return _same_noise(a.noise, b.noise, order)
@@ -228,7 +229,7 @@ def _find_common_state_length(*sensors: AbstractSensor) -> list[int]:
 
 
 def _takes_states(sensor: AbstractSensor, states: int) -> bool:
-    """Return whether a sensor measures plants with so many states."""
+    """Return whether a sensor can measure a plant with this number of states."""
     try:
         sensor.check_states(states)
     except ValueError:
@@ -237,9 +238,9 @@ def _takes_states(sensor: AbstractSensor, states: int) -> bool:
 
 
 def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
-    """Return the matrix of a linear sensor, or of linear ones stacked into one.
+    """Return the matrix of a linear sensor, or of linear sensors stacked into one.
 
-    None of any other, of a matrix that depends on inputs, and of one that JAX traces.
+    It is None for any other sensor, for a matrix that depends on inputs, and for one that JAX traces.
     """
     if isinstance(sensor, LinearSensor):
         return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
@@ -252,8 +253,8 @@ def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
     """Return whether the sender's rule is the one that the filter believes.
 
-    A filter that believes in no rule agrees with a schedule (Periodic): what is not sent then is missing whatever its
-    value, and says nothing about it.
+    A filter that believes in no rule agrees with a schedule (Periodic): a schedule leaves values out whatever they are,
+    so that a missing value says nothing.
     """
     if believed is None:
         return own is None or isinstance(own, Periodic)
@@ -266,13 +267,13 @@ def _same_gains(believed: Premise, own: Premise) -> bool:
 
 
 def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
-    """Decide whether two channels agree; memories count as the same where they stand at the same place.
+    """Return whether two channels agree; memories at the same place count as the same.
 
     Args:
         a: a channel, constant or over time.
         b: the other.
-        order: of the moments that a filter uses, None for the whole law.
-        loses: whether they may differ in what is lost, which the filter sees.
+        order: the order of the moments that a filter uses, None for the whole law.
+        loses: True if they may differ in what they lose, since the filter sees losses.
     """
     if a is b:
         return True
@@ -307,17 +308,17 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
 
 
 def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Decide whether two maps are the same but for what is lost; False where losses depend on gains (a ValueError)."""
+    """Return whether two maps are the same except for what they lose; False if losses depend on gains."""
     try:
         return are_same(a.condition_on_arrival(), b.condition_on_arrival())
-    except ValueError:
+    except ValueError:  # losses depend on gains
         return False
 
 
 def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Decide whether E[(G, n)] and Cov(z | y) of what arrives of z = G y + n through b are those of a, at every step.
+    """Return whether what arrives of z = G y + n has the same E[(G, n)] and E[z z' | y] through a and b.
 
-    False where noise is known by a bound in one of them alone: bounds would have to be compared as laws.
+    If noise is only known by a bound in one of them, the result is False, since bounds cannot be compared by moments.
     """
     if has_bounded_noise(a) != has_bounded_noise(b):
         return False
@@ -327,7 +328,7 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
     where_all_arrive = next((moments for arrived, moments in moments_of_a if arrived.all()), None)
     if where_all_arrive is None:
         return False
-    # Each set of components that may arrive has, in both, the moments that it has where all arrive.
+    # In both, each set of components that may arrive must have the moments that it has when all arrive.
     every = [*moments_of_a, *moments_of_b]
     return all(_moments_agree(where_all_arrive, moments, arrived) for arrived, moments in every)
 
@@ -357,9 +358,10 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
 
 
 def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
-    """Decide whether moments of the components that arrived are equal to rounding (EQUAL), each relative to its size.
+    """Return whether the moments of the components that arrived are equal to rounding (EQUAL), relative to their size.
 
-    Each of a and b: E[(G, n)] (m, p + 1) and E[z z' | y] as a tensor (m, m, p + 1, p + 1) of the entries of (y, 1).
+    a and b are each E[(G, n)] (m, p + 1), and E[z z' | y] as a tensor (m, m, p + 1, p + 1) that multiplies (y, 1)(y,
+    1)'.
     """
     (mean_a, second_a), (mean_b, second_b) = a, b
     rows = np.ix_(arrived, arrived)
@@ -373,9 +375,10 @@ def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
 def _same_observation(
     a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
 ) -> bool:
-    """Decide whether two pairs of sensor and channel deliver alike of the state, though they are written differently.
+    """Return whether two pairs of sensor and channel deliver the same of the state, though written differently.
 
-    Only for filters that use mean and covariance (`order`): then each pair is compared as one map from the state.
+    This is only decided for filters that use mean and covariance (`order`). Each pair is then compared as one map from
+    the state.
     """
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
@@ -386,7 +389,7 @@ def _same_observation(
 
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
-    """Return the map from the state to what is received; None unless the sensor is linear, without angles or delays."""
+    """Return the map from the state to what is received; None unless the sensor is linear, without angles, delays."""
     matrix = find_sensor_matrix(sensor)
     if matrix is None or sensor.angles or channel.past:
         return None

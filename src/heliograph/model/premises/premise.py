@@ -143,9 +143,9 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:
-        """Make the filter, and keep with it the plant, sensor, channel, trigger and encoder among the arguments.
+        """Make the filter, and store with it the plant, sensor, channel, trigger and encoder among the arguments.
 
-        `make`: the decorated function, `parameters` its signature, `parts` the names of these five.
+        From outside: `make`, the decorated function, `parameters`, its signature, and `parts`, the names of these five.
         """
         given = parameters.bind(*args, **kwargs).arguments
         premise = Premise(**{name: given[name] for name in parts if name in given})

@@ -13,27 +13,27 @@ ASIDE = ("name", "jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd")  # labels, and rules
 
 
 def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[int, ...]) -> bool:
-    """Decide whether two functions of arrays of these shapes are one, or the same program when JAX traces them.
+    """Return whether two functions of arrays are the same object, or the same program when JAX traces them.
 
     Args:
         f: one function, written with jax.numpy.
         g: the other.
-        shapes: of the arguments.
+        shapes: shapes of the arguments.
     """
     if are_same(f, g):
         return True
     try:
         with jax.enable_x64(True):
             programs = [jax.make_jaxpr(function)(*map(np.zeros, shapes)) for function in (f, g)]
-    except Exception:  # what cannot be traced is equal to itself alone
+    except Exception:  # a function that cannot be traced equals only itself
         return False
     return _same_parameter(*programs)
 
 
 def _same_parameter(a: Any, b: Any) -> bool:
-    """Return whether parameters of two operations are the same: inner programs (jaxprs) by their operations.
+    """Return whether parameters of two operations are the same.
 
-    All other parameters are compared by value, lists entry by entry.
+    Inner programs (jaxprs) are compared by their operations, lists entry by entry, and everything else by value.
     """
     if isinstance(a, core.ClosedJaxpr) and isinstance(b, core.ClosedJaxpr):
         return are_same(list(a.consts), list(b.consts)) and _same_program(a.jaxpr, b.jaxpr)
@@ -71,9 +71,9 @@ def _number_variables(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[
 
 
 def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> bool:
-    """Return whether lists of operands of two operations are the same, one by one (`_same_atom`).
+    """Return whether the operands of two operations are the same one by one (`_same_atom`).
 
-    `names`: for both programs the number of each variable.
+    `names`: for each program, the number of each variable.
     """
     if len(a) != len(b):
         return False
@@ -81,9 +81,9 @@ def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], 
 
 
 def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> bool:
-    """Return whether operands are equal constants, or variables of one number and type.
+    """Return whether operands are equal constants, or variables with the same number and type.
 
-    `names`: for both programs the number of each variable, in the order in which they appear.
+    `names`: for each program, the number of each variable in order of appearance.
     """
     if isinstance(x, core.Literal) and isinstance(y, core.Literal):
         return are_same(np.asarray(x.val), np.asarray(y.val))

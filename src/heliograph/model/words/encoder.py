@@ -112,9 +112,10 @@ class Words(Module):
         return spread
 
     def draw_dither(self, key: jax.Array, outputs: int) -> Float[jax.Array, " outputs"]:
-        """Draw the dither of one message: for each output noise that is added before it is rounded to a word.
+        """Draw the dither of one message: noise that is added to each output before it is rounded to a word.
 
-        "none", "triangular" (the sum of two uniform ones) or uniform, in units of `step`, the distance of two words.
+        It is none, uniform, or triangular (the sum of two uniform numbers), in units of `self.step`, the distance of
+        two words.
         """
         uniform = jax.random.uniform(key, (2, outputs), dtype=float)  # two numbers from 0 to 1 for each output
         match self.dither:
@@ -142,7 +143,7 @@ class Words(Module):
     def send(self, y: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the word of each component, and the numbers by which the channel carries it, (outputs * carried,).
 
-        These are its bits as signs, and behind them its dither d where the receiver subtracts it.
+        These are its bits as signs, followed by its dither d if the receiver subtracts it.
         """
         d = self.draw_dither(key, len(y))
         index = self.index(y + d)
@@ -189,7 +190,7 @@ def _read_range_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
 
 
 def _checksum_node_name(node: str) -> int:
-    """Return the CRC-32 of a node's name, which seeds its dither alike on every machine."""
+    """Return the CRC-32 of a node's name, which seeds its dither in the same way on every machine."""
     from zlib import crc32
 
     return crc32(node.encode())

@@ -42,13 +42,13 @@ class WordForm(NamedTuple):
 
 
 def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
-    """Return a channel of words as one of the numbers by which they are carried: their bits, and dithers that pass.
+    """Return a channel of words as a channel of the numbers that carry them: their bits, and unchanged dithers.
 
-    Losses, delays and choices act on all numbers of a word; only bits are flipped.
+    Losses, delays and choices act on all numbers of a word. Only bits are flipped.
 
     Args:
-        encoder: of the words.
-        channel: of words.
+        encoder: encoder of the words.
+        channel: channel of the words.
     """
     beside = encoder.carried - encoder.bits  # numbers of a word beside its bits: its dither, if any
     eye = np.eye(encoder.carried)
@@ -62,17 +62,17 @@ def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
 
 
 def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
-    """Return a channel of words as one of numbers: each word less the centre of its range.
+    """Return a channel of words as a channel of numbers, where each word counts from the centre of its range.
 
     Flipped bits are then a random gain and noise, which depend on the variance of a word, `power`.
 
     Args:
-        encoder: of the words.
-        channel: of words.
+        encoder: encoder of the words.
+        channel: channel of the words.
     """
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link of one step, `power` being the variance of each word, all of its values equally likely."""
+        """Return the link of one step; `power` is the variance of each word if all of its values are equally likely."""
         power = encoder.each(encoder.power, signal_size(link))
         as_numbers = WordForm(
             flips=lambda flips, places: flips.about_centre(power[list(places)]), selection=known, size=1
@@ -95,7 +95,7 @@ def make_word_reader(channel: Channel) -> WordReader:
 
 
 def rewrite_channel(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
-    """Return a channel of words written in another form (as bits or numbers), and which component each output carries.
+    """Return a channel of words in another form (bits or numbers), and which component each of its outputs carries.
 
     Raises:
         ValueError: a channel that does more with words than select, copy, flip, delay and lose them.
@@ -142,9 +142,9 @@ def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> 
 
 
 def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a noiseless link that selects components, rewritten in `form`, with the component at each of its outputs.
+    """Return a noiseless link that selects components, in the given form, and the component at each of its outputs.
 
-    `places`: the components of y that it is given. Words pass no other gain and no noise: raises ValueError.
+    `places`: the components of y that it gets. Another gain, or noise, raises ValueError, since words do not pass it.
     """
     matrix, gain = np.asarray(link.matrix), link.law.constant
     is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
@@ -155,9 +155,9 @@ def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> Re
 
 
 def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMap:
-    """Return maps one after another, rewritten in `form`: each gets the components that the one before delivers.
+    """Return maps in series, in the given form; each gets the components that the previous one delivers.
 
-    `places`: the components of y that the first is given.
+    `places`: the components of y that the first map gets.
     """
     maps = []
     for inner in link.maps:
@@ -168,9 +168,9 @@ def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMa
 
 
 def _rewrite_choice(link: AbstractOneOfSeveralMaps, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a choice among several maps, rewritten in `form`; raise ValueError unless all deliver the same components.
+    """Return a choice among several maps, in the given form; raise ValueError unless all deliver the same components.
 
-    `places`: the components of y that each is given.
+    `places`: the components of y that each map gets.
     """
     choices = [_rewrite_map(inner, places, form) for inner in link.maps]
     if len({choice.places for choice in choices}) > 1:

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def pause_collector() -> Iterator[None]:
-    """Stop the collector of reference cycles within the block or the decorated function; then start it if it ran.
+    """Pause the collector of reference cycles within the block or the decorated function.
 
-    It would look at all living objects again and again: a third of the time of importing JAX and of tracing a program.
-    Threads may overlap: the one that found it on switches it on again, so that it never stays off.
+    It would look at all living objects again and again, which takes a third of the time of importing JAX or tracing a
+    program. If threads overlap, the one that found it on switches it on again, so that it never stays off.
     """
     was_on = gc.isenabled()
     try:  # an interruption may come between any two statements

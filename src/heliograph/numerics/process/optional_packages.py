@@ -46,7 +46,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
 def how_to_install(extra: str) -> str:
     """Return a command that installs an extra (a set of optional packages) for this Python.
 
-    From a clone of the repository by its folder, since no index may have it.
+    From a clone of the repository, it installs from the clone's folder, since no index may have the package.
     """
     clone = Path(heliograph.__file__).parents[2]
     package = clone if (clone / "pyproject.toml").is_file() else "heliograph"
@@ -58,9 +58,9 @@ class MissingPackagesError(ModuleNotFoundError):
 
 
 def check_installed(packages: Iterable[str]) -> None:
-    """Raise MissingPackagesError, with the command to install them, where some of these packages are not installed.
+    """Raise MissingPackagesError, with the command to install them, if some of these packages are not installed.
 
-    EXTRAS has, for a package that heliograph uses but does not require, the extra that brings it.
+    EXTRAS: for each optional package of heliograph, the extra that brings it.
     """
     missing = [name for name in dict.fromkeys(packages) if find_spec(name) is None]
     if missing:

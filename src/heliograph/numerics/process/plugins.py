@@ -9,11 +9,11 @@ BROKERS, FORMATS = "heliograph.brokers", "heliograph.formats"  # groups of entry
 
 
 def find_plugin(group: str, name: str) -> Any | None:
-    """Return what an installed package offers under a name, loaded; None where none does.
+    """Return what an installed package offers under a name, loaded, or None if no package offers it.
 
     Args:
         group: group of entry points.
-        name: of a broker the scheme of its URLs, of a format the ending of its files without the dot.
+        name: for a broker the scheme of its URLs, for a format the suffix of its files without the dot.
 
     Raises:
         ValueError: two packages offer it, or it cannot be imported; one line.

@@ -24,9 +24,9 @@ _held: "WeakSet[mmap.mmap]" = WeakSet()  # memory of the arrays that live, count
 
 
 def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
-    """Return an array (count, ...) of equal rows, to be read and written as any other.
+    """Return an array (count, ...) of equal rows, which can be read and written like any other.
 
-    One of LEAST bytes or more is, where the system can, the same memory mapped again and again, until it is written.
+    If it has LEAST bytes or more and the system can, it is the same memory mapped again and again, until it is written.
 
     Args:
         row: the row (...).
@@ -74,7 +74,7 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
 
 
 def _fill_file(file: int, size: int, row: np.ndarray) -> None:
-    """Fill a file (by its descriptor), made `size` bytes large, with copies of a row, of which it holds whole ones."""
+    """Fill a file (by its descriptor) of `size` bytes with copies of a row; `size` is a multiple of the row's."""
     os.ftruncate(file, size)
     with mmap.mmap(file, size) as memory:
         values: np.ndarray = np.frombuffer(memory, row.dtype).reshape(-1, *row.shape)
@@ -87,9 +87,9 @@ MAP_FIXED = 0x10  # of Linux: at this address, in the place of what is mapped th
 
 @cache
 def _find_system_call() -> Any:
-    """Return the system's function that shows a file's bytes in memory; None where the system is not Linux.
+    """Return the system's function mmap(address, length, protection, flags, file, offset), or None if it is not Linux.
 
-    It is mmap(address, length, protection, flags, file, offset).
+    It maps the bytes of a file into memory.
     """
     if not hasattr(os, "memfd_create"):
         return None

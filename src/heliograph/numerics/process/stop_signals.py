@@ -23,9 +23,9 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
     """
 
     def handle_or_wait(number: int, frame: FrameType | None) -> None:
-        """Pass a signal to the handler, or raise it again soon (in SOON seconds) while a module in C is imported.
+        """Pass a signal to the handler, or raise it again in SOON seconds while a C module is imported.
 
-        An exception from the handler would leave that half initialised.
+        An exception from the handler would leave that module half initialised.
         """
         if _is_loading_c_module(frame):
             timer = Timer(SOON, interrupt_main, (number,))
@@ -46,9 +46,9 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
 
 
 def _is_loading_c_module(frame: FrameType | None) -> bool:
-    """Return whether a module in C is being loaded, which an exception would leave half initialised.
+    """Return whether a C module is being loaded, which an exception would leave half initialised.
 
-    Then one of the frames from this one outwards is that of its loader, in the file IMPORTS.
+    One of the frames from `frame` outwards is then that of its loader, in the file IMPORTS.
     """
     while frame is not None:
         if frame.f_code.co_filename == IMPORTS and isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
@@ -59,9 +59,9 @@ def _is_loading_c_module(frame: FrameType | None) -> bool:
 
 @contextmanager
 def hold_signals() -> Iterator[None]:
-    """Let no signal to stop (Ctrl-C, SIGTERM) interrupt the block: the first one that comes is raised again at its end.
+    """Hold signals to stop (Ctrl-C, SIGTERM) within the block; the first one is raised again at its end.
 
-    Only the main thread is interrupted by signals; in others this does nothing.
+    Only the main thread is interrupted by signals. In other threads this does nothing.
     """
     noted: list[int] = []
     if current_thread() is not main_thread():

@@ -23,9 +23,9 @@ YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
 
 def round_to_nanoseconds(dates: np.ndarray) -> np.ndarray:
-    """Return dates of any unit as datetime64[ns], NaT for those of years outside YEARS.
+    """Return dates of any unit as datetime64[ns], with NaT for dates of years outside YEARS.
 
-    NumPy before 2.5 would let these overflow into other centuries silently; later ones raise, whichever row it is.
+    NumPy before 2.5 lets these overflow silently into other centuries; later versions raise, whichever row it is.
     """
     if np.datetime_data(dates.dtype)[0] in {"ns", "ps", "fs", "as"}:  # years around 1970
         return dates.astype("datetime64[ns]")
@@ -85,12 +85,12 @@ def parse_moment(text: str, name: str) -> tuple[int, bool]:
 
 
 def _match_date(text: str) -> tuple[re.Match[str], bool]:
-    """Return the match of a date's parts (day, zone, ...), and whether it is a leap second, read as the one before it.
+    """Return the match of a date's parts (day, zone, ...), and whether it is a leap second.
 
-    Dates without marks between their numbers (BASIC) get them first.
+    A leap second is read as the second before it. A date without marks between its numbers (BASIC) gets them first.
 
     Raises:
-        ValueError: no date of ISO 8601, or one of a year that nanoseconds cannot say.
+        ValueError: no date of ISO 8601, or one of a year that nanoseconds cannot express.
     """
     text = text.upper()
     basic = BASIC.fullmatch(text)
@@ -148,9 +148,9 @@ def parse_instant(text: str) -> datetime:
 
 
 def seconds_between(time: np.ndarray) -> np.ndarray:
-    """Return the time since the row before, 0 in the first row: seconds between dates, else in the numbers' unit.
+    """Return the time since the previous row, 0 in the first row: in seconds for dates, else in the numbers' unit.
 
-    Dates are subtracted as whole nanoseconds: as doubles, those since 1970 are exact to some hundreds only.
+    Dates are subtracted as whole nanoseconds, since as doubles they would be exact only to some hundreds of these.
     """
     if time.dtype.kind != "M":
         return np.diff(time, prepend=time[:1])
@@ -163,13 +163,13 @@ SPANS = {"years": 365.25 * 86400, "months": 30.4375 * 86400, "days": 86400.0, "h
 
 
 def unequal_steps(time: np.ndarray) -> str:
-    """Return "steps of 1 and 21 years" where the longest step is more than LONGER times the median one, else "".
+    """Return a text as "steps of 1 and 21 years" if the longest step is more than LONGER times the median, else "".
 
-    These are the median and the longest step, of dates in the largest unit (SPANS, in seconds) that the median nearly
-    fills; of numbers without one.
+    The two numbers are the median and the longest step. For dates they are in the largest unit of SPANS (in seconds)
+    that the median nearly fills, for numbers they have no unit.
     """
     steps = seconds_between(time)[1:]
-    # Not above LONGER times the shortest is not above that of the median: a look that saves the median's sort.
+    # If no step exceeds LONGER times the shortest one, none exceeds LONGER times the median, which needs no sort.
     if steps.size and 0 < steps.max() <= LONGER * steps.min():
         return ""
     steps = steps[steps > 0]
@@ -183,9 +183,9 @@ def unequal_steps(time: np.ndarray) -> str:
 
 
 def format_dates(time: np.ndarray) -> np.ndarray:
-    """Return the dates as texts in UTC, all with as many digits of a second as one of them needs; "" for a missing one.
+    """Return the dates as texts in UTC, all with as many digits of a second as some date needs; a missing one is "".
 
-    UNITS are the nanoseconds of each unit, the largest first.
+    UNITS: the nanoseconds of each unit, the largest unit first.
     """
     nanoseconds = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
     unit = next(unit for unit, size in UNITS.items() if not np.any(nanoseconds % size))  # the largest that is exact
@@ -196,9 +196,9 @@ DIGITS = 12  # of a number of seconds: .1 us since 1970's
 
 
 def format_times(time: np.ndarray) -> list[str]:
-    """Return times as texts for people: dates with as many digits of a second as one of them needs, else numbers.
+    """Return times as texts for people: dates with as many digits of a second as some date needs, else numbers.
 
-    A number has up to twelve digits, so that the times of rows since 1970 differ, and 21.200000000000003 is 21.2.
+    A number has up to DIGITS (12) digits, so that the times of rows since 1970 differ, and 21.200000000000003 is 21.2.
     """
     if time.dtype.kind == "M":
         return [text.removesuffix("Z") for text in format_dates(time).tolist()]
@@ -221,10 +221,12 @@ NANOSECONDS = {
 
 
 def horizons_in(text: str) -> int | list[float | np.timedelta64 | np.datetime64]:
-    """Read how far ahead: "12" is a number of steps, "5s, 1min, 2026-12-01" is a list of spans, dates and numbers.
+    """Return how far ahead a text says: "12" is a number of steps, and "5s, 1min, 2026-12-01" is a list.
+
+    A list has spans, dates and numbers.
 
     Raises:
-        ValueError: something that is none of these, by its words.
+        ValueError: a part that is none of these.
     """
     if re.fullmatch(r"\s*\d+\s*", text):
         return int(text)

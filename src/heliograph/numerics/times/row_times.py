@@ -49,7 +49,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 
 def _holds_texts_or_spans(value: object) -> bool:
-    """Test whether a value is of texts or spans of time, by NumPy's type of it; a list of unequal lists is not."""
+    """Return whether a value holds texts or spans of time, by its NumPy type; a list of unequal lists does not."""
     try:
         return np.asarray(value).dtype.kind in "mSU"
     except ValueError:
@@ -57,7 +57,7 @@ def _holds_texts_or_spans(value: object) -> bool:
 
 
 def check_dates(name: str, value: object) -> np.ndarray:
-    """Return dates as datetime64[ns] in UTC, NaT where they are missing; raise ValueError of anything else."""
+    """Return dates as datetime64[ns] in UTC, with NaT for missing ones; raise ValueError for anything else."""
     dates = read_dates(name, value)
     if dates is None:
         raise fail(name, "dates", show_value(value))
@@ -90,7 +90,7 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
 
 
 def _list_elements(value: object) -> list[Any]:
-    """Return what a list, or an array that is not of numbers, holds along its one axis; an empty list of all else."""
+    """Return the elements of a list, or of an array of one axis that holds no numbers; anything else gives []."""
     kind = getattr(getattr(value, "dtype", None), "kind", "O")
     if isinstance(value, str | bytes | dict) or kind in "fiubcm" or getattr(value, "ndim", 1) != 1:
         return []
@@ -106,10 +106,10 @@ def _is_date(part: object) -> bool:
 
 
 def _convert_to_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
-    """Return datetime64 of any unit in nanoseconds, NaT where they are missing.
+    """Return datetime64 of any unit in nanoseconds, with NaT for missing ones.
 
     Raises:
-        ValueError: a year that nanoseconds since 1970 cannot say in 64 bits; `name` is for the message.
+        ValueError: a year that 64 bits of nanoseconds since 1970 cannot express; `name` is for the message.
     """
     given = np.asarray(moments)
     converted = round_to_nanoseconds(given)
@@ -120,11 +120,11 @@ def _convert_to_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> n
 
 
 def row_dates(name: str, rows: object) -> np.ndarray | None:
-    """Return the dates with which the rows of a table, a column or a labelled array are labelled; None if with none.
+    """Return the dates that label the rows of a table, a column or a labelled array, or None without dates.
 
     Args:
-        name: of the rows, for errors.
-        rows: with an index (pandas) or a coordinate of its first dimension (xarray); anything else has none.
+        name: name of the rows, for errors.
+        rows: the rows; an index (pandas) or a coordinate of the first dimension (xarray) labels them.
 
     Raises:
         ValueError: dates that are missing or go backwards.

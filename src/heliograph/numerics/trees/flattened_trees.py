@@ -24,7 +24,7 @@ class FlatLayout(NamedTuple):
     def tree(self, rows: jax.Array | np.ndarray) -> PyTree:
         """Return the tree whose leaves lie one after another in a row, with their shapes and dtypes.
 
-        Of rows (..., size) its leaves have the leading axes too.
+        From rows (..., size), its leaves have the leading axes too.
         """
         leaves, begin = [], 0
         leading_axes = rows.shape[:-1]
@@ -36,7 +36,7 @@ class FlatLayout(NamedTuple):
 
 
 def make_flat_layout(tree: PyTree) -> FlatLayout:
-    """Return the layout of a tree of arrays, by which a row is made a tree again: structure, shapes and types."""
+    """Return the layout of a tree of arrays (structure, shapes and types), by which a row becomes a tree again."""
     leaves, structure = jax.tree.flatten(tree)
     shapes, kinds = tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves)
     return FlatLayout(structure=structure, shapes=shapes, kinds=kinds)

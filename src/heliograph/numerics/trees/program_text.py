@@ -16,7 +16,7 @@ ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
 def hash_numbers(numbers: PyTree) -> str:
-    """Return a hash (DIGITS hexadecimal digits) of a text, or of all numbers in a tree, with their shapes and types."""
+    """Return a hash (DIGITS hexadecimal digits) of a text, or of all numbers in a tree with their shapes and types."""
     if isinstance(numbers, str):
         return sha256(numbers.encode()).hexdigest()[:DIGITS]
     digest = sha256()
@@ -45,7 +45,7 @@ class _ProgramWriter:
     def write_program(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return a program as text: its constants and inputs, a line for each operation, and its results.
 
-        Variables are numbered in their order, so that programs that differ in their names alone have the same text.
+        Variables are numbered in order, so that programs that differ only in their names have the same text.
         """
         numbers: dict[Var, int] = {}
         constants = self._write_definitions(numbers, jaxpr.constvars)
@@ -61,7 +61,7 @@ class _ProgramWriter:
         return f"{self._write_definitions(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
 
     def _write_definitions(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
-        """Number new variables, in their order, in `numbers`; return their types (with shapes) as text."""
+        """Give new variables their numbers in `numbers`, in order, and return their types (with shapes) as text."""
         for variable in variables:
             numbers[variable] = len(numbers)
         return " ".join(str(variable.aval) for variable in variables)
@@ -91,7 +91,7 @@ class _ProgramWriter:
     def _write_hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the hash of an inner program's text, which is written once for each `program` object.
 
-        The object is kept with it, so that its id is given to no other.
+        The object is kept with the hash, so that no other object gets its id.
         """
         if id(program) not in self._hashes:
             self._hashes[id(program)] = program, hash_numbers(self.write_program(jaxpr, consts))

@@ -26,7 +26,7 @@ class Static(NamedTuple):
 
 
 def split_structure(whole: object) -> tuple[list[jax.Array], Static]:
-    """Return an object's arrays, on the device, and its structure, with None where they were; call it in float64."""
+    """Return an object's arrays, on the device, and its structure with None in their places; call it in float64."""
     leaves, tree = jax.tree.flatten(jax.tree.map(_convert_leaf, whole))
     numbers = [jax.device_put(leaf) for leaf in leaves if eqx.is_array(leaf)]  # no program for each shape
     return numbers, Static(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))

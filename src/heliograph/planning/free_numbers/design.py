@@ -79,7 +79,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
 
 
 def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits:
-    """Return the limits that a budget sets to the powers of all transmitters (steps, hops); none without a budget."""
+    """Return the limits that a budget sets to the powers of all transmitters (steps, hops), or none without budget."""
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
@@ -92,12 +92,10 @@ def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits
 
 
 def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErrorLimits:
-    """Return the finite limits of a budget, peaks too, as rows of all powers, and the target error (None without one).
+    """Return the finite limits of a budget as rows @ powers.ravel() <= most, and the target error (None without one).
 
-    Powers are no free numbers here, so that their peaks are limits like others.
-
-    Each row times all powers, step by step, is at most its number in `most`; a row of a peak is one power over its
-    peak, so that its number is 1.
+    Peaks are limits like others here, since powers are not the free numbers. A row of a peak is one power divided by
+    its peak, so that its limit is 1.
     """
     rows, most = allowed.make_limit_rows()
     peaks = allowed.peak.ravel()

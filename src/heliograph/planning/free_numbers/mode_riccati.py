@@ -57,10 +57,10 @@ class ModeSolution(NamedTuple):
 
 
 def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
-    """Return the covariances X with the best gains K, and their adjoint L under the criterion, by step and mode.
+    """Return the covariances X under the best gains K, these gains, and the adjoint L of X, by step and mode.
 
-    `m.start` None: the periodic steady state is solved for, else the recursion is run from that covariance. A
-    covariance may be negative by the share NEAR of the largest entry, as it is computed to so many digits.
+    If `m.start` is None, the periodic steady state is solved for. Otherwise the recursion runs from this covariance.
+    Rounding may make a covariance negative by the share NEAR of the largest entry.
 
     Raises:
         ValueError: an error that grows without limit.
@@ -70,7 +70,7 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             X, gains = _solve_periodic(m) if m.start is None else _run_riccati(m, m.start[None])
-    except np.linalg.LinAlgError:  # of numbers that are none, or of a growth of exactly 1
+    except np.linalg.LinAlgError:  # raised for NaN, and for a growth of exactly 1
         raise growth from None
     if not np.all(np.isfinite(X)) or np.linalg.eigvalsh(X).min() < -NEAR * np.abs(X).max():
         raise growth
@@ -102,10 +102,10 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
 
 
 def _run_riccati(m: ModeSystem, X: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
-    """Return X after each step (steps, modes, n, n) and its best gains, by the coupled Riccati recursion.
+    """Return X after each step (steps, modes, n, n) and the best gains, by the coupled Riccati recursion.
 
-    X of a mode is its covariance times its probability. The argument: X before the first step, by mode; one for all
-    modes together where their chain has no memory.
+    X of a mode is its covariance times its probability. The argument X is that before the first step, for each mode, or
+    one for all modes together if their chain has no memory.
     """
     covariances, gains = [], []
     for k in range(len(m.law)):
@@ -116,22 +116,23 @@ def _run_riccati(m: ModeSystem, X: Float[np.ndarray, "_ n n"]) -> tuple[Parts, n
 
 
 def _update_riccati(m: ModeSystem, k: int, X: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best gain K (modes, n, m) of step k and the covariances X (modes, n, n) after it, by X before.
+    """Return the best gains K (modes, n, m) of step k and X (modes, n, n) after it, from X before it.
 
-    X of a mode is its covariance times its probability, `law`: the noises are weighted alike.
+    X of a mode is its covariance times the mode's probability (`m.law`), so the noises are weighted by it too.
     """
     law = m.law[k][:, None, None]
     predicted_X = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(X)
-    # A mode that never occurs has X = 0, so with any regular noise its gain is zero.
+    # A mode that never occurs has X = 0. Give it any regular noise, so that its gain is zero.
     noise = np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
     corrected_X = observe_root(roots_of(predicted_X), m.output[k], roots_of(noise))
     return corrected_X.gain, corrected_X.covariance
 
 
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
-    """Return the recursion of X under given gains, X_j = sum_i T_ij F_j X_i F_j' + S_j.
+    """Return the recursion of X under given gains K, X_j = sum_i T_ij F_j X_i F_j' + S_j, with T the chain of modes.
 
-    F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K'].
+    F = (I - K H) A and S = pi [(I - K H) Q (I - K H)' + K N K'], with pi (`m.law`) the probability of each mode, and Q
+    and N the covariances of process and measurement noise.
     """
     K, law = gains, m.law[:, :, None, None]  # K (steps, modes, n, m), law: pi
     I_KH = np.eye(K.shape[2]) - K @ m.output
@@ -140,14 +141,14 @@ def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient in m at fixed X, K and L is that of the error.
+    """Return sum_k,j <L_k,j, R_k,j>, whose gradient by m at fixed X, K and L is that of the error.
 
-    X_k,j: covariance after step k in mode j, weighted by the mode's probability; its right side: what the recursion
-    under the gains K makes of those before it; L: adjoint, what the error gains by each X.
+    X_k,j is the covariance after step k in mode j, times the mode's probability. R_k,j is the right side of its
+    recursion under the gains K. L is the adjoint: the derivative of the error by each X.
     """
     X, gains, adjoint = (jnp.asarray(values) for values in solution)
-    X_before = jnp.roll(X, 1, axis=0)  # of a period: the last step leads to the first
-    if m.start is not None:  # the first step's chain forgets the mode before: any will do
+    X_before = jnp.roll(X, 1, axis=0)  # in a period, the last step leads to the first
+    if m.start is not None:  # the first step's chain forgets the earlier mode, so that any mode may hold the start
         X_before = jnp.zeros_like(X).at[0, 0].set(m.start).at[1:].set(X[:-1])
     right_side = _close_loop(m, gains).step(X_before)
     return jnp.sum(adjoint * right_side)

@@ -48,9 +48,10 @@ class FreeNumber(NamedTuple):
 
 
 def young_scalars(steps: int) -> FreeNumber:
-    """Return the scalar of Young's inequality for each step, or a single one of the steady bound.
+    """Return the scalar b of Young's inequality as a free number for each step, or as one for a steady bound.
 
-    From 0.1, between 1e-6 and 1e3: beyond these one of the bound's factors 1 + b and 1 + 1 / b is a thousand or more.
+    It starts at 0.1 and stays between 1e-6 and 1e3. Beyond these, the bound's factor 1 + b or 1 + 1 / b is over a
+    thousand.
     """
     shape = () if steps == 1 else (steps,)
     return FreeNumber(start=np.full(shape, 0.1), low=np.full(shape, 1e-6), high=np.full(shape, 1e3))
@@ -77,7 +78,7 @@ class FreeNumbers(NamedTuple):
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def split_by_name(self, x: Array) -> dict[str, Any]:
-        """Return {name: number in its shape} from the vector x of all free numbers."""
+        """Return {name: number in its shape} from the vector x of all free numbers, which stand one after another."""
         by_name, begin = {}, 0
         for name, number in self.by_name.items():
             by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
@@ -85,9 +86,10 @@ class FreeNumbers(NamedTuple):
         return by_name
 
     def draw_start(self, draws: np.random.Generator) -> Vector:
-        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first.
+        """Return a random start: between the ends of each number's range, or near its first start without both ends.
 
-        `low`, `high`: ends of each number's range, infinite where there is none.
+        `self.low`, `self.high`: the ends of the ranges, infinite if there is none. Without both ends a number is its
+        first start times a random factor.
         """
         has_two_ends = np.isfinite(self.low) & np.isfinite(self.high)
         between_ends = draws.uniform(np.where(has_two_ends, self.low, 0.0), np.where(has_two_ends, self.high, 1.0))
@@ -120,7 +122,7 @@ def make_free_numbers(free: object) -> FreeNumbers:
 
 
 def _read_range_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a least or largest value, which may be infinite, of the start's shape."""
+    """Return the lower or upper end of a number's range, broadcast to the start's shape; it may be infinite."""
     try:
         value = np.broadcast_to(np.asarray(end, dtype=float), shape)
     except (TypeError, ValueError):
@@ -186,7 +188,7 @@ class TracedNetwork:
     start: Network
 
     def __eq__(self, other: object) -> bool:
-        """Return whether the other leads to the same programs, by builder, network and shapes of arrays."""
+        """Return whether the other network leads to the same programs: equal builder, network and shapes of arrays."""
         if not isinstance(other, TracedNetwork):
             return False
         mine = self.build, self.start, self._list_array_shapes()
@@ -202,10 +204,10 @@ class TracedNetwork:
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
     def make_system(self, x: Array) -> ModeSystem:
-        """Return the system of the best linear filter where the free numbers have the values x (numbers,).
+        """Return the system of the best linear filter if the free numbers have the values x (numbers,).
 
-        `young`: whether the scalar of Young's inequality is among the numbers, which is none of the network's own.
-        UNTRACEABLE: errors of JAX where a function reads a traced number.
+        `self.young`: True if the scalar of Young's inequality is one of the numbers; it is not passed to the network.
+        UNTRACEABLE: errors of JAX if a function needs the value of a traced number.
         """
         values = self.numbers.split_by_name(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
@@ -217,9 +219,9 @@ class TracedNetwork:
         return make_mode_system(network, self.error, young)
 
     def differentiate_by_numbers(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
-        """Return the derivatives of error and powers by the numbers x, at the fixed X, K and L of the solution."""
+        """Return the derivatives of error and powers by the numbers x, with X, K and L of the solution held fixed."""
         system, pull_back = jax.vjp(self.make_system, jnp.asarray(x))
-        # Derivatives by the system's arrays, a system each: first of the error, then of each single power.
+        # Derivatives by the system's arrays, each in the form of a system: of the error, then of each single power.
         of_error, count = jax.grad(lagrangian)(system, solution), system.powers.size
         one_for_each = jnp.eye(count).reshape(count, *system.powers.shape)
         of_powers = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape)), system)._replace(powers=one_for_each)
@@ -232,9 +234,9 @@ class TracedNetwork:
 def compile_programs(
     network: TracedNetwork,
 ) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
-    """Return the compiled programs of a network's system and derivatives; equal networks share them.
+    """Return the compiled programs of a network's system and of its derivatives; equal networks share them.
 
-    PROGRAMS: so many of the last ones are kept.
+    The last PROGRAMS of them are kept.
     """
     return compile_on_call(network.make_system), compile_on_call(network.differentiate_by_numbers)
 
@@ -267,10 +269,10 @@ class FreeNumberProblem:
     """A network that is a function of numbers, as a descent needs it; the last point is cached."""
 
     def __init__(self, build: Build, numbers: FreeNumbers, error: Error):
-        """Read the network at the starts of its free numbers, and compile its programs.
+        """Build the network at the starts of its free numbers, and compile its programs.
 
-        Where a mean gain is uncertain, the scalar of Young's inequality is one more free number (`young`), with which
-        the error is bounded.
+        If a mean gain is uncertain, the scalar of Young's inequality, which bounds the error, becomes one more free
+        number, and `young` is True.
         """
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
@@ -283,10 +285,7 @@ class FreeNumberProblem:
         self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 
     def network(self, x: Vector) -> Network:
-        """Return the network at these numbers.
-
-        The scalar of Young's inequality (YOUNG) is none of its numbers.
-        """
+        """Return the network at the numbers x, of which the scalar of Young's inequality (YOUNG) is none of its own."""
         values = {
             name: float(value) if np.ndim(value) == 0 else value
             for name, value in self.numbers.split_by_name(x).items()
@@ -296,11 +295,10 @@ class FreeNumberProblem:
             return instance("network of free numbers", self.build(**values), Network, "a Network")
 
     def check_ends(self) -> None:
-        """Raise ValueError where a number near an end of its range, the others at their starts, makes no network.
+        """Raise ValueError if no network exists with a number near an end of its range, the others at their starts.
 
-        An end itself may be one that is never reached, as a noise of variance zero.
-
-        INSIDE: how near to an end a number is put, as a share of the way to its start.
+        An end itself need not be possible, such as a noise of variance zero. INSIDE: the distance from the end, as a
+        share of the way to the start.
         """
         starts = {name: number.start for name, number in self.numbers.by_name.items()}
         for name, (start, low, high) in self.numbers.by_name.items():
@@ -335,9 +333,9 @@ class FreeNumberProblem:
         return self._last[key]
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
-        """Return the error, powers and derivatives; None where the error or the powers grow without limit.
+        """Return the error, the powers and their derivatives, or None if error or powers grow without limit.
 
-        `sharpness`: q, with which tr(S^q)^(1/q) stands for the largest eigenvalue; None for the trace.
+        `sharpness`: q in tr(S^q)^(1/q), which stands for the largest eigenvalue; None for the trace.
         """
         try:
             point = self.solve_at(x, self.criterion._replace(sharpness=sharpness))
@@ -351,9 +349,9 @@ class FreeNumberProblem:
         )
 
     def descent_problem(self) -> DescentProblem:
-        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none.
+        """Return the problem of a descent, in units of the numbers' ranges, or of their starts if a range is infinite.
 
-        LEAST_UNIT: the unit of numbers whose range and start are less.
+        No unit is below LEAST_UNIT.
         """
         low, high = self.numbers.low, self.numbers.high
         width = high - low
@@ -364,5 +362,5 @@ class FreeNumberProblem:
             unit=unit,
             sharpnesses=[criterion.sharpness for criterion in self.criterion.list_from_smoothest()],
             evaluate=self.evaluate,
-            restore=lambda x: x,  # limits of powers are no limits of x: only a descent leads back
+            restore=lambda x: x,  # powers depend on x in any way, so that only a descent leads back within their limits
         )

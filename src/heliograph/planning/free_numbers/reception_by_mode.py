@@ -117,7 +117,7 @@ def list_transmitters(network: Network) -> tuple[str, ...]:
 
 
 def check_time_variation(network: Network, error: Error) -> None:
-    """Raise ValueError unless all that varies over time in a network fits an error's horizon, or else its period."""
+    """Raise ValueError unless everything that varies over time in a network fits the error's horizon or period."""
     require_design_plant(network.plant)
     covered = steps_covered((network.plant, list_sources(network)))
     if error.horizon is not None:
@@ -172,9 +172,9 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
 
 
 def _stack_nodes(nodes: list[NodeReception]) -> tuple[Array, Array]:
-    """Return H (time, M, m, n) and N (time, M, m, m) of all nodes together.
+    """Return H (time, M, m, n) and N (time, M, m, m) of all nodes together, for each of M joint modes.
 
-    There is a mode for every combination of a mode of each node, the last node's fastest.
+    A joint mode is a combination of one mode of each node; the mode of the last node varies fastest.
     """
     outputs, noises = [], []
     make_block_diagonal_at_each_time: Callable[..., Array] = jax.vmap(
@@ -223,16 +223,16 @@ def compute_node_reception(
 def _find_laws_and_chain(
     modes: list[_ObservedModes], lengths: list[int], forever: bool
 ) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
-    """Return the law of the modes at each step, and the chain [k, i, j] = P(j at step k | i at the step before).
+    """Return the law of the modes at each step, and the chain [k, i, j] = P(mode j at step k | mode i at step k - 1).
 
     Args:
         modes: the observed modes of each span of steps with one channel.
         lengths: number of steps of each span.
-        forever: whether the steps repeat for ever, or begin with the first.
+        forever: True if the steps repeat for ever, False if they begin with the first.
     """
     pairs = list(zip(modes, lengths, strict=True))
     if modes[0].forgets:
-        # Modes that are drawn anew at each step: after any mode the next has this law.
+        # The modes are drawn anew at each step, so that the chain's rows are all this law.
         law: Array = jnp.concatenate([jnp.tile(of_span.initial, (length, 1)) for of_span, length in pairs])
         chain: Array = jnp.tile(law[:, None, :], (1, law.shape[1], 1))
         return law, chain
@@ -272,13 +272,12 @@ def _find_observed_modes(name: str, channel: AbstractRandomAffine) -> _ObservedM
 
 
 def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
-    """Return the joint modes of a channel that delivers the modes of all its chains beside its other outputs.
+    """Return the joint modes of a channel that delivers the modes of all its chains as flags beside its other outputs.
 
-    A flag: an output that is a chain's mode itself. A gain that drifts has no
-    such modes.
+    A flag is an output that is a chain's mode itself. A drifting gain has no modes.
 
     Raises:
-        ValueError: a chain whose mode is not delivered.
+        ValueError: a chain whose mode is not delivered, or a gain that drifts.
     """
     maps = channel.in_parallel
     maps_of_signal = [affine for affine in maps if not isinstance(affine, ModeOutput)]
@@ -292,10 +291,10 @@ def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
 def _propagate_laws(
     onward: Float[Array, "time M M"], initial: Float[Array, "M"], forever: bool
 ) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
-    """Return the law of the modes at each step, and the chain into it, from the chain `onward` from each step.
+    """Return the law of the modes at each step, and the chain into each step, from the chain `onward` from each step.
 
-    [k, i, j] of either chain is the probability of mode j after mode i. `forever`: laws are periodic, and the last step
-    leads to the first; else they go from the initial law on, whatever was before.
+    Entry [k, i, j] of a chain is the probability of mode j after mode i. If `forever` is True, laws are periodic and
+    the last step leads to the first. Otherwise they start with the initial law, whatever the mode was before.
     """
     over_period = reduce(jnp.matmul, onward)
     mode_count = len(over_period)

@@ -58,9 +58,9 @@ class PathProblem(NamedTuple):
         return self.criterion.compute_exact_error(self.covariances(powers))
 
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
-        """Return the error, -d error / d j of each free hop's path, and d error / d p (both (time, free)).
+        """Return the error, -d error / d j of each free hop's path, and d error / d p, both (time, free), at powers p.
 
-        By one adjoint recursion, at the free powers p (time, free). j: information of a path; `path`: that of each hop.
+        j is the information of a path, and `self.path` the path of each free hop. One adjoint recursion gives both.
         """
         information, slope = self.information(powers)
         p = compute_error_covariances(self.paths, information)
@@ -69,33 +69,30 @@ class PathProblem(NamedTuple):
         return value, by_information, -by_information * slope
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
-        """Return the error, powers and their derivatives at x, powers in one row, with this smoothing of the error."""
+        """Return the error, the powers and their derivatives at x (all powers in a row), with this smoothing."""
         powers = np.maximum(x, 0.0).reshape(self.limits.peak.shape)
         smoothed = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
         value, _, gradient = smoothed.sensitivity(powers)
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
     def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
-        """Return the problem whose error, linear in P, touches this one's from below at p, its value and gradient.
+        """Return the problem with linear error that touches this one's from below at powers p, its value and gradient.
 
-        The gradient is by the powers p (time, free).
+        The error is linear in P. The gradient is by the powers p (time, free).
         """
         problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
         return problem, value, gradient
 
     def lower_bound(self, powers: Powers) -> float:
-        """Return Frank and Wolfe's lower bound of a convex error within the limits, from its tangent at powers p.
-
-        It is f(p) + min over allowed q of grad f(p).(q - p).
-        """
+        """Return Frank and Wolfe's lower bound f(p) + min over allowed q of grad f(p).(q - p) of a convex error f."""
         _, value, gradient = self.make_support(powers)
         return float(value + np.sum(gradient * (self.limits.find_best_powers(-gradient) - powers)))
 
     def bound_least_total(self, powers: Powers, target: float) -> float:
-        """Return the least total power at which the tangent at p reaches the target: a convex error needs no less.
+        """Return the least total power at which the tangent at p reaches the target, found by bisection.
 
-        By bisection of the total power.
+        A convex error is nowhere below its tangent, so it needs at least this power.
         """
         _, value, gradient = self.make_support(powers)
         low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
@@ -168,7 +165,7 @@ class PowerTask(NamedTuple):
         )
 
     def sum_by_path(self, powers: Powers) -> Float[np.ndarray, "time path"]:
-        """Return the power of the free hops of each path together (time, path), from theirs (time, free)."""
+        """Return the sum of the free hops' powers for each path (time, path), from their powers (time, free)."""
         total = np.zeros(self.problem.paths.second.shape)
         np.add.at(total.T, self.problem.path, powers.T)
         return total
@@ -201,10 +198,10 @@ def make_power_task(
     """
 
     def information(powers: Powers) -> PathInformation:
-        """Return the information of all paths and its slope by the free powers, the others being fixed.
+        """Return the information of all paths, and its slope by the free powers, with the other powers fixed.
 
-        `fixed`: powers of all hops (time, hop), of which those of the hops `free` are replaced by `powers`
-        (time, free).
+        `fixed`: powers of all hops (time, hop), in which those of the hops `free` are replaced by `powers` (time,
+        free).
         """
         of_all_hops = fixed.copy()
         of_all_hops[:, free] = powers
@@ -230,9 +227,9 @@ def make_power_task(
 
 
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
-    """Return the total power of starts where none is given: what peaks and means allow, or plenty.
+    """Return the total power of starts if none is given: what peaks and means allow, or a lot of power without them.
 
-    Plenty is so much that noise hardly counts: ten times the largest alpha, at which half of what arrives is noise.
+    It is ten times the largest alpha for each transmitter. At power alpha half of what arrives is noise.
     """
     largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
     plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
@@ -324,9 +321,9 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
 
 
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
-    """Return the powers of the least total that reaches a target, by descents from the starts; None where none does.
+    """Return the powers of least total that reach a target, by descents from the starts, or None if none can.
 
-    Each start is raised first until it reaches the target. `scale`: size of the powers, in which the search steps.
+    Each start is raised until it reaches the target. `scale`: the size of powers, which sets the steps of the search.
     """
     no_power = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
@@ -340,14 +337,14 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
 
 
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
-    """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None."""
+    """Return the start times the least factor that reaches the target within peaks and means, or None if none does."""
 
     def reaches(factor: float) -> bool:
         """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less."""
         powers = problem.limits.clip_powers(start * factor)
         return problem.criterion.smooth(problem.covariances(powers))[0] <= target
 
-    low, high = FACTORS  # between which the factor's logarithm is bisected
+    low, high = FACTORS  # the factor's logarithm is bisected between these
     if not reaches(high):
         return None
     for _ in range(BISECTIONS):
@@ -357,10 +354,10 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
-    """Raise ValueError where the target is not above (by REACHED) the error that remains however much is sent."""
+    """Raise ValueError unless the target exceeds, by the share REACHED, the error that all allowed power leaves."""
     limits, alpha = task.problem.limits, task.problem.paths.alpha[:, task.free]
     has_limits = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
-    # The most that each may send: up to its peak, or plenty (UNLIMITED), or its whole mean power in one step.
+    # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (UNLIMITED).
     plenty, whole_mean = UNLIMITED * np.maximum(alpha, 1.0), limits.mean * len(limits.peak)
     largest_powers = np.minimum(np.minimum(limits.peak, plenty), whole_mean)
     least_error = task.problem.compute_exact_error(largest_powers)

@@ -49,7 +49,7 @@ class RiccatiMap(NamedTuple):
 
 
 def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
-    """Return the map of two steps of the filter, the first applied first: again a map A X (I + G X)^-1 A' + H."""
+    """Return the map of two filter steps, `first` and then `second`, as one map X -> A X (I + G X)^-1 A' + H."""
     inner = np.linalg.inv(np.eye(len(first.h)) + first.h @ second.g)
     through = inner @ first.a
     g = first.g + first.a.T @ second.g @ through
@@ -58,9 +58,9 @@ def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 
 
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
-    """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k doublings.
+    """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: k doublings make 2^k steps.
 
-    It is reached when a doubling changes H by no more than a share CONVERGED.
+    It is reached when a doubling changes H by at most the share CONVERGED.
 
     Raises:
         ValueError: covariances that grow without limit.
@@ -101,11 +101,11 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
 
 
 def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
-    """Return the adjoint L_k (time, n, n), the gradient of the cost with respect to P_k through all later steps.
+    """Return the adjoint L_k (time, n, n): the gradient of the cost by P_k, through P_k itself and all later steps.
 
-    `information`: J_k; `p`: P_k; `weights`: derivative W_k of the cost by P_k alone; all (time, n, n).
+    `information`: J_k. `p`: P_k. `weights`: the derivative W_k of the cost by P_k alone. All are (time, n, n).
     """
-    # The filter's error moves by phi from step to step: its covariance follows X+ = phi X phi'.
+    # From step to step the filter's error is multiplied by phi, and its covariance moves by X+ = phi X phi'.
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
     one_mode_always, no_noise = np.ones((len(p), 1, 1)), np.zeros_like(phi[:, None])
     system = JumpSystem(one_mode_always, phi[:, None], no_noise)
@@ -225,10 +225,10 @@ def _read_hop_numbers(
     """Return a number for each hop, of this shape (sensors, hops of each), none below `least`.
 
     Args:
-        name: of the numbers, for messages.
-        value: numbers of that shape, one for all, or one for each sensor if it has one hop.
+        name: name of the numbers, for messages.
+        value: numbers of that shape, one for all hops, or one for each sensor if all have one hop.
         shape: (sensors, hops of each).
-        least: least value that is allowed.
+        least: the least value that is allowed.
     """
     numbers = np.asarray(value)
     if numbers.ndim == 0:
@@ -246,7 +246,10 @@ def compute_path_kappas(paths: Paths) -> PathValues:
 def _arrange_by_place(
     paths: Paths, values: Powers
 ) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
-    """Return the values of hops as (time, path, place along the path), 1 where a path is shorter, and hops' places."""
+    """Return the values of hops as (time, path, place along the path), and the place of each hop on its path.
+
+    Where a path is shorter than the longest, the value is 1.
+    """
     order = np.argsort(paths.path, kind="stable")
     hop_counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     first_hops = np.cumsum(hop_counts) - hop_counts  # of each path, in the order by paths
@@ -258,17 +261,17 @@ def _arrange_by_place(
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop); alpha in sent power."""
+    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop), with alpha in sent power."""
     total = powers + alpha
-    # A hop without noise: any power does.
+    # A hop without noise and power has the share 1: without noise any power will do.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
 
 
 def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop).
 
-    j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h, where F is the product of p / (p + alpha) along the
-    path, s = E y^2 of what is sent, t = s less the sensor's noise, and K the product of kappa.
+    j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h. F is the product of p / (p + alpha) along the path,
+    and K that of kappa. s = E y^2 of what is sent, and t is s minus the sensor's noise variance.
     """
     factors, places = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # factors (time, path, place)
     F, sK = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)
@@ -298,13 +301,13 @@ def compute_path_sensitivities(
     p: Float[np.ndarray, "time n n"],
     weights: Float[np.ndarray, "time n n"],
 ) -> PathValues:
-    """Return the sensitivity -d cost / d j = c P L P c' of each path at each step, (time, path).
+    """Return -d cost / d j = c P L P c' of each path at each step, (time, path), with c its row and L the adjoint.
 
     Args:
         paths: the paths.
         information: j of each path (time, path).
         p: the error covariance P after each step.
-        weights: derivative of the cost by P of each step.
+        weights: the derivative of the cost by each step's P.
     """
     ahead = compute_adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
     projected = paths.rows @ p

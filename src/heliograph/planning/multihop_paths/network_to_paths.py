@@ -87,7 +87,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 
 
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes by name; refuse relays that filter, nodes that share a channel, and senders that decide."""
+    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders that decide."""
     if network.relays is not None:
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
@@ -182,9 +182,9 @@ def _compute_hop_kappa_and_alpha(hop: GainAndNoise) -> tuple[float, float]:
 
 
 def _split_loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
-    """Return the channel behind an unobserved loss, and 1 / (arrival probability), the factor of its kappa.
+    """Return the channel inside an unobserved loss, and 1 / (arrival probability), the factor of its kappa.
 
-    A loss is a mixture of one channel with maps that deliver nothing.
+    Such a loss is a mixture of one channel with maps that deliver nothing.
     """
     probabilities = np.asarray(mixture.choice.probabilities)
     delivering = [index for index, affine in enumerate(mixture.maps) if not _delivers_nothing(affine)]
@@ -259,11 +259,10 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
 
 
 def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance: Float[np.ndarray, "m m"]) -> None:
-    """Raise ValueError where two paths of a node carry correlated noise of its sensor.
+    """Raise ValueError if two paths of a node carry correlated noise of its sensor.
 
-    `rows`: combination of the outputs that each path carries; `covariance`: of the sensor's noise.
-
-    UNCORRELATED: a correlation that is rounding.
+    `rows`: the combination of outputs that each path carries. `covariance`: of the sensor's noise. A correlation up to
+    UNCORRELATED counts as rounding.
     """
     path_covariance = rows @ covariance @ rows.T
     variances = np.diag(path_covariance)

@@ -54,18 +54,17 @@ class SplitPaths(NamedTuple):
 
 
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
-    """Return the paths by the power that their free hops send together; the others send the powers `fixed`.
+    """Return the paths as functions of the total power of their free hops, while other hops send the powers `fixed`.
 
-    `fixed`: powers (time, hop). DEAD: a number so large that the path carries nothing, for one that a silent hop
-    cuts.
+    `fixed`: powers (time, hop). DEAD: a noise factor so large that the path carries nothing, as if a hop is silent.
     """
     full = paths.second * compute_path_kappas(paths)
-    # alpha of the free hops of each path.
+    # Gather alpha of the free hops by path.
     free_hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
     alpha = np.zeros((*full.shape, max(1, max(len(hops) for hops in free_hops))))
     for i, hops in enumerate(free_hops):
         alpha[:, i, : len(hops)] = paths.alpha[:, hops]
-    # A hop of fixed power divides A by p / (p + alpha).
+    # A hop of fixed power divides `full` by its share of signal, p / (p + alpha).
     share = share_of_signal(fixed, paths.alpha)
     for h in np.flatnonzero(~free):
         i = paths.path[h]
@@ -74,10 +73,10 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
 
 
 def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") -> Float[np.ndarray, "H"]:
-    """Return powers p_h >= 0 of a given sum that make the noise factor prod_h (1 + alpha_h / p_h) of a chain least.
+    """Return the powers p_h >= 0 of a given sum with the least noise factor prod_h (1 + alpha_h / p_h) of a chain.
 
-    p_h = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with the multiplier l that the sum sets. Plant, sensor and
-    fading do not matter. Two hops share in the ratio sqrt(alpha_1 (P + alpha_2)) to sqrt(alpha_2 (P + alpha_1)).
+    They are p_h = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2, where the sum determines the multiplier l. Plant,
+    sensor and fading do not matter. Two hops share as sqrt(alpha_1 (P + alpha_2)) to sqrt(alpha_2 (P + alpha_1)).
 
     Args:
         alpha: noise of each hop in units of sent power, Var m / E g^2, shape (H,). A hop without noise gets nothing.
@@ -87,7 +86,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
         The powers, shape (H,).
 
     Raises:
-        ValueError: a negative noise or total, no hops, noises or a total whose squares are no numbers.
+        ValueError: a negative noise or total, no hops, or numbers whose squares overflow or underflow.
     """
     noise, power = check_hop_noises(alpha), float(scalar("total power", total, 0.0))
     if not np.any(noise):
@@ -100,7 +99,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
 
 
 def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
-    """Return the noises alpha of a chain's hops (H,), checked: not negative, and of a size whose square is a number."""
+    """Return the noises alpha of a chain's hops (H,), checked to be nonnegative and small enough to be squared."""
     noise = require_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
@@ -141,10 +140,10 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
 
 
 def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
-    """Return log l of each path (time, path, 1), with the multiplier l at which sum_h p_h(l) is its power.
+    """Return log l of each path (time, path, 1), with the multiplier l at which sum_h p_h(l) is the path's power P.
 
-    By Newton's method for log sum_h p_h as a function of log l, from l = (sum_h root alpha_h / P)^2, which is exact for
-    much power. `power`: P > 0 (time, path, 1).
+    Newton's method is applied to log sum_h p_h as a function of log l. It starts at l = (sum_h sqrt(alpha_h) / P)^2,
+    which is exact for large P. `power`: P > 0 (time, path, 1).
     """
     has_hops = (alpha > 0).any(axis=-1, keepdims=True)
     log_l: np.ndarray = 2 * np.log(np.where(has_hops, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
@@ -152,7 +151,7 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
         p, negative_slope = _split_at_multiplier(alpha, log_l)
         total = p.sum(axis=-1, keepdims=True)
         excess = np.log(np.divide(total, power, out=np.ones_like(power), where=total > 0))
-        # Newton's step for the logarithm of the sum, whose slope is d sum p / d log l over the sum.
+        # Newton's step: the slope of log(sum p) by log l is (d sum p / d log l) / sum p.
         step = np.divide(excess * total, negative_slope, out=np.zeros_like(total), where=negative_slope > 0)
         log_l = log_l + step
         if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
@@ -163,8 +162,8 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
 def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return p_h(l) of each hop (time, path, hop), and -d sum_h p_h / d log l of each path (time, path, 1).
 
-    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the same as (root - alpha) / 2, but
-    without a difference that cancels.
+    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l). This equals (root - alpha) / 2, but
+    loses no digits by cancellation.
     """
     inverse = np.exp(-log_l)
     root = np.sqrt(alpha**2 + 4 * alpha * inverse)
@@ -182,10 +181,10 @@ class Envelope(NamedTuple):
     ray: PathValues
 
     def information(self, total: PathValues) -> tuple[PathValues, PathValues]:
-        """Return the envelope and its slope at these powers of the paths.
+        """Return the concave envelope of the information, and its slope, at these powers of the paths.
 
-        The envelope is the least concave function above the information: up to the power `touch` a straight
-        line of slope `ray` from 0, then the information itself.
+        It is the least concave function above the information: a line of slope `self.ray` from 0 up to the power
+        `self.touch`, and the information itself beyond.
         """
         exact = split_power_over_hops(self.whole, total)
         on_ray = total < self.touch

@@ -95,14 +95,14 @@ def _search_line(
 
 
 def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
-    """Return the powers [y sqrt(w b) - b]^+ / a (time, free) at the level y that the limits set.
+    """Return the powers [y sqrt(w b) - b]^+ / a (time, free) at the level y that the limits determine.
 
-    They are [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. `weights`: w = -d error / d j of each
-    path, which carries the information j = p / (a p + b).
+    They are [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. w (`weights`) is -d error / d j of each
+    path, whose information is j = p / (a p + b).
     """
     rise, ground = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
     steps, transmitters = ground.shape
-    # The level at which each transmitter's mean is reached, then that of the total under these.
+    # Find the level at which each transmitter reaches its mean, and then the level of the total.
     no_limit = np.full(steps, np.inf)
     levels_of_means = [
         _find_level(rise[:, i], ground[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps)
@@ -110,7 +110,7 @@ def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) 
     ]
     highest = np.broadcast_to(levels_of_means, ground.shape)
     level = _find_level(rise.ravel(), ground.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
-    # A transmitter at its mean keeps its own level where that of the total is higher.
+    # A transmitter's level is at most the one at which it reaches its mean.
     return limits.clip_powers(_fill_to_level(np.minimum(level, highest), rise, ground, limits.peak))
 
 
@@ -120,9 +120,9 @@ def _fill_to_level(
     ground: Float[np.ndarray, "*k"],
     peak: Float[np.ndarray, "*k"],
 ) -> Float[np.ndarray, "*k"]:
-    """Return the powers min([level rise - ground]^+, peak), of the arguments' shape; 0 where rise is 0, at any level.
+    """Return the powers min([level rise - ground]^+, peak), in the arguments' shape; they are 0 if rise is 0.
 
-    Powers as water: each place is filled above its ground `ground`, the faster the larger `rise`, up to its peak.
+    Powers fill like water: each place is filled above its `ground`, faster with a larger `rise`, up to its `peak`.
     """
     with np.errstate(invalid="ignore"):
         wet = np.where(rise > 0, level * rise - ground, 0.0)

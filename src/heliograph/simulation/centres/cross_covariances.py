@@ -68,12 +68,12 @@ class CrossCovariances:
         return np.asarray(self.state @ self.state.T)
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
-        """Return the best unbiased weights W of the nodes' estimates and the covariance W P W' of their weighted error.
+        """Return the best unbiased weights W of the nodes' estimates, and the covariance W P W' of the fused error.
 
-        The time that it takes is linear in the number of nodes where P allows it.
+        P is the joint covariance of the nodes' errors. If P allows it, the time is linear in the number of nodes.
         """
         weights = _choose_weights(self._error_sources)
-        # The error as factors of what the nodes share, and what is independent of it.
+        # The fused error: a factor of the part from shared sources, and the covariance of the independent part.
         shared, independent = self._error_sources.weigh(weights)
         return weights, np.asarray(shared @ shared.T + independent)
 
@@ -125,10 +125,10 @@ class CrossCovariances:
 def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
     """Return the weights (n, node, n) of least error variance for the nodes' estimates with these errors.
 
-    By factors where the part of each error that is independent of all others is regular enough (REGULAR), at a cost
-    linear in the nodes; else by the joint covariance of all errors.
+    If the independent part of every error is regular enough (above REGULAR), the weights come from factors, at a cost
+    linear in the number of nodes. Otherwise they come from the joint covariance of all errors.
     """
-    # Least eigenvalue of the independent parts, in units of each component's whole deviation.
+    # Scale each component by its whole deviation, so that eigenvalues of the independent parts can be compared.
     deviation = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
     deviation = np.where(deviation > 0, deviation, 1.0)
     scaled = errors.independent / (deviation[:, :, None] * deviation[:, None])
@@ -214,7 +214,7 @@ def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | No
 
 @quickly_compiled
 def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
-    """Return the joint covariance of all errors by its factors, after the steps of u, for the one informed fusion."""
+    """Return factors of the joint covariance of all errors after the steps of u, for the only informed fusion."""
     (centre,) = filters.linear_centres  # that of the informed fusion, which knows how the errors are correlated
     filter_states, _, _, (centre_state,), *_ = filters.init()
     nodes, n = centre_state.errors.bias.shape

@@ -21,7 +21,7 @@ def check_error_decay(
     what: str, graph: Graph, shares: np.ndarray, arrival: np.ndarray, plant: tuple[np.ndarray, np.ndarray],
     squares: np.ndarray,
 ) -> None:  # fmt: skip
-    """Raise ValueError for fixed shares, by which nodes weigh their neighbours' estimates, with which errors grow.
+    """Raise ValueError if the nodes' errors grow with these fixed shares of their neighbours' estimates.
 
     Args:
         what: name of the fusion.
@@ -107,9 +107,9 @@ def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMap
 
 
 def _take_moments_of_pairs(blocks: np.ndarray, graph: Graph) -> np.ndarray:
-    """Return E[(e_i, e_j) (e_i, e_j)'] of the errors of node i and each sender j it receives, (node, degree, 2 n, 2 n).
+    """Return E[(e_i, e_j) (e_i, e_j)'] for each node i and each of its senders j, (node, degree, 2 n, 2 n).
 
-    `blocks`: E[e_i e_j'] of all nodes (node, n, node, n).
+    e_i is the error of node i. `blocks`: E[e_i e_j'] of all nodes (node, n, node, n).
     """
     nodes, senders = np.arange(len(graph.senders)), graph.senders
     cross = blocks[nodes[:, None], :, senders, :]

@@ -99,9 +99,11 @@ class FusedInnovation(Module):
 def _predict_by_first(
     filters: AbstractFilter, states: PyTree, estimate: Gaussian, u: jax.Array, k: jax.Array
 ) -> Gaussian:
-    """Return `estimate` predicted over step k by the first of some stacked filters, all of one plant.
+    """Return `estimate` predicted over step k by the first of some stacked filters.
 
-    `states`: of the filters, stacked too: the first one's takes the estimate in place of its own.
+    All filters have the same plant, so any of them predicts the same.
+
+    `states`: the filters' states, stacked too. The estimate replaces the one in the first state.
     """
     arrays, static = eqx.partition(filters, eqx.is_array)
     first_arrays, state = jax.tree.map(lambda leaf: leaf[0], (arrays, states))
@@ -133,7 +135,8 @@ def _correct_in_turn(
     def correct(before: _CorrectedEstimate, row: tuple[PyTree, PyTree, jax.Array]) -> tuple[_CorrectedEstimate, None]:
         """Return the fused estimate x corrected by one node's filter, with its squared innovation e' S^-1 e added.
 
-        `row`: the filter's arrays (`static` is the rest of it), its predicted state, and the node's measurement.
+        `row`: the arrays of the node's filter, its predicted state, and the node's measurement. `static` is the rest of
+        the filter.
         """
         filter_arrays, prior, z = row
         filter = eqx.combine(filter_arrays, static)

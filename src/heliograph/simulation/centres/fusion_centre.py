@@ -79,7 +79,7 @@ class FusionCentre(Module):
     def init(self, starts: Sequence[jax.Array]) -> CentreState:
         """Return the centre's state before the first step: moments of all nodes' errors, and the rules' states.
 
-        `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
+        `starts`: initial means (node, n) of the filters, by group of nodes. `self.order` sorts their rows by node.
         """
         plant = at(self.plant, k=0)
         initial_means = jnp.concatenate(starts)[self.order]
@@ -102,7 +102,7 @@ class FusionCentre(Module):
         `mean` (n,) and `covariance` (n, n): of the plant's state. `filters`: matrices in the order of the nodes.
         """
         plant: LinearPlant = at(self.plant, k)
-        # x+ = A x + shift + w; what is measured of the state after the step depends on its moments there.
+        # x+ = A x + shift + w. The measurement is taken after the step, so its model needs the moments after the step.
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         mean_after, covariance_after = propagate_state(mean, covariance, motion)
         observation = self.observation_model.observe(mean_after, covariance_after, k)
@@ -130,7 +130,7 @@ class FusionCentre(Module):
             """Step the filters' states over step k, and the factors of the errors' covariance by their matrices."""
             states, factors = carry
             k, u_k = row
-            # Moments of the plant's state: row 0 of the means, and its part of the factors.
+            # The plant's state has row 0 of the means, and its covariance is S S' with the factor S = factors.state.
             covariance = jnp.asarray(factors.state @ factors.state.T)
             matrices = compute_matrices(states, u_k, k)
             step = self.compute_error_maps(factors.mean[0], covariance, matrices, u_k, k)
@@ -237,7 +237,7 @@ def has_data_dependent_gains(nodes: Parts) -> bool:
 
 
 def _check_data_dependent_gains(rule: str, nodes: Parts, shared: bool) -> None:
-    """Raise unless all filters are cubature or extended ones, of nodes that share nothing but the plant."""
+    """Raise ValueError unless all filters are cubature or extended ones, and the nodes share no channel."""
     for name, (_, _, filter) in nodes.items():
         if not isinstance(filter, GaussianFilter) or filter.linear:
             raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", filter)
@@ -261,11 +261,10 @@ def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
 
 
 def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
-    """Return the claim of fusion by reports, which nodes send to a centre: `claim`, lowered by what is uncertain.
+    """Return the claim of a fusion of the reports that nodes send to a centre: `claim`, or a weaker one.
 
-    That is quantizers of the reports, and uplinks, the nodes' channels to the centre, with uncertain probabilities.
-
-    `complete`: for each node whether it loses no measurement.
+    Quantizers of the reports weaken it. So do uplinks (channels from node to centre) of uncertain probabilities.
+    `complete`: for each node, True if it loses no measurement.
 
     Raises:
         ValueError: nodes that lose measurements, which the centre cannot know from a missing report.
@@ -282,9 +281,9 @@ def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complet
 
 
 def _has_uncertain_law(channel: Channel) -> bool:
-    """Return whether probabilities of the channel's laws are known up to a radius only.
+    """Return whether the channel's laws have probabilities that are known only up to a radius.
 
-    Each extreme law that they allow is a corner.
+    Each extreme law within the radius is a corner, so an uncertain law has more than one.
     """
     try:
         return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))
@@ -368,10 +367,10 @@ class CentreFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: CentreJointState, z: ArrayLike, k: Step = 0) -> tuple[CentreJointState, Innovation]:
-        """Return the state corrected by the reports that arrived, and their innovation; z is NaN where one did not.
+        """Return the state corrected by the reports that arrived, and the innovation.
 
-        `indices`: of z among all numbers that could come, (age, node, widest): of every delay, padded to the longest
-        report.
+        z is NaN for reports that did not arrive. `self.rows` are the indices of z among all numbers that could come,
+        flattened from (age, node, widest): reports of every delay, padded to the longest report.
         """
         shape = self.ages, state.known.past.gain.shape[1], self.widest
         indices = np.array(self.rows)

@@ -63,9 +63,10 @@ class StackedFusions(Module):
     angles: Angles = eqx.field(static=True)
 
     def init(self, n: int) -> PyTree:
-        """Return the states of the quantizers, by which nodes send estimates in few bits, before the first step.
+        """Return the states before the first step of the quantizers, by which nodes send their estimates in few bits.
 
-        () without quantizers; else of each fusion and node, (fusion, node, ...). `n`: number of the plant's states.
+        Without quantizers the result is (). Otherwise each leaf has leading axes (fusion, node).
+        `n`: number of the plant's states.
         """
         if self.quantizers is None:
             return ()
@@ -114,14 +115,14 @@ class StackedFusions(Module):
     def _gather_by_fusion(self, values_by_kind: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters as (fusion, node, ...), in the order of each fusion's nodes.
 
-        `values_by_kind`: (filter, node, ...) by kind of filter; `sources`: for each fusion the (kind, filter) that it
-        fuses.
+        `values_by_kind`: (filter, node, ...) for each kind of filter. `self.sources`: for each fusion, the pairs
+        (kind, filter) that it fuses. `self.order`: for each fusion, the order of their joined rows.
         """
         values_by_fusion = [
             jnp.concatenate([values_by_kind[kind][filter] for kind, filter in sources]) for sources in self.sources
         ]
         are_in_order = all(np.array_equal(order, np.arange(len(order))) for order in self.order)
-        if are_in_order:  # no gather is compiled
+        if are_in_order:  # so that no gather is compiled
             return jnp.stack(values_by_fusion)
         return jnp.stack([values[order] for values, order in zip(values_by_fusion, self.order, strict=True)])
 
@@ -232,7 +233,7 @@ def build_centre_filter(
 
 
 def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
-    """Return a node with the filter `name` alone of its filters, or with none if it has none of this name."""
+    """Return a copy of the node that keeps only the filter `name`, or no filter if the node has none of this name."""
     filters = {label: filter for label, filter in node.filters.items() if label == name}
     if isinstance(node, Node):
         return Node(node.sensor, node.channel, filters)
@@ -240,15 +241,15 @@ def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingN
 
 
 def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
-    """Return the network's fusions of estimates by rules that need no model of the nodes; of one structure, stacked.
+    """Return the network's fusions whose rules need no model of the nodes, with fusions of one structure stacked.
 
-    Rules that know how the nodes' errors are correlated, called informed, have centres instead (`list_centres`).
+    Rules that know how the nodes' errors are correlated are called informed; they have centres (`list_centres`).
     """
     names_by_structure: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
             nodes = network.nodes_with(fusion.filter)
-            # Of one structure: rules and quantizers, for the same number of nodes.
+            # Fusions stack if their rules and quantizers have one structure, and they fuse equally many nodes.
             key = structure_key((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
             names_by_structure.setdefault(key, []).append(name)
     places, claims = network.places, network.claims().get(FUSED, {})
@@ -285,9 +286,9 @@ def _stack_fusions(
 
 
 def list_centres(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...]:
-    """Return the network's centres that know how the nodes' errors are correlated, one for each filter fused so.
+    """Return one centre for each filter that some informed rule fuses.
 
-    A rule that needs this knowledge is called informed.
+    A rule is informed if it needs to know how the nodes' errors are correlated; the centre keeps that knowledge.
     """
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, fusion in network.fused.items():
@@ -324,10 +325,10 @@ def _build_centre(
 def find_source_filters(
     network: Network, places: Mapping[tuple[str, str], EstimatePlace], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Return where the filters of this name stand in the stacks of filters: (kind, number within the kind); an order.
+    """Return the sources of a fusion, each as (kind, number of the filter within the kind), and an order of their rows.
 
-    A kind is a stack of filters of one structure, over a group of nodes. The estimates (node, n) of these sources, one
-    source after another and indexed by the order, are those of `nodes`.
+    A kind is a stack of filters of one structure, over a group of nodes. Join the estimates (node, n) of the sources,
+    one source after another, and index them by the order: row i is then the estimate of nodes[i].
 
     Args:
         network: the network.

@@ -47,17 +47,17 @@ def find_event_senders(
     alpha: Array, difference: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
     senders: np.ndarray, present: np.ndarray,
 ) -> Bool[jax.Array, " node"]:  # fmt: skip
-    """Return which nodes send: those whose estimate is off by d' P^-1 d > alpha n from what somebody received last.
+    """Return which nodes send: those with d' P^-1 d > alpha n for some neighbour.
 
     Args:
         alpha: threshold of the events.
-        difference: d, for each node and place the sender's estimate less what the node received of it last.
+        difference: d, for each node and neighbour: the sender's estimate minus what the node received from it last.
         information: P^-1 of the sender's estimate.
-        senders: of whom each node receives (node, degree), itself first.
-        present: where it has a neighbour (node, degree).
+        senders: the numbers of the nodes that each node receives (node, degree), itself first.
+        present: True where a node has a neighbour in this place (node, degree).
 
-    Where the message arrives, the error of what was received last is then at most (1 + sqrt(alpha n))^2 P, whatever got
-    lost before: E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
+    If the sent messages arrive, the received estimate has an error covariance of at most (1 + sqrt(alpha n))^2 P:
+    E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'] for any t > 0, and d d' <= alpha n P where nothing is sent.
     """
     squared_distance = jnp.einsum("ida,idab,idb->id", difference, information, difference)
     is_far = squared_distance > alpha * difference.shape[-1]
@@ -71,9 +71,9 @@ def find_event_senders(
 def quantize_estimate(
     quantizer: AbstractQuantizer, mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return what a node sends of an estimate: the mean quantized, NaN if it saturates, and a covariance wider by that.
+    """Return the estimate as it is received: its mean quantized, and its covariance widened by the quantizer's error.
 
-    The quantizer's state is (), as one between neighbours has none.
+    The mean is NaN if the quantizer saturates. The quantizer's state is (): quantizers between neighbours have none.
     """
     _, quantized = quantizer.step((), mean)
     received = jnp.where(jnp.any(quantized.saturated), jnp.nan, quantized.value)

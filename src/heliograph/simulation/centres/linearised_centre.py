@@ -59,7 +59,7 @@ class LinearisedCentre(Module):
     def init(self, starts: Sequence[jax.Array]) -> dict[str, LinearisedFusionState]:
         """Return the states of all fusions before the first step, by name.
 
-        `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
+        `starts`: initial means (node, n) of the filters, by group of nodes. `self.order` sorts their rows by node.
         """
         plant = at(self.plant, k=0)
         initial_means = jnp.concatenate(starts)[self.order]
@@ -109,11 +109,11 @@ class LinearisedCentre(Module):
 
 
 def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: LinearisedStep) -> ErrorStep:
-    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors, `error_factor` being F_i = I - K_i C_i.
+    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `error_factor` is F_i = I - K_i C_i.
 
-    A, w: of the plant's `motion`; K_i, nu_i: gain and measurement noise of node i (`linear`). The state x itself
-    stands before the errors, which do not depend on it; only x is shifted, so that errors of mean zero keep that
-    mean. Shapes: error_factor (node, n, n).
+    A and w are the matrix and the noise of the plant's `motion`. K_i and nu_i are the gain and the measurement noise of
+    node i, from `linear`. The plant's state x stands before the errors. Errors do not depend on x, and only x is
+    shifted, so errors of mean zero keep that mean. `error_factor`: (node, n, n).
     """
     nodes, n, _ = error_factor.shape
     return ErrorStep(
@@ -127,30 +127,31 @@ def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: Line
 
 
 def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
-    """Return the moments of the errors `after` a step, but those of the plant's state as `before` it.
+    """Return the moments `after` a step, with the plant's mean and cross-covariances taken from `before` it.
 
-    Models are linearised along estimates here, so that nobody knows the plant's own moments: its mean stays, and its
-    covariance with all else. Row 0 of the means, and the first n numbers of the covariance, are the plant's.
+    Models are linearised along estimates here, so the plant's own moments are unknown and stay as they are.
+    The plant's moments are row 0 of the means (node + 1, n), and the first n rows and columns of the covariance.
+    `after.bias`: the rows of the mean below row 0, the means of the errors.
     """
     n = before.mean.shape[1]
-    of_errors = np.arange(len(before.covariance)) >= n
-    covariance = jnp.where(np.outer(of_errors, of_errors), after.covariance, before.covariance)
+    is_of_error = np.arange(len(before.covariance)) >= n
+    covariance = jnp.where(np.outer(is_of_error, is_of_error), after.covariance, before.covariance)
     return ErrorMoments(jnp.concatenate([before.mean[:1], after.bias]), covariance)
 
 
 def _compute_drift_of_mean_errors(
     state: ReportsBelief, matrix: jax.Array, predicted_mean: jax.Array, error_factor: jax.Array, linear: LinearisedStep
 ) -> jax.Array:
-    """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
+    """Return F_i (E e_i- - A E e_i) (node, n): the part of each mean error's move that the linear map A leaves out.
 
     Each filter's prediction m_i- is known, so that E e_i- = E x- - m_i-.
 
     Args:
-        state: the rule's, with the means E e_i before the step.
+        state: the rule's state, with the means E e_i before the step.
         matrix: A (n, n).
         predicted_mean: E x- (n,).
         error_factor: F_i of all nodes (node, n, n).
-        linear: with the filters' predictions m_i- (node, n).
+        linear: the linearised step, with the filters' predictions m_i- (node, n).
     """
     nodes, n, _ = error_factor.shape
     mean_errors = state.gaussian.mean[n:].reshape(nodes, n)

@@ -82,9 +82,9 @@ class Mesh(Module):
 
     @property
     def has_long_step(self) -> bool:
-        """Return whether a step has more operations than MESH: too many for native code, which writes out each one."""
+        """Return whether a step has more than MESH operations, which is too many to write out as native code."""
         n = len(first(self.plant).states)
-        # About n^2 operations for each message, and twice N^2 for a joint covariance of N = nodes n numbers.
+        # About n^2 operations for each message, and 2 N^2 for a joint covariance of N = (number of nodes) n numbers.
         messages = self.edges.rounds * int(np.count_nonzero(self.edges.present))
         size = len(self.senders) * n if self.needs_joint else 0
         return max(messages * n * n, 2 * size**2) > MESH
@@ -175,18 +175,19 @@ class Mesh(Module):
     def _compute_innovation(
         self, predicted: jax.Array, common: jax.Array, weighted: jax.Array, step: MeshStep, arrived: Arrived
     ) -> Float[jax.Array, "node n"]:
-        """Return s - S xb of each node, xb its `predicted` estimate (node, n): what the measurements say beyond it.
+        """Return s - S xb (node, n): what the measurements say beyond each node's predicted estimate xb (`predicted`).
 
-        Computed as sum_j H_j' R_j^-1 (z_j - offset_j - H_j m) - S (xb - m), `weighted` the terms of the sum, about one
-        m for all nodes, `common`: so no digits of large means are lost. S is `step.information`.
+        s = sum_j H_j' R_j^-1 (z_j - offset_j) over the measurements that reach the node, and S is `step.information`.
+        It is computed as sum_j `weighted`_j - S (xb - m), with the terms H_j' R_j^-1 (z_j - offset_j - H_j m) and m =
+        `common`, so that large means cost no digits.
         """
         sums = self._sum_over_reached_nodes(weighted, arrived)
         return sums - jnp.einsum("iab,ib->ia", step.information, predicted - common)
 
     def _gather_late_or_quantized(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
-        """Return the estimates that arrive where they may be late or quantized; None where they come as they are now.
+        """Return the estimates that arrive if messages may be late or quantized, else (`state.way` is None) None.
 
-        `arrived`: flags, or ages where messages may be late, (node, rounds, degree).
+        `arrived` (node, rounds, degree): flags, or ages where messages may be late.
         """
         if state.way is None:
             return None
@@ -316,24 +317,22 @@ class Mesh(Module):
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
     def _sum_over_reached_nodes(self, values: jax.Array, arrived: Arrived) -> jax.Array:
-        """Return for each node the sum of `values` (node, ...) of all nodes that reach it in any round, each once."""
-        if self.edges.rounds == 1:  # from the senders to the node alone
+        """Return for each node the sum of `values` (node, ...) over all nodes that reach it in any round, each once."""
+        if self.edges.rounds == 1:  # only a node's own senders can reach it
             return self.sum_over_messages(values, jnp.asarray(arrived[:, 0]))
         return jnp.tensordot(self.find_known_measurements(arrived).astype(values.dtype), values, 1)
 
     def find_known_measurements(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
         """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
         has_measurement, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
-        # In each round a node comes to have what the senders of the messages that arrive had before it.
+        # In each round a node gets all measurements that the senders of its arriving messages had before the round.
         for round_number in range(self.edges.rounds):
             has_measurement = jnp.any(has_measurement[self.senders] & arrived[:, round_number, :, None], axis=1)
         return has_measurement
 
     def sum_over_messages(self, values: jax.Array, present: jax.Array) -> jax.Array:
-        """Return for each node the sum of `values` (node, ...) of the senders whose messages it has.
-
-        `present` (node, degree): which these are, of `senders`, the nodes that it receives.
-        """
+        """Return for each node the sum of `values` (node, ...) over the senders whose messages are `present`."""
+        # `present` and `self.senders` are (node, degree): the nodes that each node can receive.
         sums: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
         return sums
 
@@ -361,7 +360,7 @@ class Mesh(Module):
             complete: jax.Array,
             weights_ahead: Sequence[jax.Array],
         ) -> NodeGains:
-            """Return the gains of one node, with weights computed ahead or those of the rule for what it received."""
+            """Return the gains of one node, by the weights computed ahead if there are any, else by the rule."""
             step = NodeStep(motion.matrix, motion.noise, arrived=information, complete=complete)
             if weights_ahead:
                 neighbour_weights, fused_covariance = weights_ahead
@@ -373,18 +372,18 @@ class Mesh(Module):
         return gains
 
     def compute_weights_ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
-        """Return the weights of many steps by bucket, with a leading axis of steps, from what arrives at each.
+        """Return the weights of many steps, by bucket (nodes of like degree), from what arrives; steps come first.
 
-        Empty where they depend on more than that: on covariances before the step. Buckets: nodes of like degree.
+        The result is empty if the weights also depend on covariances before the step.
         """
         weights = [bucket.rule.weights_ahead(arrived[:, bucket.rows, -1, : bucket.width])
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
 
     def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
-        """Return the estimates (1, node, ...) by group of nodes, from `mean` and `covariance` in the mesh's order.
+        """Return the estimates (1, node, ...) of each group of nodes, from means and covariances in the mesh's order.
 
-        `places`: for each group the numbers of its nodes in the mesh. The axis of 1: of filters, here the fusion alone.
+        `self.places`: numbers of each group's nodes in the mesh. The first axis, of filters, has length 1.
         """
         groups = map(jnp.array, self.places)
         return tuple(Estimate(mean[nodes][None], covariance[nodes][None], self.claim) for nodes in groups)

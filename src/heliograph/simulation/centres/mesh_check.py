@@ -81,9 +81,10 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
 
 
 def find_claim_of_errors(name: str, fusion: Fusion, network: HasNodes) -> Claim:
-    """Return the claim of the joint covariance of all nodes' errors: "exact", weaker where laws or noises are bounds.
+    """Return the claim of the joint covariance of all nodes' errors.
 
-    `name`: of the fusion between neighbours `fusion` in the network.
+    It is "exact", or weaker if laws or noises are only bounds. `name`: the name of `fusion`, a fusion between
+    neighbours, in the network.
     """
     parts_by_node = {}
     for name_of_node in network.mesh_nodes(name):
@@ -97,10 +98,9 @@ def find_claim_of_errors(name: str, fusion: Fusion, network: HasNodes) -> Claim:
 def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """Return the claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance.
 
-    `name`: of the fusion between neighbours `fusion` in the network.
-
-    Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
-    sender by what it measured, limits by what they refuse, a quantizer by what it cannot send.
+    `name`: the name of `fusion`, a fusion between neighbours, in the network. The claim is weaker if laws are known
+    only up to a radius, if weights are frozen means over losses, or if data decide what arrives. Data decide if a
+    sender chooses by what it measured, limits refuse values, or a quantizer saturates.
     """
     claim_of_errors = find_claim_of_errors(name, fusion, network)
     nodes = [network.nodes[node] for node in network.mesh_nodes(name)]
@@ -232,7 +232,7 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
 
 
 def _measures_mode(node: object, vector: np.ndarray) -> bool:
-    """Return whether a node's own measurement shows the plant's mode of this eigenvector: H v is not 0, to RANK."""
+    """Return whether a node's measurement shows the plant's mode of this eigenvector v: whether |H v| exceeds RANK."""
     if not isinstance(node, Node):
         return False
     gain, _ = _get_gain_and_noise(node)
@@ -240,10 +240,11 @@ def _measures_mode(node: object, vector: np.ndarray) -> bool:
 
 
 def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tuple[list[str], list[str]]:
-    """Return the nodes for which nobody upstream observes some unstable mode of A, and those for some decaying mode.
+    """Return the nodes that do not see some unstable mode of A, and those that do not see some decaying mode.
 
-    Upstream of a node are itself and all whose messages can reach it. `squares`: H'H of each node (node, n, n). Nodes
-    that reach each other have the same nodes upstream, in one array `upstream`, which is checked once.
+    A node sees a mode if it, or a node whose messages can reach it (all called upstream), observes the mode.
+    `squares`: H'H of each node (node, n, n). Nodes that reach each other share one array `upstream`, which is checked
+    once.
     """
     without_unstable, without_decaying = [], []
     values = np.linalg.eigvals(a)
@@ -260,15 +261,15 @@ def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tu
 
 
 def _hides_modes(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> tuple[bool, bool]:
-    """Return whether outputs hide a mode of A that does not decay, and whether they hide one that does.
+    """Return whether outputs hide a mode of A that does not decay, and whether they hide one that decays.
 
-    `values`: eigenvalues of A; from 1 - MODE on one does not decay. `square`: sum of H'H over the outputs' gains, which
-    hides what all of them hide. RANK: the singular value below which one counts as 0.
+    `values`: eigenvalues of A. A mode with |value| >= 1 - MODE does not decay. `square`: the sum of H'H over the
+    outputs; it hides a mode that all of them hide. RANK: a singular value below it counts as 0.
     """
     size = np.linalg.norm(a, 2) or 1.0
     hides_unstable = hides_decaying = False
     for value in values:
-        # Of lower rank, so that its smallest singular value is 0, where outputs hide the mode (test of Hautus).
+        # Test of Hautus: outputs hide the mode if this matrix loses rank, so that its smallest singular value is 0.
         pencil = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
         if np.linalg.svd(pencil, compute_uv=False)[-1] < RANK:
             is_unstable = abs(value) >= 1 - MODE
@@ -284,19 +285,20 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
 
 
 def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Return H, the mean matrix from state to what a node receives, and R, its noise's covariance at zero signal."""
+    """Return the mean matrix H from the state to what a node receives, and the noise covariance R at a signal of 0."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
-    # The channel's noise: the last entry of the covariance of gains and offset, which a signal of 0 leaves.
+    # `center` is the covariance of (gains, offset). At a signal of 0 only the offset's entry, the last, makes noise.
     gain = np.asarray(channel.mean_gain)
     noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
     return gain @ np.asarray(sensor.matrix), noise
 
 
 def _check_noise_is_regular(where: str, noise: np.ndarray) -> None:
-    """Raise ValueError for a measurement without noise in some direction: its information is infinite.
+    """Raise ValueError for a measurement without noise in some direction, whose information would be infinite.
 
-    `where`: the node, for errors. `noise`: the covariance R, judged as correlations; RANK: what counts as 0 of these.
+    `where`: the node's name in the error. `noise`: the covariance R. Its correlation matrix must have no eigenvalue
+    below RANK.
     """
     deviation = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
     has_zero = np.any(deviation == 0)
@@ -331,9 +333,10 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
 
 
 def _measures_alike_at_each_step(node: Node) -> bool:
-    """Return whether a node's measurement has one law at every step, and its noise does not grow with the signal.
+    """Return whether a node's measurement has one law at every step, with noise that does not grow with the signal.
 
-    It would if the channel's gains were random: if the covariance of gains and offset were not 0 in the gains' part.
+    Noise grows with the signal if the channel's gains are random: if the gains' part of `center`, the covariance of
+    (gains, offset), is not 0.
     """
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False

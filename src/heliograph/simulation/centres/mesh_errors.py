@@ -88,7 +88,10 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
 
 @quickly_compiled
 def _draw_arrivals(edges: MeshEdges, key: jax.Array, steps: np.ndarray) -> jax.Array:
-    """Draw what arrives at these steps (step, node, rounds, degree), by the edges alone: one program for all rules."""
+    """Draw what arrives at these steps, as flags (step, node, rounds, degree).
+
+    It depends on the edges alone, so that one compiled program serves all rules.
+    """
 
     def draw_step(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         """Draw what arrives at step k: next states of the channels, and flags (node, rounds, degree)."""
@@ -181,9 +184,9 @@ def _compute_step_when_all_is_measured(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
-    """Return all of step k that does not depend on the estimates, such as gains, with all components measured.
+    """Return the parts of step k that do not depend on the estimates, such as gains, if no measurement is missing.
 
-    Arguments as of `Mesh.compute_step_without_estimates`.
+    The arguments are those of `Mesh.compute_step_without_estimates`.
     """
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, arrived, u, k)
@@ -256,13 +259,13 @@ def best_possible(
 
 
 def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshStep]) -> list[np.ndarray]:
-    """Return for each step the information (node, n, n) in those of its measurements that reach each node by the end.
+    """Return for each step the information (node, n, n) of those of its measurements that reach each node by the end.
 
-    `flags`: what arrives (step, node, rounds, degree). `steps`: with the information in each node's measurements.
+    `flags`: what arrives (step, node, rounds, degree). `steps`: each has the information of each node's measurement.
     """
     count = len(mesh.nodes)
-    # From the last step back: the more exchanges follow, the more nodes' measurements can have come. `reaches`: sparse
-    # (node, node), a one where the data of the column's node reach the row's.
+    # Go from the last step back, since a step's measurements pass through all later exchanges. `reaches` is sparse
+    # (node, node), with a one where data of the column's node reach the row's node by the end.
     reaches: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
     information: list[np.ndarray] = []
     for step, arrived in zip(reversed(steps), reversed(flags), strict=True):
@@ -275,24 +278,24 @@ def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshSt
 
 @quickly_compiled
 def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
-    """Return a step at which everything arrives, for the models of plant and measurements in it, not for its gains.
+    """Return a step at which everything arrives. Only its models of plant and measurements are of use, not its gains.
 
-    `covariance` (node, n, n): any regular one. Others as of `Mesh.compute_step_without_estimates`.
+    `covariance` (node, n, n): any regular one. The other arguments are those of `Mesh.compute_step_without_estimates`.
     """
     all_arrive = mesh.edges.lossless()
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
-    if mesh.needs_joint:  # any blocks do, since they matter to gains alone
+    if mesh.needs_joint:  # zeros will do, since the blocks matter to the gains alone
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
         blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
     return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, all_arrive, u, k)
 
 
 def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
-    """Return whose data each node has if one more exchange, before all others, is counted.
+    """Return which nodes' data reach which node, with one more exchange put before those already counted.
 
-    `known`: sparse (node, node), a one where the data of the column's node reach the row's. `present`: which messages
-    arrive in that exchange (node, degree).
+    `known`: sparse (node, node), a one where data of the column's node reach the row's node. `present`: which messages
+    arrive in the new exchange (node, degree).
     """
     receiver, neighbour_index = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
@@ -345,9 +348,9 @@ def freeze(
 
 
 def find_mesh(network: Network, fusion: str) -> Mesh:
-    """Return the fusion of this name between neighbours, ready to be stepped; raise ValueError where there is none.
+    """Return the fusion of this name between neighbours, ready to be stepped; raise ValueError if there is none.
 
-    It raises also for one of over 2,000 nodes (SPARSE), whose joint covariance would not fit in memory.
+    It also raises for more than SPARSE (2,000) nodes, whose joint covariance would not fit in memory.
     """
     instance("network", network, Network, "a Network").check_sends_each_step(
         "errors between neighbours before any data"
@@ -361,7 +364,7 @@ def find_mesh(network: Network, fusion: str) -> Mesh:
 
 
 def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
-    """Return flags of what arrives at each step, of neighbours alone; raise where `arrived` does not fit the mesh.
+    """Return flags of what arrives at each step, from real neighbours only; raise ValueError if `arrived` does not fit.
 
     `arrived`: flags of this shape, or a number of steps at which everything arrives.
     """

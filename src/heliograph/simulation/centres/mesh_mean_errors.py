@@ -118,7 +118,7 @@ def mean_mesh_errors(
 
 
 def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
-    """Return all patterns of which messages may reach a node in a step, and the mesh with a row for each of them."""
+    """Return all patterns of arriving messages that a node can have in a step, and the mesh with a row for each."""
     graph = graph_of(fusion.neighbours or {}, mesh.nodes)
     links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
@@ -127,9 +127,9 @@ def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
 
 
 def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
-    """Return the mesh with a row for each pattern of each node in place of one for each node.
+    """Return the mesh with one row for each pattern of each node, instead of one row for each node.
 
-    A pattern: which messages reach the node. `rule`: placed on the nodes, which are the last axis of its arrays.
+    A pattern says which messages reach the node. `rule`: the fusion rule, with nodes as the last axis of its arrays.
     """
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
     bucket = NodeBucket(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
@@ -141,14 +141,14 @@ def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: Arrival
 def _compute_gains_by_pattern(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
-    """Return the gains of each pattern, with a leading axis of patterns: weights for what arrives in it.
+    """Return the gains for what arrives in each pattern, with a leading axis of patterns.
 
     Args:
         rows: the mesh, with a row for each pattern.
-        covariance: by which the nodes' estimates are weighed before the step (node, n, n).
+        covariance: covariances of the nodes' estimates before the step (node, n, n), which set the weights.
         blocks: of J, the joint covariance of all errors, at each node's neighbours (node, degree, n, degree, n).
         patterns: what arrives.
-        step: at which everything arrives, for the models and the measurements' information.
+        step: a step at which everything arrives; its models and its measurements' information are used.
     """
     information = rows.sum_over_messages(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]

@@ -104,11 +104,11 @@ class MeshStep(NamedTuple):
 
 
 def compute_information(observation: JointObservation, measured: Bool[jax.Array, "node m"]) -> MeasurementInformation:
-    """Return the information H' R^-1 H in each node's measurement: in what was measured, and as if nothing was missing.
+    """Return the information H' R^-1 H of each node's measurement: of the components that came, and of all components.
 
-    `observation`: gain H and noise covariance R of each node; `measured`: which components came.
+    `observation`: gain H and noise covariance R of each node. `measured`: which components came.
     """
-    # Rows of zeros without noise only pad a measurement: they are no numbers of it.
+    # A row of zeros without noise only pads a shorter measurement, so it is not counted as a number.
     is_number = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
     gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
     weighted, information = jax.vmap(information_of)(gain, noise, is_number & measured)
@@ -122,9 +122,10 @@ def weigh_measurements(
     present: Bool[jax.Array, "node m"],
     common: Float[jax.Array, " n"],
 ) -> Float[jax.Array, "node n"]:
-    """Return H_j' R_j^-1 (z_j - offset_j - H_j m) of each node's measurement z_j, m = `common`; what is missing adds 0.
+    """Return H_j' R_j^-1 (z_j - offset_j - H_j m) for each node's measurement z_j; missing components add 0.
 
-    H_j, R_j: gain and noise covariance of node j; `present`: which components of z_j came.
+    H_j, R_j: gain and noise covariance of node j. m: `common`, one point for all nodes. `present`: which components of
+    z_j came.
     """
     observation = data.observation
     innovation = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
@@ -132,10 +133,10 @@ def weigh_measurements(
 
 
 def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEstimates:
-    """Return what nodes received, with covariances that hold where neighbours send on events alone.
+    """Return the received estimates with covariances that hold if neighbours send only on events.
 
-    What a neighbour sent last errs by more than its estimate of covariance P: by (1 + sqrt(alpha n))^2 P at most, see
-    `find_event_senders`. A node's own estimate, the first, is as it is.
+    A neighbour's last message may be off by more than the covariance P of its estimate, but by at most
+    (1 + sqrt(alpha n))^2 P (see `find_event_senders`). A node's own estimate, in place 0, stays as it is.
 
     Args:
         received: estimates, with a leading axis of nodes.
@@ -159,7 +160,7 @@ def pull_to_neighbours(
         front: a matrix for each node.
         parts: a matrix for each message, or its diagonal alone.
         mean: the nodes' own estimates.
-        received: the estimates that each node received, in place 0 its own, which adds nothing.
+        received: the estimates that each node received. Place 0 is its own estimate, which adds nothing.
     """
     difference = (received - mean[:, None]).at[:, 0].set(0.0)
     is_matrix = parts.ndim == 4

@@ -62,11 +62,15 @@ def find_filter_by_name(network: Network, name: str, node: str | None = None) ->
 
 
 def _find_at_centre(network: Network, name: str) -> NamedFilter:
-    """Return the filter of this name at the centre: a central filter, or the one of a fusion by reports."""
+    """Return the filter of this name at the centre: a central filter, or the filter of a fusion by reports.
+
+    Raises:
+        ValueError: a fusion that weighs finished estimates, which has no filter of what arrives.
+    """
     fused = network.fused[name]
     if isinstance(fused, AbstractFilter):
         names = [f"{node}_{number}" for node in network.names for number in network.nodes[node].received_names]
-        # A central filter receives the numbers of all nodes, or none at all.
+        # A central filter receives the numbers of all nodes, or no numbers (fused.received is 0).
         return NamedFilter(FUSED, fused, tuple(names[: fused.received]))
     if not fused.rule.uses_reports:
         rule = type(fused.rule).__name__
@@ -77,7 +81,10 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
 
 
 def _name_reports(network: Network, fusion: Fusion) -> list[str]:
-    """Return names of the reports' numbers, as NODE_STATE, in the order in which the centre's filter receives them."""
+    """Return the names of the reports' numbers, as NODE_STATE, in the order in which the centre's filter receives them.
+
+    A number of a report that comes AGE steps late has the suffix _AGE_late.
+    """
     nodes = network.nodes_with(fusion.filter)
     uplinks = build_uplinks(fusion, nodes, len(network.states))
     names = []
@@ -92,7 +99,8 @@ def _name_reports(network: Network, fusion: Fusion) -> list[str]:
 def _find_between_neighbours(network: Network, name: str, node: str) -> NamedFilter:
     """Return the filter of one node of the fusion `name` between neighbours, which receives their messages.
 
-    Of each it receives mean, covariance (row after row) and measurement, named NEIGHBOUR_mean_STATE and so on.
+    A message has the neighbour's mean, its covariance (row after row) and its measurement. The numbers are named
+    NEIGHBOUR_mean_STATE, NEIGHBOUR_covariance_STATE_STATE and NEIGHBOUR_NUMBER.
     """
     names = list(network.nodes[node].received_names)
     for sender in (network.meshes[name].neighbours or {})[node]:

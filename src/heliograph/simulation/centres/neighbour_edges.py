@@ -54,9 +54,9 @@ class MeshEdges(Module):
     past: int = eqx.field(static=True, default=0)
 
     def init(self, key: jax.Array) -> tuple[PyTree, ...]:
-        """Return the states of the edges' channels before the first step of the run with this key.
+        """Return the initial states of the edges' channels for the run with this key, one for each group of channels.
 
-        One for each group, a stack of channels of one structure.
+        A group is a stack of channels of one structure.
         """
 
         def start_group(group: ChannelGroup) -> PyTree:
@@ -102,10 +102,10 @@ class MeshEdges(Module):
         def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
             """Return the next state of one edge's channel, and what arrives of a message sent over it at step k.
 
-            A flag, or its age in steps (-1: nothing) where messages may be late. `count`: number of the exchange, by
-            which with `key` it is drawn.
+            What arrives is a flag or, if messages may be late, the message's age in steps (-1 if nothing arrives).
+            `count`: the number of the exchange. With `key` it determines the random draw.
             """
-            # What is sent does not matter: lost numbers are NaN, and a time stamp is the last number.
+            # Send zeros, since only arrival matters here: lost numbers are NaN, and a time stamp is the last number.
             channel = at(edge.channel, k)
             state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
                                       edge.checksums, edge.memories)  # fmt: skip
@@ -115,7 +115,7 @@ class MeshEdges(Module):
             age: jax.Array | int = 0
             if delay is not None:
                 age = z[-1].astype(int) if delay.timestamped else delay.times[0]
-            # Nothing was sent before the first step.
+            # A message cannot be older than the run: nothing was sent before the first step.
             return state, jnp.where(arrives & (age <= count), age, -1)
 
         deliver_all = eqx.filter_vmap(deliver_once, in_axes=(eqx.if_array(0), 0, None))
@@ -123,9 +123,10 @@ class MeshEdges(Module):
         return after, arrives
 
     def lossless(self) -> Bool[np.ndarray, "node rounds degree"] | Int[np.ndarray, "node rounds degree"]:
-        """Return the flags of a step at which everything arrives at once: whether there is a neighbour.
+        """Return what arrives at a step without losses and delays, (node, rounds, degree).
 
-        Where messages may be late they are ages: 0 of a neighbour, -1 where there is none.
+        The entries are flags: True where there is a neighbour. If messages may be late (`self.past` > 0), they are
+        ages: 0 where there is a neighbour, -1 where there is none.
         """
         xp = library(self.present)  # NumPy outside a trace, JAX inside
         flags = xp.where(self.present, 0, -1) if self.past else self.present
@@ -165,9 +166,12 @@ class MeshEdges(Module):
     def _read_ages(
         self, node: str, report: SentReports | ArrayLike, steps: int, neighbours: int
     ) -> Int[np.ndarray, "steps rounds neighbours"]:
-        """Return the ages in steps of the messages that a node received, -1 where none arrived, from its report.
+        """Return the ages in steps of the messages that a node received, from its report; -1 means that none arrived.
 
-        Raises ValueError for an age above `past`, the most by which a message may be late. `neighbours`: of this node.
+        `neighbours`: number of the node's neighbours. `self.past`: the most steps by which a message may be late.
+
+        Raises:
+            ValueError: an age that is no whole number from 0 to `self.past`.
         """
         numbers = report.values if isinstance(report, SentReports) else report
         values = array(f"reports of node {node!r}", numbers, (steps, self.rounds * neighbours), missing=True)
@@ -182,7 +186,7 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
     """Build the edges of a fusion between neighbours.
 
     Raises:
-        ValueError: links of other edges, links that do more to a message than lose it, or of which nobody knows.
+        ValueError: links of edges that do not exist, links that change messages, or unknown losses or delays.
     """
     if fusion.link is None:
         return MeshEdges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
@@ -191,16 +195,16 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
     distinct = {id(channel): (name, channel) for name, channel in links.items()}
     for name, channel in distinct.values():
         check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
-    # Places of the edges in the flattened (node, degree), without place 0, the node itself.
+    # Places of the edges in the flattened (node, degree). Place 0 of each node is the node itself, and no edge.
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
     past = max(first(channel).past for channel in links.values())
     return MeshEdges(group_channels(links), slots, graph.present, fusion.rounds, past)
 
 
 def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
-    """Return the link of each edge, a pair of neighbours, by its name "SENDER to RECEIVER", receiver after receiver.
+    """Return the link of each edge by the edge's name "SENDER to RECEIVER", receiver after receiver.
 
-    `link`: one for all edges, or a link for each by this name.
+    An edge is a pair of neighbours. `link`: one link for all edges, or a link for each name.
     """
     names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
     title, label = "links between neighbours", "edge SENDER to RECEIVER"
@@ -208,14 +212,14 @@ def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[s
 
 
 def check_edge(what: str, link: Channel) -> None:
-    """Raise ValueError for a link that changes a message, or whose losses or delays its receiver does not know of."""
+    """Raise ValueError if a link changes its messages, or if the receiver does not know of its losses or delays."""
     instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for step in unstack(link):
-        # Delays that are the same for all, or stamped on the message.
+        # The receiver knows a delay that is the same for all messages, or is stamped on the message.
         delay = find_delay(step)
         if delay is not None and not (delay.constant or delay.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
-        # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
+        # What is left inside losses and delays, and inside the losses of each mode, must change nothing.
         _, inside = _split_losses_from_link(step, Erasure | DelayedLink)
         for mode_link in inside.maps if isinstance(inside, Modes) else [inside]:
             _, mode = _split_losses_from_link(mode_link)
@@ -233,7 +237,10 @@ def find_delay(channel: AbstractRandomAffine) -> DelayedLink | None:
 def _split_losses_from_link(
     channel: AbstractRandomAffine, kinds: type | UnionType = Erasure
 ) -> tuple[Scalar, AbstractRandomAffine]:
-    """Return the probability that a message passes all outer maps of these kinds (losses), and the map inside them."""
+    """Return the probability that a message passes all outer losses, and the map inside the outer maps.
+
+    `kinds`: the types of the outer maps to take off. Only erasures among them lose messages.
+    """
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
         arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival
@@ -242,9 +249,10 @@ def _split_losses_from_link(
 
 
 def find_arrival_probability(channel: Channel | None) -> float | None:
-    """Return the probability that a message arrives: 1 without a channel (None).
+    """Return the probability that a message arrives, or None if there is no one probability.
 
-    None where it differs between steps, or depends on earlier ones: the channel then erases inside, by its modes.
+    It is 1 without a channel (`channel` is None). It is None if the probability differs between steps, or depends on
+    earlier steps through the modes of the channel.
     """
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
@@ -255,8 +263,9 @@ def find_arrival_probability(channel: Channel | None) -> float | None:
 def find_loss_decay(channel: Channel | None) -> float | None:
     """Return the factor by which each further loss in a row is less probable, in the long run.
 
-    Of modes with loss probabilities l and transitions P it is the spectral radius of diag(l) P; without modes the
-    probability of a loss. None where the channel varies, or shares its modes with other edges.
+    Without modes it is the probability of a loss. With modes it is the spectral radius of diag(l) P, where l are the
+    modes' loss probabilities and P their transitions. It is 0 without a channel (None), and the result is None if the
+    channel varies over time or shares its modes with other edges.
     """
     if channel is None or isinstance(channel, OverTime):
         return 0.0 if channel is None else None
@@ -272,9 +281,13 @@ def find_loss_decay(channel: Channel | None) -> float | None:
 
 
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
-    """Return whether a channel delivers exactly what is sent: a gain of I, without offset, noise or random gains."""
+    """Return whether a channel delivers exactly what is sent: gain I, no offset, no noise and no random gains.
+
+    `center`: the covariance of (gains, offset), which is 0 without noise and random gains.
+    """
     if channel.inputs != channel.outputs:
         return False
     moments = second_order(channel.condition_on_arrival())
     is_identity = np.array_equal(moments.mean_gain, np.eye(channel.inputs)) and not np.any(moments.offset)
-    return is_identity and not np.any(moments.nominal.center)
+    has_noise = np.any(moments.nominal.center)
+    return is_identity and not has_noise

@@ -72,7 +72,7 @@ class NodeFilter(AbstractSizedFilter):
         """Return the state before the first step: the plant's initial law, and no message on the way."""
         start = self.mesh.init()
         n, count = start.mean.shape[1], len(self.measured)
-        # The state of a mesh of the node and its neighbours; the first axis of `way`, ages, is empty.
+        # The mesh has the node and its neighbours. The first axis of the messages, by age, is empty: none is late.
         no_messages = MessagesOnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n)))
         state = start._replace(way=no_messages)
         return NodeState(state, jnp.zeros(len(self.inputs)), state)
@@ -114,15 +114,16 @@ class NodeFilter(AbstractSizedFilter):
         return message if self.quantizer is None else _quantize_message(self.quantizer, *message)
 
     def _split_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
-        """Return the measurements in z of the node and its neighbours, and `before` with their estimates in z too.
+        """Return the measurements of the node and its neighbours in z, and `before` with the estimates in z.
 
-        Rows of these: the node's own, then its neighbours'. `measurement`: how many numbers each measures. Where no
-        message came, the mean is NaN, and the covariance any regular one: the node's own.
+        The first row is the node's, and the next rows are its neighbours'. `self.measured`: how many numbers each of
+        them measures. If a neighbour's message did not come, its mean is NaN, and its covariance is the node's own,
+        since any regular one will do.
         """
         n, begin = len(self.states), self.measured[0]  # where the next neighbour's numbers begin in z
         measurements = [z[:begin]]  # the node's own first
         means, covariances = [before.mean[0]], [before.covariance[0]]
-        # Of each neighbour mean (n), covariance (n n) and measurement (size).
+        # Each neighbour's numbers in z: mean (n), covariance (n n) and measurement (size).
         for size in self.measured[1:]:
             mean, covariance, measurement = jnp.split(z[begin : begin + n + n * n + size], [n, n + n * n])
             begin += n + n * n + size
@@ -135,7 +136,7 @@ class NodeFilter(AbstractSizedFilter):
     def _step_from(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         """Return the state after step k from `before` with z, the node's measurement and its neighbours' messages."""
         measurements, state_with_messages = self._split_measurements(z, before)
-        # What did not come is NaN, so that all is said to arrive.
+        # All messages are flagged as arrived, since NaN already marks those that did not come.
         everything = jnp.ones((1, 1, len(measurements)), dtype=bool)
         after, _ = self.mesh.step(
             state_with_messages, [x[None] for x in measurements], everything, jnp.asarray(u), jnp.asarray(k)
@@ -219,25 +220,25 @@ def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
 
 
 def _check_can_filter_alone(what: str, network: Network, between: Fusion) -> None:
-    """Raise ValueError where a node of the fusion `between` neighbours cannot filter without knowing all others."""
+    """Raise ValueError if a node of the fusion `between` neighbours would have to know all other nodes to filter."""
     if between.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
                    type(between.rule).__name__)  # fmt: skip
     if between.rounds > 1 or between.alpha is not None:
         raise fail(what, "one exchange a step", "several rounds" if between.rounds > 1 else "events")
-    if "dt" in network.inputs:  # the length of a step: nodes need not have the same steps then
+    if "dt" in network.inputs:  # with the length of a step as an input, nodes could have different steps
         raise fail(what, "a plant whose time counts steps, which all nodes share", "the input 'dt'")
 
 
 def node_network(network: Network, node: str) -> Network:
-    """Return the network of one node of a fusion between neighbours: itself, and its neighbours as senders of messages.
+    """Return the network that one node of a fusion between neighbours sees: itself, and its neighbours as senders.
 
     Args:
         network: the whole network.
         node: name of the node.
 
     Raises:
-        ValueError: no network, not one fusion between neighbours, no node of it, one that cannot run by itself.
+        ValueError: no network, none or several fusions between neighbours, an unknown node, one that cannot run alone.
     """
     instance("network", network, Network, "a Network")
     if len(network.meshes) != 1:

@@ -49,14 +49,14 @@ class ObservationModel(Module):
 def _linearise_observation(
     sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
 ) -> JointObservation:
-    """Return M, o and Cov(z - M x) of z = G (C x + v) + n, G a random gain, for a plant with these moments.
+    """Return M, o and Cov(z - M x) of z = G (C x + v) + n with a random gain G, for a plant with these moments.
 
-    M = E[G] C and o = E[G] E v + E n; the covariance is that of noise through the mean gain, and of the gain's spread.
+    M = E[G] C and o = E[G] E v + E n. Cov(z - M x) = E[G] Cov(v) E[G]' + Cov((G - E G) y + n), with y = C x + v.
     `mean` and `covariance`: of the plant's state x.
     """
     matrix, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = matrix @ mean + sensor.noise.mean  # E y, y = C x + v
-    # E (y, 1)(y, 1)', of which the random gains and the channel's noise make noise of z: Cov((G - E G) y + n).
+    # E (y, 1)(y, 1)', from which `evaluate_center` computes Cov((G - E G) y + n).
     second = matrix @ covariance @ matrix.T + noise + jnp.outer(signal, signal)
     signal_moments = augmented_second_moment(second, signal, last=1.0)
     gain = jnp.asarray(channel.mean_gain)
@@ -84,8 +84,9 @@ class SeparateObservations(Module):
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
         """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments.
 
-        `groups`: the models of one structure, stacked; None of nodes without a sensor, whose models are zeros. `size`:
-        of the longest measurement, to which all are padded.
+        `self.groups`: the stacked models of each group of nodes, or None for nodes without a sensor, whose models are
+        zeros. `self.counts`: the number of nodes of each group. `self.size`: the length of the longest measurement, to
+        which all are padded. `self.order`: sorts the joined rows by node.
         """
         m, n = self.size, len(mean)
         models_by_group = []
@@ -110,13 +111,13 @@ class SharedObservation(Module):
     rows: np.ndarray
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
-        """Return gain (node, size, n) and offset of each node, and the noise's covariance (node, size, node, size).
+        """Return gain (node, size, n) and offset (node, size) of each node, and the noise's covariance of all.
 
-        `mean`, `covariance`: of the plant's state. `rows`: of each node, its rows of what the one channel of all
-        delivers, -1 where a shorter measurement is padded.
+        The covariance is (node, size, node, size). `mean` and `covariance`: of the plant's state. `self.rows` (node,
+        size): the rows of each node in what the shared channel delivers, -1 where a shorter measurement is padded.
         """
         gain, offset, noise = _linearise_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
-        # A last row of zeros, which index -1 takes.
+        # Add a last row of zeros, which index -1 takes.
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
         return JointObservation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])

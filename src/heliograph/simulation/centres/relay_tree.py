@@ -60,10 +60,10 @@ class RelayTree:
         return np.asarray(self.covariances[-1][0])
 
     def fused(self, estimates: ArrayLike) -> Float[np.ndarray, "... n"]:
-        """Return the root's estimate from those of the leaves, (..., node, n), for filters whose model is the world.
+        """Return the root's estimate (..., n) from the leaves' estimates (..., node, n) by filters of the true model.
 
         Raises:
-            ValueError: another number of estimates than of leaves; leading axes are free.
+            ValueError: the last two axes are not (number of leaves, n). Leading axes are free.
         """
         nodes, n, _ = self.covariances[0].shape  # of the lowest level, the leaves
         values = np.asarray(estimates, dtype=float)
@@ -221,9 +221,10 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
 
 
 def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
-    """Return the weights (relay, n, child, n) and the errors of the relays that fuse nodes with these errors.
+    """Return the weights (relay, n, child, n) of one level of relays, and the errors of their estimates.
 
-    Each relay fuses the next `degree` nodes, its children; the last may have fewer, whose weights are padded.
+    `errors`: the errors of the nodes below. Each relay fuses the next `degree` nodes, its children. The last relay may
+    have fewer, and its weights are padded with zeros.
     """
     groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
     outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
@@ -239,9 +240,9 @@ def _fuse_at_relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
 
 
 def _weigh_children(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Return the best weights (n, child, n) of the estimates of a relay's children, and the error of the weighted one.
+    """Return the best weights (n, child, n) of the estimates of a relay's children, and the fused error.
 
-    `children`: their errors, as sources that they share and independent parts.
+    `children`: the errors of their estimates, as sources that they share and independent parts.
     """
     children = ErrorSources(*map(jnp.asarray, children))
     weights = matrix_weights(children.joint())
@@ -264,7 +265,7 @@ def _take_rows(numbers: PyTree, rows: int | slice) -> PyTree:
 
 
 def _count_leaves(numbers: PyTree) -> int:
-    """Return how many nodes the arrays have along their leading axis; raise if they differ."""
+    """Return how many nodes the arrays have along their leading axis; raise ValueError if lengths differ or are 0."""
     lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in jax.tree.leaves(numbers)}
     if len(lengths) != 1 or lengths & {None, 0}:
         raise fail("numbers of the leaves", "arrays with one leading axis of nodes", sorted(map(str, lengths)))

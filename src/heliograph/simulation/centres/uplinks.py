@@ -166,9 +166,9 @@ class Uplinks(Module):
         return UplinkDraws(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _check_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
-        """Return the delays in steps of a node's reports (steps,); raise at one that its uplink to the centre lacks.
+        """Return the delays in steps of a node's reports (steps,); raise ValueError for an impossible delay.
 
-        `delay` (node, steps): probability of each delay.
+        `self.delay` (node, ages): the probability of each delay of the node's uplink.
         """
         delays: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
@@ -216,21 +216,22 @@ class Uplinks(Module):
         return state, jnp.where(saturated[:, None], jnp.inf, z), traffic
 
     def arrive(self, state: ReportsInTransit, sent: jax.Array, delay: Array) -> tuple[ReportsInTransit, jax.Array]:
-        """Return the next state, and what arrives now of this step's reports and earlier ones (age, node, m).
+        """Return the next state, and what arrives now of this report and of earlier ones, by age (age, node, m).
 
-        `sent` (node, m): values of this step's reports, which arrive `delay` (node,) steps later. NaN: nothing arrives.
+        `sent` (node, m): values of this step's reports, which arrive `delay` (node,) steps later. NaN means that
+        nothing arrives.
         """
         values = jnp.concatenate([sent[None], state.values])
         delays = jnp.concatenate([jnp.asarray(delay, dtype=state.delays.dtype)[None], state.delays])
-        is_due = delays == np.arange(len(values))[:, None]  # those whose age is their delay
+        is_due = delays == np.arange(len(values))[:, None]  # a report arrives when its age is its delay
         arriving = jnp.where(is_due[..., None], values, jnp.nan)
         return state._replace(values=values[:-1], delays=delays[:-1]), arriving
 
 
 def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draw the matrices [G n; 0 1] (channel, m + 1, n + 1) of a group's channels at step k, and delays in steps.
+    """Draw the matrices [G n; 0 1] (channel, m + 1, n + 1) of a group's channels at step k, and their delays in steps.
 
-    `delay` (channel, ages): probability of each delay in steps.
+    G: the gain. n: the offset with its noise. `delay` (channel, ages): the probability of each delay.
     """
 
     def draw_link(channel: Channel, source: jax.Array, probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -268,10 +269,10 @@ def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
 def _make_link_models(
     moments_by_node: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
-    """Return the centre's model of the uplinks, one for each step if any varies.
+    """Return the centre's model of the uplinks, or one for each step if any uplink varies.
 
-    `moments_by_node`: of each node's channel. `received`: how many numbers arrive of its report. `error` (node, n):
-    bound on what its quantizer changes.
+    `moments_by_node`: the moments of each node's channel. `received`: how many numbers arrive of each node's report.
+    `error` (node, n): a bound on the error of each node's quantizer.
     """
 
     def gather(*links: SecondOrder) -> ReportModel:
@@ -283,9 +284,9 @@ def _make_link_models(
 
 
 def _gather_link_moments(links: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
-    """Return the moments of all uplinks as arrays, padded with zeros where fewer numbers arrive of a node's report.
+    """Return the moments of all uplinks as arrays, padded with zeros where a node's report has fewer numbers.
 
-    `links`: moments of each node's channel at one step; else as `_make_link_models`.
+    `links`: the moments of each node's channel at one step. Other arguments are those of `_make_link_models`.
     """
     gains, offsets, spreads = [], [], []
     for link, size in zip(links, received, strict=True):

@@ -81,13 +81,13 @@ def examine_innovations(
 def _test_correlation(normalised: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
     """Return the correlation r_1 of innovations one message apart, and the p-value of r_1, ..., r_10 together.
 
-    r_l = sum_k u_k u_(k-l) / sum_k u_k^2. Without memory the sum over l of the squares, each in units of its variance,
-    is chi-squared. The variance is that of Ljung and Box where innovations are independent, else estimated.
+    r_l = sum_k u_k u_(k-l) / sum_k u_k^2. If innovations have no memory, the sum over l of r_l^2 / Var(r_l) is
+    chi-squared. Var(r_l) is that of Ljung and Box if innovations are independent, else it is estimated.
 
     Args:
-        normalised: innovations u in units of their claimed deviation, NaN where none is; of few rows fewer lags are
-            tested.
-        exact: whether innovations are independent if their claim is true.
+        normalised: innovations u in units of their claimed deviation, NaN where there is none. Fewer than 100 rows are
+            tested at fewer lags.
+        exact: True if innovations are independent when their claim is true.
     """
     rows, count = len(normalised), int(np.sum(~np.isnan(normalised)))
     lags = min(LAGS, rows // 10)  # LAGS: 10

@@ -183,10 +183,9 @@ def judge_declared_links(
     data: "Float[ArrayLike, 'steps received']",
     inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
 ) -> tuple[DeclaredJudgement, ...]:
-    """Judge what each link declares of its noise, as `judge_declared` does, with the others as they declare it.
+    """Judge what each link declares of its noise, as `judge_declared` does, while the other links are believed.
 
-    Of a filter that receives several nodes, one after another in their order; of a filter that is told no noise, and
-    of links of fewer than 20 rows with values, none.
+    They come in the order of the filter's nodes. A link of fewer than 20 rows with values has none.
 
     Args:
         filter: a filter.
@@ -244,9 +243,9 @@ class _DeclaredVariances(eqx.Module):
 def _compute_declared_variances(
     link_place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
 ) -> Float[np.ndarray, "steps outputs"]:
-    """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
+    """Return the variances that each row's message declares, NaN where one of its numbers is missing.
 
-    Typical numbers stand for missing ones meanwhile, so that the law has a variance for every row.
+    Typical numbers stand for missing ones in the computation, so that the law has a variance for every row.
     """
     numbers = z[:, link_place.numbers]
     complete = ~np.isnan(numbers).any(axis=1)[:, None]
@@ -368,7 +367,7 @@ def _make_judgement(
 
 
 def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
-    """Return lines on how large a bias is, if it matters (LEAST: 1.1), its memory in this unit, and what to do."""
+    """Return lines that say how large a bias is if its size matters, how long its memory is, and what to do."""
     lines = []
     if bias.times_white_low > np.sqrt(LEAST):
         is_bounded = bias.times_white < 2 * bias.times_white_low
@@ -382,7 +381,10 @@ def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
 
 
 def _describe_scale(declared_class: DeclaredClass, are_several: bool) -> list[str]:
-    """Return a line on how much too large or small the variances of a class of messages are; none if they are right."""
+    """Return a line on how much too large or small a class's declared variances are, or no line if they are right.
+
+    The line tells the class's range if there are several classes (`are_several`).
+    """
     if np.isnan(declared_class.scale) or (declared_class.scale_low < LEAST and declared_class.scale_high > 1 / LEAST):
         return []
     times, low, high, kind = declared_class.scale, declared_class.scale_low, declared_class.scale_high, "small"

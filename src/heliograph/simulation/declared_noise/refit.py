@@ -126,9 +126,13 @@ class LinkWithScaledNoise(eqx.Module):
     scales: Array
 
     def __call__(self, numbers: Array) -> AbstractRandomAffine:
-        """Return the link of these declared numbers, with its noise scaled."""
+        """Return the link of these declared numbers, with its noise scaled by the scale of the message's class.
+
+        `self.edges` are the borders of the classes, on the mean logarithm of the noise variances. `self.scales`: by
+        class.
+        """
         link = self.make(numbers)
-        # Class of the message: how many `edges` the mean logarithm of its variances is above.
+        # The class of the message is the number of edges below the mean logarithm of its variances.
         log_variance = jnp.mean(jnp.log(list_noise_variances(link)))
         class_number = jnp.sum(log_variance > jnp.asarray(self.edges))
         scale = jnp.asarray(self.scales)[class_number]
@@ -154,9 +158,9 @@ def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
 
 @in_float64
 def _declares_noise(affine: ToldMap) -> bool:
-    """Return whether a map takes its Gaussian noise from the number it is told: another number gives another noise.
+    """Return whether a map's noise is Gaussian and changes with the number that the map is told.
 
-    ALMOST: by which part of itself the number is changed. A map that is told its gain declares no noise.
+    The number is changed by the part ALMOST of itself to see this. A map that is told its gain declares no noise.
     """
     if isinstance(affine.make, ToldGainHop):
         return False
@@ -247,13 +251,13 @@ def refit_scales(declared: DeclaredRows) -> Refit:
 
 
 def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
-    """Return the scales, and the deviation and memory of a bias of each output, that fit best, as logarithms.
+    """Return the best scales together with the best deviation and memory of a bias of each output, as logarithms.
 
-    `scales`: the best without a bias, from which the search begins, once for each memory of TIMES in steps.
+    `scales`: the best scales without a bias. The search begins from them, once for each memory of TIMES (in steps).
     """
     time_step = find_median_step(declared)
     start_scales = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
-    # Behind the scales: the bias's deviation over the root of its memory, and its memory.
+    # After the scales come two logarithms: the bias's deviation over the root of its memory, and its memory.
     log_deviation = (np.mean(scales.logs) - np.log(time_step)) / 2
     starts = [np.append(start_scales, [log_deviation, np.log(memory * time_step)]) for memory in TIMES]
     refits = [_maximise_likelihood(declared, start) for start in starts]
@@ -280,10 +284,10 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
     constrained = best
 
     def compute_excess_fall(distance: float) -> float:
-        """Return by how much the log-likelihood falls at this distance from the maximum, less REACH, 1.92 nats.
+        """Return by how much the log-likelihood falls at this distance from the maximum, minus REACH (1.92 nats).
 
-        The distance is one of the logarithm with index `number`, upwards for `sign` 1; all others are at their best.
-        Closed over: `best`, the maximum; `declared`, the filter and its recording.
+        The distance is along logarithm number `number`, upwards if `sign` is 1 and downwards if it is -1. All other
+        logarithms are at their best. From outside: `best`, the maximum, and `declared`, the filter and its recording.
         """
         nonlocal constrained  # each search starts from the last one's result
         start = constrained.logs.copy()

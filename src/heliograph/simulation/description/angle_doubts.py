@@ -25,10 +25,11 @@ REMEDY = "on the circle that is no Gaussian any more: start from an angle that d
 
 
 def find_largest_usable_deviation(filter: AbstractFilter) -> float:
-    """Return the deviation of an angle up to which a filter can take it for a Gaussian, in radians.
+    """Return the largest standard deviation of an angle, in radians, at which a filter can treat the angle as Gaussian.
 
-    No more than WIDE, 1 rad; and the points of a cubature or unscented filter, sqrt(c) deviations from the mean, may
-    not lie beyond half a turn, where they are taken for points of the other side. c: n states, or alpha^2 (n + kappa).
+    It is WIDE (1 rad) at most. A cubature or unscented filter has points at sqrt(c) deviations from the mean, with c =
+    n (the number of states) or alpha^2 (n + kappa). These must stay within half a turn, since a point beyond it counts
+    as one on the other side.
     """
     inner = getattr(filter, "base", filter)
     transform, n = getattr(inner, "transform", None), len(filter.states)
@@ -43,7 +44,7 @@ def find_largest_usable_deviation(filter: AbstractFilter) -> float:
 
 
 def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
-    """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
+    """Yield a line for each angle whose standard deviation at the start is larger than the filter can use."""
     nodes_by_angle: dict[tuple[str, str, float], list[str]] = {}
     for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(filter.estimate(filter.init()).covariance)
@@ -57,7 +58,7 @@ def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each filter that knew an angle less well in some row than it can use."""
+    """Yield a line for each filter and angle whose standard deviation was in some row too large for the filter."""
     for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(record.estimates[node][label].covariance)
         for name, deviation in _yield_deviations(network, filter, covariance):
@@ -95,9 +96,9 @@ class WideAngles:
         self._largest_usable = find_largest_usable_deviation(filter) if self.states else np.inf
 
     def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each received angle that is beyond a full turn (TURN) for the first time.
+        """Return a row and a line for each received angle that first goes beyond a full turn (TURN) in these values.
 
-        `received`: names of the angles of which nothing was said yet, by component; one that is said is taken out.
+        `self.received`: {component: name} of the angles without such a line so far. An angle with a line is taken out.
         """
         doubts = []
         for i in list(self.received):
@@ -107,9 +108,9 @@ class WideAngles:
         return doubts
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each angle that is known too badly (variance over the usable) for the first time.
+        """Return a row and a line for each angle whose variance first exceeds what the filter can use in these rows.
 
-        `states`: names of the angles of which nothing was said yet, by state; one that is said is taken out.
+        `self.states`: {state number: name} of the angles without such a line so far. An angle with a line is taken out.
         """
         doubts = []
         for i in list(self.states):
@@ -121,7 +122,7 @@ class WideAngles:
 
 
 def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
-    """Yield (node, name, filter) of the filters that have angles."""
+    """Yield (node, name, filter) of each filter that has angles; the node of central filters is FUSED."""
     if not first(network.plant).circular:
         return
     for node, network_node in network.nodes.items():
@@ -136,7 +137,9 @@ def _yield_deviations(
 ) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
     """Yield the name and the standard deviation (radians) of each angle of a filter that claims this covariance."""
     used = filter.angles_used()
-    for i in () if used is None or filter.claim == "none" else used.states:
+    if used is None or filter.claim == "none":
+        return
+    for i in used.states:
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
 
 

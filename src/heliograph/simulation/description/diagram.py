@@ -52,7 +52,7 @@ def list_diagram_lines(network: HasNodes) -> list[DiagramLine]:
 
 
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
-    """Return the claim of each estimate by node and filter, with the models of the filter that are not the node's."""
+    """Return the claim of each estimate by node and filter, and which of its models differ from the node's own."""
     words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
     for belief in yield_mistaken_beliefs(network):
         words[belief.node][belief.filter] += f", believes {belief.another}"
@@ -60,9 +60,10 @@ def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
 
 
 def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
-    """Return in words what a node receives, through which hops, and its filters with their `claims` by name.
+    """Return in words what a node receives, over which hops, and its filters with their claims.
 
-    It receives its own sensor's signal, rows of the channel that all nodes share (`common`), or what relays send.
+    A node receives its own sensor's signal, rows of a channel that all nodes share (`network.common`), or what relays
+    send. `claims`: by name of the filter.
     """
     node = network.nodes[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
@@ -86,7 +87,7 @@ def list_shared_in_words(network: HasNodes) -> list[str]:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
     channels = {name: node.channel for name, node in network.nodes.items() if isinstance(node, Node)}
     numbers_of = number_memory_seeds(channels)
-    # Nodes of each memory, and its name, by the number that memories have in common where they are one.
+    # Nodes that have each memory, and the memory's name, by number. Equal memories have equal numbers.
     nodes: dict[int, list[str]] = {}
     names: dict[int, str] = {}
     for name, channel in channels.items():
@@ -97,7 +98,7 @@ def list_shared_in_words(network: HasNodes) -> list[str]:
 
 
 def list_rounded_numbers(network: HasNodes) -> list[str]:
-    """Return lines on which numbers of the models were rounded to single precision, with the parts that hold them."""
+    """Return lines on numbers of the models that were rounded to single precision, and the parts that hold them."""
     return [
         f"rounded to single precision before they came in: {describe_rounded(rounded)} ({join_names(names)})"
         for rounded, names in find_rounded_parts(network).items()
@@ -110,7 +111,7 @@ def write_diagram(network: HasNodes) -> str:
 
 
 def write_short_diagram(network: HasNodes) -> str:
-    """Return the diagram cut to LINES lines, and to the length of line that any object has; … stands for the rest."""
+    """Return the diagram cut to LINES lines, each cut to the usual length; … stands for what is left out."""
     lines = _format_lines(network)
     if len(lines) > LINES:
         hidden = len(lines) - (LINES - 1)
@@ -141,9 +142,9 @@ def write_html_table(network: HasNodes) -> str:
 
 
 def link_in_words(channel: Channel) -> str:
-    """Return a channel in words, such as "Rician hop → hop of gain 1.1, 10% lost"; `direct` where z = y.
+    """Return a channel in words, such as "Rician hop → hop of gain 1.1, 10% lost"; DIRECT if it delivers z = y.
 
-    One that JAX traces has no numbers to be told, but its class.
+    A channel that JAX traces has no known numbers, so only its class is named.
     """
     if isinstance(channel, OverTime):
         return f"varying over time, at first {link_in_words(first(channel))}"

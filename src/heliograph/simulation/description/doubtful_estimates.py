@@ -27,7 +27,7 @@ APART = 10.0  # deviations between two limits, from which the other one changes 
 
 
 def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
-    """Return a line for each estimate that ends where no sensor shows it, or that lies at a limit in most rows.
+    """Return a line for each estimate that ends with states no sensor shows, or that lies at a limit in most rows.
 
     Args:
         network: the network.
@@ -79,15 +79,15 @@ def _doubt_unseen_states(network: Network, record: Record) -> Iterator[str]:
 def _find_unseen_states(
     view: "_FilterView", means: Float[np.ndarray, "time n"], covariances: Float[np.ndarray, "time n n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which states outputs depend on at the start, but neither at the last estimate nor LAST rows before it.
+    """Return which states the outputs show at the start, but neither at the last estimate nor LAST rows earlier.
 
-    `view`: how a filter sees plant and sensors; it depends on the estimate where these are not linear.
+    `view`: how a filter sees plant and sensors. What it shows depends on the estimate if these are not linear.
     """
     plant = view.plant
     initial = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
     last = means[-1], covariances[-1]
     earlier = means[-1 - LAST], covariances[-1 - LAST]
-    # Over one step first, which is cheap: hardly any recording ends so.
+    # Look over one step first. It is cheap, and settles most recordings: few states are lost from sight.
     if not np.any(view.find_shown(*initial, steps=1) & ~view.find_shown(*last, steps=1)):
         return np.zeros(len(plant.states), dtype=bool)
     steps = len(plant.states)
@@ -121,7 +121,7 @@ def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
 
 
 def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
-    """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
+    """Yield (node, name, filter, sensors whose signals it receives) for every filter that claims a covariance."""
     all_sensors = list_sensors(network)
     for name, node in network.nodes.items():
         sensors = [node.sensor] if isinstance(node, Node) else all_sensors  # others hear what several nodes send
@@ -149,9 +149,9 @@ class _FilterView(NamedTuple):
     ) -> Bool[np.ndarray, " n"]:
         """Return which states change an output within some steps, for a filter with this mean and covariance.
 
-        Of a filter that takes tangents (`self.tangent`) those whose column of the observability matrix is not zero. Of
-        one that takes points also those for which outputs differ at mean +- sqrt(n) deviations, where `Cubature` has
-        its points if states are not correlated.
+        A filter that linearises (`self.tangent` is True) sees a state if its column of the observability matrix is not
+        zero. A filter that takes points also sees a state if outputs differ between mean + sqrt(n) deviations and mean
+        - sqrt(n) deviations of it. `Cubature` has its points there if states are not correlated.
         """
         by_tangent = np.any(make_observability_matrix(self.plant, self.sensors, mean, steps) != 0, axis=0)
         if self.tangent or np.all(by_tangent):

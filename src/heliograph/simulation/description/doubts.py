@@ -90,13 +90,13 @@ def doubts_before_data(network: Network) -> list[Doubt]:
 
 
 def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
-    """Yield how often a node's words of few bits will be overloaded: values beyond their range, expected before data.
+    """Yield how often a node's words of few bits are expected to be overloaded by values beyond their range.
 
-    A doubt is serious (True) where the bound on that probability is above SEEN.
+    A doubt is serious if the bound on this probability is above SEEN.
     """
     for name, filters in find_overloads(network).items():
         for label, overload in filters.items():
-            is_serious = not float(overload.bound) <= SEEN  # NaN too
+            is_serious = not float(overload.bound) <= SEEN  # also True for NaN
             yield Doubt(serious=is_serious, words=overload.describe(name, label))
 
 
@@ -147,10 +147,10 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
-    """Yield a doubt where the error of the best filter of all nodes grows without end, or this cannot be decided.
+    """Yield a doubt if the error of the best filter of all nodes grows without end, or if this cannot be decided.
 
-    `what`: whose error, in words. `serious`: whether its growth is a serious doubt; then it is also said where nobody
-    can judge it.
+    `what`: whose error it is, in words. `serious`: True if growth is a serious doubt. Only then is there also a line if
+    boundedness cannot be judged.
     """
     try:
         boundedness = certify_boundedness(network)
@@ -210,7 +210,7 @@ def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
-    """Yield a doubt for each node told numbers (by its messages) of which no claim can be made, with the reason."""
+    """Yield a doubt, with the reason, for each node whose messages tell it numbers that allow no claim."""
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not node.filters:
             continue
@@ -221,15 +221,16 @@ def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
-    """Yield a doubt for filters made for other models than those where they stand, alike ones in one line.
+    """Yield a doubt for filters made for other models than those where they stand, like ones in one line.
 
-    `forgetful`: nodes, by filter, where it ignores the memory of their links. `lowered`: the claim was lowered for it.
+    `forgetful`: for each filter, the nodes where it ignores the memory of their links. `belief.lowered`: True if the
+    filter's claim was lowered for this.
     """
     beliefs_by_words: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
     forgetful = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
-            continue  # said already, with what to do
+            continue  # `_doubt_forgetful_filters` says this already
         beliefs_by_words.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
     for (lowered, _, _), beliefs in beliefs_by_words.items():
         other_nodes = join_names([repr(belief.node) for belief in beliefs[1:]])
@@ -239,7 +240,7 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
-    """Yield a doubt for filters that take a link's draws as independent over time, though its gains have memory."""
+    """Yield a doubt for each filter that takes a link for one without memory although its gains have memory."""
     for label, names in _list_forgetful_nodes(network).items():
         finding = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
         remedy = "another channel than its own; linear_filter or mixture_filter of the link knows it"
@@ -253,9 +254,9 @@ def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
 
 
 def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
-    """Return, by name of the filter, the nodes at which it takes a link with memory for one without.
+    """Return for each filter name the nodes where the filter takes a link with memory for one without.
 
-    Memory matters where gains are correlated over time; numbers that a link tells are fixed at typical ones.
+    Memory matters if gains are correlated over time. Numbers that a link tells are fixed at typical ones to judge this.
     """
     nodes: dict[str, list[str]] = {}
     for name, node in network.nodes.items():
@@ -263,7 +264,7 @@ def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
             continue
         try:
             remembers = memory_matters(at_each_step(_fix_told_numbers, node.channel))
-        except InputError:  # a memory that nothing is known of
+        except InputError:  # it is unknown whether this memory matters
             continue
         for label, filter_ in node.filters.items() if remembers else ():
             if _ignores_memory(filter_):

@@ -17,7 +17,10 @@ SHOWN = 3  # of many that are refused for one reason
 
 
 def explain_xla_fallbacks(network: Network) -> list[str]:
-    """Return a line for each reason for which XLA, not this library's native code, computes filters: who, and why."""
+    """Return a line for each reason for which XLA computes filters in place of this library's native code.
+
+    A line names the filters or fusions first, and then the reason.
+    """
     names_by_reason: dict[str, list[str]] = {}
     for name, reason in (*_find_refused_filters(network), *_find_refused_meshes(network)):
         names_by_reason.setdefault(reason, []).append(name)
@@ -31,7 +34,7 @@ def describe_sequential_filters(network: Network) -> str:
 
 
 def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
-    """Yield each filter of the network, with who it is in words."""
+    """Yield (description in words, filter) for each filter of the network."""
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     filters_by_place = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
     for place_in_words, filters in (*filters_by_place, ("", central)):
@@ -39,7 +42,7 @@ def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
 
 
 def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield each filter whose step native code refuses, so that XLA computes it, with the reason."""
+    """Yield (name, reason) for each filter whose step native code refuses, so that XLA computes it."""
     for name, filter_with_names in _list_filters(network):
         filter = without_output_names(filter_with_names)  # so that filters of one structure are compiled once
         z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
@@ -54,10 +57,10 @@ def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
 
 
 def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield each fusion between neighbours whose step is too long to be written out as native code, with the reason."""
+    """Yield (name, reason) for each fusion between neighbours whose step is too long to write out as native code."""
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
-        # Of more than DENSE nodes none is built where the joint covariance of their errors is needed: a run refuses it.
+        # A rule that needs the joint covariance of all errors cannot be built for more than DENSE nodes.
         can_be_built = nodes <= DENSE or not fusion.rule.needs_joint
         if can_be_built and build_mesh(network, name).has_long_step:
             yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"

@@ -26,7 +26,7 @@ def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Rema
 
     Args:
         network: the network.
-        state: states of all its filters, as the step of the network has them.
+        state: states of all filters, as `NetworkFilters.init` returns them: stacks by kind, then central ones by name.
     """
     alike, central, *_ = state
     for node, name in find_remarking_filters(network):
@@ -36,7 +36,7 @@ def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Rema
             yield (node, name), fusion.remark(central[name])
             continue
         place = network.places[node, name]
-        # A stack has all nodes of its first filter, then all of its second, and so on.
+        # A stack has the first filter of all nodes, then the second filter of all nodes, and so on.
         row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
         filter_state = jax.tree.map(lambda leaf, row=row: leaf[row], alike[place.kind])
         yield (node, name), network.nodes[node].filters[name].remark(filter_state)

@@ -26,14 +26,20 @@ def list_sensors(network: Network) -> list[AbstractSensor]:
 def make_observability_matrix(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int
 ) -> Float[np.ndarray, "rows n"]:
-    """Return the observability matrix d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
+    """Return the observability matrix d(y_1, ..., y_steps)/dx_0 at a state, with all sensors stacked.
+
+    All inputs are 1.
+    """
     return np.asarray(_differentiate_outputs(plant, tuple(sensors), state, np.arange(steps)))
 
 
 def simulate_outputs(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], states: Float[np.ndarray, "states n"], steps: int
 ) -> Float[np.ndarray, "states rows"]:
-    """Return y_1, ..., y_steps of all sensors from each of some states, without noise, with inputs of 1."""
+    """Return y_1, ..., y_steps of all sensors from each initial state, one row each, without noise.
+
+    All inputs are 1.
+    """
     return np.asarray(_measure_from_states(plant, tuple(sensors), states, np.arange(steps)))
 
 
@@ -41,7 +47,7 @@ def simulate_outputs(
 def _differentiate_outputs(
     plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], state: Float[Array, " n"], rows: Int[Array, " steps"]
 ) -> jax.Array:
-    """Return d(y_1, ..., y_steps)/dx_0 at `state`, of the outputs of all sensors, (outputs of all steps, n)."""
+    """Return d(y_1, ..., y_steps)/dx_0 at `state` for the outputs of all sensors: (outputs of all steps, n)."""
     jacobian: jax.Array = jax.jacfwd(lambda x: _measure_rows(plant, sensors, x, rows))(state)
     return jacobian
 
@@ -60,7 +66,7 @@ def _measure_from_states(
 def _measure_rows(
     plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], x: jax.Array, rows: Int[Array, " steps"]
 ) -> jax.Array:
-    """Return y_1, ..., y_steps of all sensors from the state x, one after another, a step for each row."""
+    """Return y_1, ..., y_steps of all sensors from the state x in one row, one step for each entry of `rows`."""
     u = jnp.ones(len(plant.inputs))
 
     def step(x: jax.Array, _: object) -> tuple[jax.Array, jax.Array]:

@@ -16,12 +16,12 @@ Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
 
 
 def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
-    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}.
+    """Return {(number as meant, number as rounded): names of the parts of the network that hold it}.
 
-    Rounded to single precision; of each model only the first such number is named.
+    Only numbers that were rounded to single precision count, and only the first such number of each model.
     """
     names_by_number: dict[tuple[float, float], list[str]] = {}
-    first_rounded: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
+    first_rounded: dict[int, tuple[float, float] | None] = {}  # by id of the model, as nodes may share a model
     for name, model, functions in _yield_models_with_calls(network):
         if id(model) not in first_rounded:
             found = map(find_rounded_to_single, _yield_arrays(model, functions))
@@ -33,7 +33,10 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
 
 
 def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
-    """Yield (name, model, its functions with arguments for each) of plant, sensors, channels and what is shared."""
+    """Yield (name, model, [(function, arguments)]) for the plant, sensors, channels and what nodes share.
+
+    The functions are those of the model that may hold arrays; they can be called with these arguments.
+    """
     plant, x, u = first(network.plant), np.zeros(len(network.states)), np.zeros(len(network.inputs))
     yield "plant", network.plant, [(plant.transition, (x, u)), (plant.noise_covariance, (u,))]
     for name, node in network.nodes.items():
@@ -57,9 +60,9 @@ def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
 
 
 def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
-    """Return the arrays that a function of a model holds, as its trace shows them.
+    """Return the arrays that a function of a model holds, found by tracing it with these arguments.
 
-    None of a function that cannot be traced by itself with these arguments.
+    The list is empty if the function cannot be traced.
     """
     try:
         arrays, *_ = constants(function, *arguments)

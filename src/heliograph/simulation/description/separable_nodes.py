@@ -40,7 +40,10 @@ def _mask_measured(sensor: object) -> Bool[np.ndarray, " states"]:
 
 
 def _mask_coupled(plant: object) -> Bool[np.ndarray, "states states"]:
-    """Return which pairs of states a linear plant couples, by motion, noise or initial covariance, with inputs of 1."""
+    """Return which pairs of states a linear plant couples by its motion, noise or initial covariance.
+
+    All inputs are 1.
+    """
     assert isinstance(plant, LinearPlant)
     u = jnp.ones(len(plant.inputs))
     with jax.enable_x64(True):

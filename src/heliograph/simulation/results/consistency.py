@@ -61,15 +61,15 @@ def nees(
 ) -> Float[np.ndarray, "*steps"]:
     """Return the normalised estimation error squared (NEES), e' P^-1 e with e = truth - mean: one number a step.
 
-    Its expectation is n where P = E[e e']; where e is Gaussian besides, it has a chi-squared law with n degrees of
-    freedom (`hg.consistency`). A component that P says is known exactly counts 1 if it is, and is infinite if not.
+    Its expectation is n if P = E[e e']. If e is also Gaussian, it is chi-squared with n degrees of freedom
+    (`hg.consistency`). A component of variance 0 in P adds 1 if its error is 0, and makes the result infinite if not.
 
     Args:
-        truth: true states, NaN where a component is not known: the others are judged, by their part of P.
+        truth: true states, NaN for components that are not known. The others are judged, by their part of P.
         mean: estimates, NaN where there is none.
-        covariance: what is claimed of their errors, one (n, n) for all steps or one a step.
-        angles: which states are angles in radians, whose errors are between -pi and pi: by place, or the plant whose
-            states they are, whose attitudes err by turns then; none by default.
+        covariance: claimed covariances P of the errors, one (n, n) for all steps or one a step.
+        angles: places of the states that are angles in radians, whose errors are between -pi and pi. A plant may be
+            given instead; errors of its attitudes are then rotation vectors. None are angles by default.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite, a matrix that is no covariance, angles that are
@@ -92,8 +92,8 @@ def nis(
 ) -> Float[np.ndarray, "*steps"]:
     """Return the normalised innovation squared (NIS), e' S^-1 e of an innovation e: one number a step, without a truth.
 
-    Its expectation is the number of components that arrived; NaN where none did. A gate (a test whether a measurement
-    belongs to the target) compares it with a quantile of the chi-squared law.
+    Its expectation is the number of components that arrived. It is NaN if none arrived. A gate (a test whether a
+    measurement belongs to the target) compares it with a quantile of the chi-squared law.
 
     Args:
         innovation: z - E[z | earlier z], NaN for what did not arrive: `filter.run(z).innovations`.
@@ -117,7 +117,11 @@ def nis(
 def _broadcast_covariance_to_steps(
     covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps n n"]:
-    """Return the covariance of each step; one matrix is that of all steps. Raise ValueError if one is not symmetric."""
+    """Return the covariance of each step; a single matrix is repeated for all steps.
+
+    Raises:
+        ValueError: a matrix that is not symmetric.
+    """
     n = x.shape[-1]
     shape = (n, n) if rank("covariance", covariance) == 2 else (*x.shape, n)
     matrices = array("covariance", covariance, shape, missing=True)
@@ -132,22 +136,22 @@ def _broadcast_covariance_to_steps(
 def _compute_normalised_square(
     x: Float[np.ndarray, "*steps n"], covariance: Float[np.ndarray, "*steps n n"], size: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps"]:
-    """Return x' P^-1 x of each step, over the components that are not NaN; NaN where all are.
+    """Return x' P^-1 x of each step over the components of x that are not NaN, or NaN if all are.
 
     Args:
         x: errors or innovations.
         covariance: P of each step.
-        size: numbers of which x is a difference, by which its rounding is judged.
+        size: the numbers of which x is a difference; their size bounds the rounding error of x.
 
     Raises:
         ValueError: a covariance with a negative eigenvalue.
     """
-    # A missing component counts as zero, of variance 1, correlated with nothing: it adds 0^2 / 1.
+    # Replace a missing component by 0 with variance 1 and no correlation, which adds 0^2 / 1 to the square.
     present, n = ~np.isnan(x), x.shape[-1]
     both_present = present[..., :, None] & present[..., None, :]
     with_missing = np.where(both_present, covariance, np.eye(n) * ~present[..., None, :])
     errors, sizes = np.where(present, x, 0.0), np.nan_to_num(size)
-    # One matrix after another, whatever the leading axes are.
+    # Join all leading axes into one, so that matrices stand one after another.
     squares = _square_distances(with_missing.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
     squares_by_step = np.asarray(squares).reshape(x.shape[:-1])
     # Of an indefinite matrix the square is NaN, which would count as missing.
@@ -245,9 +249,9 @@ def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -
 
 
 def _correlate_over_steps(deviations: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
-    """Return the correlation over 1, 2, ..., `lags` steps of values given by their deviations from the mean.
+    """Return the correlations over 1, 2, ..., `lags` steps of values whose deviations from the mean are given.
 
-    `deviations`: the deviations, 0 of missing values, which then add nothing.
+    Missing values have deviation 0, and so add nothing.
     """
     power = np.sum(deviations**2)
     products = [np.sum(deviations[:, :-t] * deviations[:, t:]) for t in range(1, lags + 1)]

@@ -61,9 +61,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
     ):
         """Make the dictionary from statistics by node and filter, with the names of the states and their units."""
         super().__init__(by_node)
-        # Units that the states' names carry, and those given, which prevail.
+        # The names of states may carry units; units that are given override these.
         self.states, self.units = states, units_in(states) | dict(units or {})
-        self.smoothed: StatisticsByName | None = None
+        self.smoothed: StatisticsByName | None = None  # statistics of smoothed estimates, set where there are some
 
     def to_xarray(self) -> "xr.Dataset":
         """Return the labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
@@ -135,7 +135,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
         return cls(results, tuple(states), read_units(dataset))
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Return the table: a row for each node and filter, with claim, runs, RMSE, NEES, errors, and figures by state.
+        """Return a table with a row for each node and filter: claim, runs, RMSE, NEES, errors, and figures by state.
 
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
@@ -144,7 +144,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
 
         rows, index = [], []
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of failed runs: the row says how many
+            warnings.simplefilter("ignore")  # no warnings of failed runs, since each row says how many failed
             for node, filters in self.items():
                 for name, score in filters.items():
                     index.append((node, name))
@@ -194,7 +194,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
     def failures(self) -> list[str]:
         """Return a line for each filter without a valid estimate in some run, and for each uplink that saturated.
 
-        Those of smoothed estimates come first and begin with "smoothed".
+        Lines on smoothed estimates come first and begin with "smoothed".
         """
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.items():

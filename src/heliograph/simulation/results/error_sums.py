@@ -163,9 +163,9 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def others(
         self, filtered: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
-        """Return the statistics of filtered estimates, with those of the smoothed ones as their field `smoothed`.
+        """Return the statistics of filtered estimates, with those of the smoothed estimates in their field `smoothed`.
 
-        `claims`: of the smoothed estimates' covariances, by node and filter.
+        `claims`: claims of the smoothed estimates' covariances, by node and filter.
         """
         statistics = {
             node: {
@@ -194,8 +194,11 @@ class _FilterSums(NamedTuple):
 
 
 def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> ErrorStatistics:
-    """Return the statistics of one filter from its sums over runs; `count`: runs in each batch."""
-    # Failures are counted by test, that of means first: the only one where no covariance is claimed.
+    """Return the statistics of one filter from its sums over runs.
+
+    `count`: number of runs in each batch.
+    """
+    # Row 0 counts failures of the test of means, the only test if no covariance is claimed.
     tests = 0 if claim == "none" else slice(None)
     return ErrorStatistics(
         count=count,
@@ -275,9 +278,9 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
 
 
 def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[int, ...]) -> OfStep:
-    """Return the sums of errors of one run's estimates of one filter, by step, as a simulation makes them.
+    """Return the sums of errors, by step, of one filter's estimates in one run, as a simulation makes them.
 
-    The filter is given as a fused one without a name, since a step of a simulation has estimates by name.
+    The filter is given the name "" at the centre, since a step of a simulation has estimates by name.
     """
     estimate = Estimate(mean, covariance, claim="none", attitude=attitude)
     steps = {"truth": truth, "estimates": (), "fused": {"": estimate}, "uplinks": {}}

@@ -31,9 +31,9 @@ def read_modes(estimate: Estimate) -> np.ndarray:
 
 
 def drop_unused_modes(modes: np.ndarray | None) -> np.ndarray | None:
-    """Return the probabilities of modes (..., M) without modes that are NaN at all times; None where none is left.
+    """Return the probabilities of modes (..., M) without modes that are always NaN, or None if no mode is left.
 
-    A dataset has as many for all filters, NaN of those that a filter does not have.
+    A dataset has equally many modes for all filters, NaN for modes that a filter does not have.
     """
     if modes is None:
         return None
@@ -96,7 +96,7 @@ def list_axes(name: str, lead: Sequence[str]) -> list[str]:
 
 
 def select_given_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
-    """Return units by the state's name, and of "time", without those that are empty; raise where one does not fit.
+    """Return the units that are not empty, by the state's name or "time".
 
     Raises:
         ValueError: a name that is no state, a unit that is no text.
@@ -140,7 +140,7 @@ class FilterLabels:
         return list(dict.fromkeys(node for uplink in self.uplinks.values() for node in uplink.nodes))
 
     def list_placed(self, read: Callable[[Any], T]) -> list[Placed[T]]:
-        """Return what `read` gives of each result, with the result's place (number of node, number of filter)."""
+        """Return (place, read(result)) for each result; a place is (number of node, number of filter)."""
         filters = self.filters
         placed: list[Placed[T]] = []
         for node, by_filter in self.by_node.items():
@@ -149,17 +149,17 @@ class FilterLabels:
         return placed
 
     def fill_field(self, name: str, placed_values: Iterable[Placed[ArrayLike]]) -> np.ndarray:
-        """Return the array of a field with these parts at their places along node, or node and filter; NaN elsewhere.
+        """Return the array of a field with values at their places (node, or node and filter) and NaN elsewhere.
 
-        A part that is shorter than its axis, as measurements of a node may be, fills the beginning. `rows`, `lengths`:
-        lengths of the axes of rows, and of all further ones.
+        Values shorter than their axis, such as measurements of some nodes, fill its beginning. `self.rows` and
+        `self.lengths`: the lengths of the axes of rows, and of further axes, by name.
         """
         sizes = {"node": len(self.nodes), "filter": len(self.filters), "state": len(self.states)}
         sizes |= {"other": len(self.states), **self.rows, **self.lengths}
         axes = list_axes(name, list(self.rows))
         array, node_axis = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
         for place, values in placed_values:
-            # Rows before the node's axis, the part's own axes behind its place.
+            # Axes of rows come before the node's axis, and the values' own axes after their place.
             lengths = np.shape(values)[node_axis:]
             all_rows = (slice(None),) * node_axis
             index: Any = (*all_rows, *place, *map(slice, lengths))
@@ -171,9 +171,9 @@ class FilterLabels:
         return self.fill_field(name, self.list_placed(read))
 
     def claims(self) -> np.ndarray:
-        """Return what each filter claims of its covariance (node, filter): exact, upper, nominal or none.
+        """Return the claim of each filter's covariance (node, filter): exact, upper, nominal or none.
 
-        Empty where a node has no filter of the name.
+        The text is empty if a node has no filter of this name.
         """
         claims = np.full((len(self.nodes), len(self.filters)), "", dtype="U7")
         for place, claim in self.list_placed(lambda result: result.claim):
@@ -181,12 +181,12 @@ class FilterLabels:
         return claims
 
     def make_attitude_field(self) -> dict[str, np.ndarray]:
-        """Return the field that says which states are the rotation vectors of attitudes; no field where none are.
+        """Return the field that says which states are rotation vectors of attitudes; no field if none are.
 
-        By state its place among all their numbers, -1 of other states.
+        It has for each state its place among the numbers of all rotation vectors, or -1 for other states.
         """
         placed = self.list_placed(lambda result: result.attitude)
-        rotations = next((states for _, states in placed if states), ())  # the same of all filters that have some
+        rotations = next((states for _, states in placed if states), ())  # all filters with attitudes have the same
         order = np.full(len(self.states), -1, dtype=np.int64)
         order[list(rotations)] = np.arange(len(rotations))
         return {"attitude": order} if rotations else {}
@@ -257,9 +257,10 @@ class FilterLabels:
 def iterate_filters(
     dataset: "xr.Dataset", names: Sequence[str], lead: Sequence[str]
 ) -> Iterator[tuple[str, str, Claim, dict[str, np.ndarray]]]:
-    """Yield (node, filter, claim, values) of each filter in a dataset.
+    """Yield (node, filter, claim, values) for each filter in a dataset.
 
-    `values`: copies of the fields `names`, by name, without their axes (node, filter). `lead`: the axes of rows.
+    `names`: the fields to read. `values`: {field: copy of its values of this filter}, without the axes node and filter.
+    `lead`: the axes of rows, such as run and time.
     """
     nodes, filters = read_labels(dataset, "node"), read_labels(dataset, "filter")
     claim = read_values(dataset, "claim", lead)
@@ -274,8 +275,8 @@ def iterate_filters(
 
 
 def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.ndarray]) -> Estimate:
-    """Return the estimate of a filter of a dataset, from its values by field as `iterate_filters` yields them."""
-    # By state its place among the numbers of all attitudes' rotation vectors, -1 of other states.
+    """Return the estimate of a filter of a dataset, from its {field: values} as `iterate_filters` yields them."""
+    # For each state, its place among the numbers of all rotation vectors of attitudes, or -1 for other states.
     order = read_values(dataset, "attitude", []) if "attitude" in dataset else np.zeros(0, dtype=np.int64)
     attitude = tuple(int(i) for i in np.argsort(order, kind="stable") if order[i] >= 0)
     modes = drop_unused_modes(values.get("modes"))
@@ -283,9 +284,9 @@ def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.n
 
 
 def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
-    """Return what nodes sent to fusions (uplinks), by the fusion's name, from a dataset; `lead`: the axes of rows.
+    """Return what nodes sent to fusions (uplinks) in a dataset, by the fusion's name.
 
-    SENT: the fields of an uplink, whether a quantizer saturated and how many symbols it sent.
+    `lead`: the axes of rows. SENT: the fields of an uplink, whether a quantizer saturated and how many symbols it sent.
     """
     if "place" not in dataset:
         return {}
@@ -293,7 +294,7 @@ def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
     saturated, symbols = (read_values(dataset, name, lead) for name in SENT)
     uplinks = {}
     for i, name in enumerate(read_labels(dataset, "fusion")):
-        # Its senders in their order; those of other fusions only have the place -1.
+        # The senders of this fusion in their order. Others have the place -1.
         order = np.array([j for j in np.argsort(places[i], kind="stable") if places[i, j] >= 0], dtype=int)
         nodes = tuple(senders[j] for j in order)
         uplinks[name] = Uplink(nodes, saturated[..., i, order, :], symbols[..., i, order, :])
@@ -301,7 +302,7 @@ def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
 
 
 def make_name_array(names: Sequence[str]) -> np.ndarray:
-    """Return the names as an array of Python's texts, since one of fixed-length texts would drop final zero bytes."""
+    """Return the names as an array of Python strings, since an array of fixed-length strings drops final zero bytes."""
     texts = np.empty(len(names), dtype=object)
     texts[:] = names
     return texts
@@ -315,14 +316,14 @@ def check_title(dataset: "xr.Dataset", title: str) -> None:
 
 
 def read_labels(dataset: "xr.Dataset", axis: str) -> list[str]:
-    """Return the labels of a dimension of a dataset, such as the names of nodes; raise ValueError where it lacks."""
+    """Return the labels of a dimension of a dataset, such as names of nodes; raise ValueError if it is missing."""
     if axis not in dataset.dims:
         raise fail("dataset", f"the dimension {axis!r}, also where it has one label", f"{list(dataset.dims)}")
     return [str(name) for name in dataset[axis].values]
 
 
 def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
-    """Return the values of a field with its axes in the order of `list_axes`, or raise ValueError where it has others.
+    """Return the values of a field with its axes in the order of `list_axes`; raise ValueError if it has other axes.
 
     `lead`: the axes of rows, such as run and time, which stand first.
     """
@@ -334,7 +335,7 @@ def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.nda
 
 
 def read_units(dataset: "xr.Dataset") -> dict[str, str]:
-    """Return the units in a dataset, by the state's name and of "time"."""
+    """Return the units in a dataset, by the state's name or "time"."""
     time = {TIME: str(dataset[TIME].attrs["units"])} if "units" in dataset[TIME].attrs else {}
     if "unit" not in dataset.coords:
         return time

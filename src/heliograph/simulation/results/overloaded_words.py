@@ -10,10 +10,10 @@ Overloads = TypeAliasType("Overloads", dict[str, dict[str, Overload]])  # by nod
 
 
 def find_overloads(network: object) -> Overloads:
-    """Return how often words are overloaded, sent for values beyond their range, by node and filter that takes words.
+    """Return how often words are overloaded by values beyond their range, by node and filter that takes words.
 
     Args:
-        network: a network; of any other model there are none.
+        network: a network. The result is empty for any other model.
     """
     if not isinstance(network, Network):
         return {}

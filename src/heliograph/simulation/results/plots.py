@@ -20,7 +20,10 @@ if TYPE_CHECKING:  # an extra
 def choose_filters(
     filters_by_node: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
 ) -> tuple[str, list[str]]:
-    """Return the node to draw, by default the first with filters, and its filters, by default all; raise at others."""
+    """Return the node to draw and its filters; raise ValueError if a given one does not exist.
+
+    The default is the first node with filters, and all of its filters.
+    """
     with_filters = [name for name, by_filter in filters_by_node.items() if by_filter]
     if not with_filters or node not in (None, *with_filters):
         raise fail("node", f"one with filters: {', '.join(with_filters) or 'there is none'}", repr(node))
@@ -34,7 +37,7 @@ def choose_filters(
 
 
 def find_state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
-    """Return the places of the named states among the `known` ones, all by default; raise ValueError at others."""
+    """Return the places of the chosen `states` in `known`, or of all if None; raise ValueError for an unknown state."""
     one_or_all = [states] if isinstance(states, str) else states
     chosen = list(known if one_or_all is None else one_or_all)
     for name in chosen:
@@ -44,9 +47,12 @@ def find_state_places(states: Sequence[str] | None, known: Sequence[str]) -> lis
 
 
 def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
-    """Return the given axes as a list, or those of a new figure, `count` one below the other; raise at another number.
+    """Return the given axes as a list, or those of a new figure with `count` panels one below the other.
 
-    `time`: of what is drawn; dates have no unit. `units`: by name, that of "time" too.
+    `time`: times to be drawn; dates need no unit. `units`: by name, also of "time".
+
+    Raises:
+        ValueError: another number of axes than `count`.
     """
     if axes is None:
         import matplotlib.pyplot as plt

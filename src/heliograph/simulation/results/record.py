@@ -111,7 +111,7 @@ class Record(SavableResults):
         return write_record_html(self)
 
     def with_origin(self, origin: Origin) -> "Record":
-        """Return the same record with the states in which its filters ended, from which more rows can be filtered."""
+        """Return the same record with the final states of its filters, from which more rows can be filtered."""
         changed = copy(self)
         vars(changed)["origin"] = origin  # fields are frozen
         return changed
@@ -123,7 +123,7 @@ class Record(SavableResults):
 
     @property
     def runs(self) -> int | None:
-        """Number of Monte Carlo runs, the first of three axes of all arrays; None for one recording, of two axes."""
+        """Number of Monte Carlo runs, the first of three axes of all arrays; None for a recording, with two axes."""
         means = [np.asarray(estimate.mean) for filters in self.estimates.values() for estimate in filters.values()]
         arrays = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
         return len(arrays[0]) if arrays and arrays[0].ndim == 3 else None
@@ -150,7 +150,7 @@ class Record(SavableResults):
         )
 
     def errors(self, node: str, name: str) -> np.ndarray:
-        """Return x - xhat of one filter of one node, of attitudes the turn from the estimated to the true one.
+        """Return x - xhat of one filter of one node; for attitudes it is the rotation from the estimate to the truth.
 
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
@@ -180,10 +180,10 @@ class Record(SavableResults):
         return dict(zip(self.states, np.sqrt(mean).tolist(), strict=True))
 
     def nees(self, node: str, name: str) -> np.ndarray:
-        """Return the normalised estimation error squared of each step (run, time), of the states whose truth is known.
+        """Return the normalised estimation error squared of each step (run, time), over states of known truth.
 
-        Its expectation is their number where the claim is exact; NaN where no state's truth is known, or nothing is
-        claimed.
+        Its expectation is the number of these states if the claim is exact. It is NaN where no state's truth is known,
+        or if no covariance is claimed.
 
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
@@ -196,10 +196,10 @@ class Record(SavableResults):
         return nees(truth, np.where(is_sound, truth - errors, np.nan), covariance)
 
     def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
-        """Return a summary of innovations for each output of a filter that weighs: what it used, weights, bias, size.
+        """Return a summary of each output's innovations, for a filter that weighs them: use, weights, bias, size.
 
         Raises:
-            ValueError: no such filter, one that weighs nothing, or a simulation, whose weights `filter.run` has.
+            ValueError: no such filter, one that weighs nothing, or a simulation (use `filter.run` for its weights).
         """
         self.check_filter(node, name)
         if name not in self.weighed.get(node, {}):
@@ -208,7 +208,7 @@ class Record(SavableResults):
         return self.weighed[node][name].summarise()
 
     def with_refused(self, refused: ByNode) -> "Record":
-        """Return the same record with the reasons for which readings were refused, by node (time, received).
+        """Return the same record with the reason for which each reading was refused, by node (time, received).
 
         Nodes that refused nothing are left out.
         """
@@ -302,7 +302,7 @@ class Record(SavableResults):
         return cls(**read_frame(frame))
 
     def apart(self) -> list[str]:
-        """Return the names of the parts that `save` leaves out of a file, and that are saved separately."""
+        """Return the names of the parts that `save` leaves out of a file, and that must be saved separately."""
         return super().apart() + [
             name for name in ("reports", "transmissions", "weighed", "refused") if getattr(self, name)
         ]
@@ -388,9 +388,9 @@ class Record(SavableResults):
 
 
 def describe_bad_steps(is_bad: np.ndarray) -> list[str]:
-    """Return a list of one phrase: from which step on, and in how many runs, the flags `is_bad` (..., time) hold.
+    """Return one phrase that says from which step on, and in how many runs, some flag of `is_bad` (..., time) is True.
 
-    An empty list where they never do.
+    The list is empty if no flag is True.
     """
     if not np.any(is_bad):
         return []

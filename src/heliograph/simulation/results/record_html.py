@@ -139,9 +139,9 @@ def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state:
 
 
 def _read_curve(estimate: Estimate, state: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mean, lower and upper end of the band of a state in the chosen rows; the ends are NaN without a claim.
+    """Return the mean, and the lower and upper end of the band, of a state in the chosen rows.
 
-    The band is SIGMAS (2) claimed deviations to either side.
+    The band is SIGMAS (2) claimed deviations to either side. Its ends are NaN if nothing is claimed.
     """
     mean = np.asarray(estimate.mean)[rows, state]
     variance = np.asarray(estimate.covariance)[rows, state, state]
@@ -157,7 +157,7 @@ def _find_range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())
-    # 4 % on either side; 1e-12 (LEAST) of the size where all values are equal.
+    # Add 4 % on either side, or LEAST (1e-12) of the size if all values are equal.
     margin = max(0.04 * (high - low), LEAST * max(abs(low), abs(high), 1.0))
     return low - margin, high + margin
 
@@ -174,9 +174,9 @@ def _split_at_gaps(finite: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
-    """Return a curve of heights y as an SVG path with more attributes, broken where there is no value (NaN).
+    """Return a curve of heights y as an SVG path, with gaps where y is NaN.
 
-    SVG: M moves the pen, L draws a line to a point.
+    In SVG, M moves the pen and L draws a line to a point. `attributes`: further attributes of the path.
     """
     x = _compute_x_places(len(y))
     pieces = ["L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y))]
@@ -188,9 +188,9 @@ def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
 
 
 def _yield_band_paths(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
-    """Yield the outlines of a band between two curves of heights, as SVG paths, one for each piece without a gap (NaN).
+    """Yield an SVG path around each piece without NaN of the band between two curves of heights.
 
-    Along the upper curve and back along the lower one; Z closes the outline.
+    It goes along the upper curve and back along the lower one; Z closes it.
     """
     x = _compute_x_places(len(lower))
     for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):

@@ -77,13 +77,13 @@ class AbstractReducer(Module, Generic[Result]):
     def split_by_name(
         self, network: Network, collected: PyTree, read: Callable[[PyTree], Any], axis: int
     ) -> dict[str, dict[str, np.ndarray]]:
-        """Return what was collected of estimates, split by node and filter, as `finish` needs it.
+        """Return arrays collected from estimates, split by node and filter as `finish` needs them.
 
         Args:
             network: the network.
-            collected: "estimates" and "fused", as `of_step` had them in a step.
-            read: gives the array of an entry.
-            axis: of the filters in that array; the nodes' follows it.
+            collected: the parts "estimates" and "fused" in the form of a step's outputs.
+            read: returns the array of an entry.
+            axis: the axis of filters in that array; the axis of nodes follows it.
         """
         return split_by_name(network, collected, read, axis)
 
@@ -126,7 +126,7 @@ class Trajectories(AbstractReducer[Record]):
         return trajectories_record(network, collected, time)
 
     def joined(self, results: Sequence[Record], network: Network) -> Record:
-        """Return the record of all nodes, in the network's order, from records of parts of a network."""
+        """Return one record of all nodes, in the network's order, from records of parts of the network."""
         measurements = {name: z for record in results for name, z in record.measurements.items()}
         estimates = {name: filters for record in results for name, filters in record.estimates.items()}
         return replace(
@@ -136,9 +136,10 @@ class Trajectories(AbstractReducer[Record]):
         )
 
     def others(self, filtered: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
-        """Return the record of filtered estimates, with that of the smoothed ones, which have `claims`, as `smoothed`.
+        """Return the record of filtered estimates, with the record of smoothed estimates as its field `smoothed`.
 
-        Its time is that of the last steps if there are fewer.
+        `claims`: claims of the smoothed estimates, by node and filter. If only the last steps are smoothed, the
+        smoothed record has the times of these.
         """
         estimates = {
             node: {name: replace(estimate, claim=claims[node][name]) for name, estimate in filters.items()}

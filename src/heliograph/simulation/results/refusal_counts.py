@@ -38,22 +38,23 @@ def list_refusals(
     """Count what nodes refused, and what filters that weigh left out, by component and reason.
 
     Args:
-        refused: by node the number of each reading's reason, 0 where it is kept (time, received).
-        weighed: by node and filter the weights of its components, NaN where nothing arrived (time, received).
+        refused: for each node, the number of each reading's reason (time, received), 0 if it is kept.
+        weighed: for each node and filter, the weights of the components (time, received), NaN if nothing arrived.
     """
     refusals = [refusal for node, reasons in refused.items() for refusal in _count_refusals(node, "", reasons)]
     for node, filters in weighed.items():
         for filter, weighed_innovations in filters.items():
-            # A weight of 0: the filter left the reading out, for the reason "gate".
+            # A weight of 0 means that the filter left the reading out, which is the reason "gate".
             is_left_out = np.asarray(weighed_innovations.weight) == 0
             refusals += _count_refusals(node, filter, np.where(is_left_out, number_of_reason("gate"), 0))
     return tuple(refusals)
 
 
 def _count_refusals(node: str, filter: str, refused: np.ndarray) -> Iterator[Refusal]:
-    """Yield, by component and reason, how many readings were refused, and the row of the first.
+    """Yield, by component and reason, how many readings were refused, and the row of the first one.
 
-    `refused`: number of each reading's reason (time, received), 0 of one that is kept; `filter`: "" of a node's own.
+    `filter`: name of the filter that refused, or "" if the node did. `refused`: number of each reading's reason
+    (time, received), 0 if it is kept.
     """
     for reason, counts in count_by_reason(refused).items():
         for i in np.flatnonzero(counts).tolist():

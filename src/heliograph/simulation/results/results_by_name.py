@@ -36,9 +36,10 @@ def reports_by_name(
 
 
 def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
-    """Return by node what arrived from its neighbours (..., rounds times neighbours): 1 or the age, NaN if lost.
+    """Return for each node what arrived from its neighbours (..., rounds times neighbours): 1 or the age, NaN if lost.
 
-    `arrived`: of the fusion `name`, (..., node, rounds, degree), flags, or ages in steps with -1 of what is lost.
+    `arrived`: what arrived in the fusion `name` (..., node, rounds, degree), as flags, or as ages in steps with -1 for
+    lost messages.
     """
     neighbours = network.meshes[name].neighbours or {}
     reports = {}
@@ -48,7 +49,7 @@ def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str
             are_flags = arrivals.dtype == bool
             ages = np.where(arrivals, 1.0, np.nan) if are_flags else np.where(arrivals >= 0, arrivals, np.nan)
             values = ages.reshape(*arrivals.shape[:-2], -1)
-            # Messages that are late say so by their ages: the delays beside them are zeros.
+            # The ages say already how late messages are, so that the delays are zeros.
             reports[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return reports
 
@@ -59,7 +60,7 @@ def split_measurements(
     """Split measurements of the groups of nodes (..., node, received) by node, in the order of the network.
 
     Args:
-        network: the network, whose `groups` are the nodes of each.
+        network: the network; `network.groups` has the names of each group's nodes.
         groups: measurements of each group, as a reducer collects them.
     """
     received = {
@@ -71,7 +72,10 @@ def split_measurements(
 
 
 def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return why the nodes' senders transmitted, by node, from arrays (..., node, m) by number of the nodes' group."""
+    """Return for each node why its sender transmitted.
+
+    `groups`: arrays (..., node, m) by the number of the nodes' group.
+    """
     return {
         name: np.asarray(node_group)[..., i, :]
         for group, node_group in groups.items()
@@ -80,9 +84,10 @@ def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> di
 
 
 def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
-    """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter.
+    """Return the probabilities of modes (..., M) of the filters that weigh modes, by (node, filter).
 
-    `batch`: estimates of many steps, stacked by kind of filter, and fused ones by name; FUSED is the centre's "node".
+    `batch`: estimates of many steps, stacked by kind of filter, and fused estimates by name. Fused ones have the node
+    FUSED.
     """
     estimates_by_kind = batch["estimates"]
     fused = batch["fused"] if network.fused else {}
@@ -90,16 +95,17 @@ def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[st
         (FUSED, name): np.asarray(estimate.modes) for name, estimate in fused.items() if estimate.modes is not None
     }
     for name, place in network.places.items():
-        # Of nodes' filters (..., filter, node, M), where the batch has estimates of their kind.
+        # A kind's probabilities are (..., filter, node, M), if the batch has estimates of this kind.
         if place.kind < len(estimates_by_kind) and estimates_by_kind[place.kind].modes is not None:
             modes[name] = np.asarray(estimates_by_kind[place.kind].modes)[..., place.filter, place.node, :]
     return modes
 
 
 def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
-    """Return the innovations of the filters that weigh what arrives, by node and filter; FUSED is the centre's "node".
+    """Return the innovations of the filters that weigh what arrives, by node and filter; centrally the node is FUSED.
 
-    `batch`: "weighed" has them by kind of filter, (time, filter, node, m), None of kinds that do not weigh.
+    `batch["weighed"]` has the innovations by kind of filter (time, filter, node, m), or None for kinds that do not
+    weigh.
     """
     weighed_by_kind = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
@@ -137,7 +143,10 @@ def split_by_name(
 
 
 def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
-    """Return what the nodes sent to each fusion (uplinks), by its name, from arrays whose last axes are (node, n)."""
+    """Return what the nodes sent to each fusion (its uplinks), by the fusion's name.
+
+    `outcome`: for each fusion, the arrays by field; their last axes are (node, n).
+    """
     uplinks = {}
     for name, fusion in network.fused.items() if outcome else ():
         if isinstance(fusion, Fusion) and name in outcome:

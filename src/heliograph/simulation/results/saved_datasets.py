@@ -29,7 +29,7 @@ class SavableResults:
     smoothed: Self | None
 
     def with_units(self, units: Mapping[str, str]) -> Self:
-        """Return the same results with units, by the state's name and of "time", for files, tables and figures.
+        """Return the same results with units, by the state's name or "time", for files, tables and figures.
 
         Raises:
             ValueError: a name that is no state.
@@ -61,9 +61,10 @@ class SavableResults:
         return [] if self.smoothed is None else ["smoothed"]
 
     def save(self, path: str | Path) -> None:
-        """Write to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `open` reads it.
+        """Write these results to a NetCDF file (.nc) or a Zarr folder (.zarr), which `open` reads.
 
-        Warns of parts that have to be saved separately, such as `smoothed`.
+        A write that fails leaves an earlier file as it was. Parts that must be saved separately, such as `smoothed`,
+        raise a warning.
 
         Raises:
             ValueError: another ending, or a place that cannot be written.
@@ -139,7 +140,7 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
 
 
 def _find_package(path: Path) -> str:
-    """Return the name of the package for files with this ending; raise ValueError at another ending."""
+    """Return the name of the package for files with this suffix; raise ValueError for an unknown suffix."""
     packages = {NETCDF: "h5netcdf", ZARR: "zarr"}
     if path.suffix.lower() not in packages:
         raise fail(str(path), f"a name that ends in {' or '.join(packages)}", repr(path.suffix))
@@ -152,7 +153,7 @@ def _list_names(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
 
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
-    """Return names changed each by `change`: for files as texts of fixed length, else as Python's texts."""
+    """Return the names with each changed by `change`, as strings of fixed length for files, else as Python's."""
     changed_names = [change(str(name)) for name in names.values]
     if change is quote_for_file:
         return np.array(changed_names, dtype="U")

@@ -46,7 +46,7 @@ class ErrorStatistics:
 
     @property
     def failure(self) -> str:
-        """In words, from which step on and in how many runs estimates were not valid; empty where all were."""
+        """From which step on, and in how many runs, estimates were not valid, in words; "" if all were valid."""
         if not self.failed_runs:
             return ""
         moment = "mean" if self.claim == "none" else "covariance"
@@ -122,23 +122,23 @@ class ErrorStatistics:
     def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
         """Return the mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
 
-        e: error of all n states, B: what the filter claims of its covariance. The interval is from the means of batches
-        of runs, so correlation over time within a run does not matter.
+        e is the error of all n states, and B the covariance that the filter claims. The interval comes from the scatter
+        of batches of runs, so correlation over time within a run does not matter.
         """
         self._warn_of_failures()
         n = self.outer.shape[-1]
         mean, error = _average_batches(self.nees.mean(axis=1) / n, self.count)
-        # The quantile of Student's t for the batches that have runs, since the error is estimated from their scatter.
+        # Use Student's t for the number of batches with runs, since the error is estimated from their scatter.
         freedom = max(int(np.count_nonzero(self.count)) - 1, 1)
         width = float(scipy.special.stdtrit(freedom, (1 + confidence) / 2)) * error
         return mean, mean - width, mean + width
 
     def worst_direction(self) -> "WorstDirection":
-        """Return the largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, on runs that did not choose d.
+        """Return the largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, with B the claimed covariance.
 
-        B is the claimed covariance. The even batches choose step and direction, the odd batches measure the ratio
-        there, and the reverse; so the ratio is not biased by the search. `z` is the excess over 1 in standard errors.
-        NaN where some error or bound is not finite.
+        Even batches choose step and direction and odd batches measure the ratio there, and then the reverse, so that
+        the search does not bias the ratio. `z` is the excess over 1 in standard errors. The ratio is NaN if some error
+        or claim is not finite.
 
         Raises:
             ValueError: fewer than 4 runs.
@@ -189,8 +189,8 @@ class ErrorStatistics:
 
 
 def expand_pairs(pairs: np.ndarray) -> np.ndarray:
-    """Return the symmetric matrices (..., n, n) from their entries i <= j, row by row, (..., n (n + 1) / 2)."""
-    n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2
+    """Return the symmetric matrices (..., n, n) with these entries i <= j, row after row (..., n (n + 1) / 2)."""
+    n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2  # solves n (n + 1) / 2 = number of entries
     index = np.zeros((n, n), dtype=int)
     index[np.triu_indices(n)] = np.arange(pairs.shape[-1])
     return np.asarray(pairs[..., np.maximum(index, index.T)])
@@ -249,9 +249,10 @@ class WorstDirection:
 
 
 def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Return the mean of per-run values from their sums by batch, and its standard error from the scatter of batches.
+    """Return the mean of per-run values from their sums over batches, and its standard error from the batches' scatter.
 
-    `count`: number of runs in each batch.
+    With s_b the sum and c_b = `count` the runs of batch b, G batches with runs, and m the mean: the squared standard
+    error is G / (G - 1) sum_b (s_b - m c_b)^2 / (sum_b c_b)^2. It is NaN for fewer than two batches.
     """
     has_runs = count > 0
     sums, count = sums[has_runs], count[has_runs]
@@ -259,15 +260,15 @@ def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]
     groups = len(count)
     if groups < 2:
         return mean, float("nan")
-    # Batches may differ in their number of runs: sums less the mean times that number.
+    # Batches may differ in their number of runs, so each sum is compared with the mean times this number.
     scatter = np.sum((sums - mean * count) ** 2) * groups / (groups - 1)
     return mean, float(np.sqrt(scatter) / count.sum())
 
 
 def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Return the root of the mean of per-run values from their sums by batch, and its standard error.
+    """Return the root of the mean m of per-run values from their sums over batches, and its standard error.
 
-    d sqrt(m) = dm / (2 sqrt(m)). `count`: number of runs in each batch.
+    The error is se(sqrt(m)) = se(m) / (2 sqrt(m)), or 0 if m is 0. `count`: number of runs in each batch.
     """
     mean, error = _average_batches(sums, count)
     root = float(np.sqrt(mean))
@@ -277,14 +278,14 @@ def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
 
-    Each component is in units of its root of B_ii, and where that is zero of its root of A_ii. With W' B W = I the
-    eigenvalues are those of W' A W; the vectors d = W times its eigenvectors.
+    Each component is scaled by sqrt(B_ii), or by sqrt(A_ii) if B_ii is 0. W is chosen so that W' B W = I. The
+    eigenvalues are then those of W' A W, and the vectors d are W times its eigenvectors.
     """
     root_b, root_a = (np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 0.0)) for matrix in (b, a))
     unit = np.where(root_b > 0, root_b, np.where(root_a > 0, root_a, 1.0))
     scale = unit[..., :, None] * unit[..., None, :]
     eigenvalues, vectors = np.linalg.eigh(b / scale)
-    # W: B's eigenvectors over the roots of its eigenvalues, those of zero taken as rounding.
+    # W: B's eigenvectors over the roots of its eigenvalues, which count as at least one rounding error.
     whitening = vectors / np.sqrt(np.maximum(eigenvalues, np.finfo(float).eps))[..., None, :]
     values, rotated = np.linalg.eigh(np.swapaxes(whitening, -1, -2) @ (a / scale) @ whitening)
     return values, (whitening @ rotated) / unit[..., None]

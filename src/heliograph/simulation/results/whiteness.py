@@ -107,13 +107,13 @@ def memory_test(
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     lags: int = 10,
 ) -> MemoryTest:
-    """Return the test from data whether links have memory that a filter ignores.
+    """Return a test of data for memory of the links that a filter ignores.
 
-    The best linear filter's innovations are uncorrelated in time, and not independent: bursts come and go with the
-    modes. Standard errors therefore allow for correlation among the products w_k w_(k+t) (Newey and West).
+    The best linear filter's innovations w_k are uncorrelated in time, but they need not be independent, since bursts
+    come and go with the modes. Standard errors therefore allow for correlated products w_k w_(k+t) (Newey and West).
 
     Args:
-        data: measurements of the filter (steps, received), or without a filter innovations; NaN did not arrive.
+        data: measurements of the filter (steps, received), or innovations if there is no filter; NaN where missing.
         filter: a filter that claims a covariance; None by default.
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
         lags: number of lags; 10 by default.
@@ -133,7 +133,8 @@ def _scale_to_unit_power(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     """Return innovations (steps, m) of unknown covariance, each component in units of its own root mean square."""
     values = array("innovations", data, (None,) * max(rank("innovations", data), 1), missing=True)
     value = values[:, None] if values.ndim == 1 else values
-    largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
+    # Divide by the largest value before squaring, which may overflow.
+    largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)
     value = value / np.where(largest > 0, largest, 1.0)
     count = np.maximum(np.sum(~np.isnan(value), axis=0), 1)
     deviation = np.sqrt(np.nansum(value**2, axis=0) / count)
@@ -145,10 +146,10 @@ def whitened_innovations(
     filter: AbstractFilter,
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> Float[np.ndarray, "steps m"]:
-    """Return innovations of a recording in units of the filter's claim: white and of variance 1 where it holds.
+    """Return the innovations L^-1 (z - E z) of a recording, which are white and of variance 1 if the claim is true.
 
-    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could, and where a
-    filter that weighs gave less than half of a component's weight.
+    L L' is the claimed covariance of z - E z. A component is NaN if it did not arrive, if the components before it
+    determine it, or if a filter that weighs gave it a weight below 1/2.
 
     Args:
         data: measurements of the filter (steps, received), NaN where a component did not arrive.
@@ -173,15 +174,15 @@ def score_innovations(
     data: Float[ArrayLike, "steps m"],
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
+    """Return the log-likelihood of each step (steps,), and the whitened innovations L^-1 (z - E z) (steps, m).
 
-    NaN where it did not arrive, counted less than half, or the components before it determine it. The same as
-    `whitened_innovations`, in one pass with the likelihoods.
+    L L' is the claimed covariance of z - E z. A component is NaN if it did not arrive, if a filter that weighs gave it
+    a weight below 1/2, or if the components before it determine it.
 
     Args:
         filter: a filter that claims a covariance.
         data: its measurements (steps, m), NaN where a component did not arrive.
-        inputs: its inputs (steps, inputs); by default a filter without any is assumed.
+        inputs: its inputs (steps, inputs); by default a filter without inputs is assumed.
 
     Raises:
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
@@ -195,14 +196,14 @@ def score_innovations(
 
 
 def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
-    """Return each row's log-likelihood (steps,) and its innovation made white (steps, m), NaN where nothing arrived."""
+    """Return each row's log-likelihood (steps,) and whitened innovation (steps, m), NaN where nothing arrived."""
 
     def score_row(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return one row's log-likelihood and its whitened innovation (m,)."""
+        """Return one row's log-likelihood and its whitened innovation (m,), NaN for components that are not used."""
         is_used = ~jnp.isnan(innovation.value)
-        if innovation.weight is not None:  # what a filter left out, or nearly, does not count against it
-            is_used &= innovation.weight >= HALF  # half of a weight
-        # Components that are not used: 0 of variance 1, correlated with none.
+        if innovation.weight is not None:  # do not judge a filter by what it mostly left out
+            is_used &= innovation.weight >= HALF
+        # Replace components that are not used by 0 with variance 1 and no correlation.
         unit_if_unused = jnp.diag(jnp.where(is_used, 0.0, 1.0))
         covariance = jnp.where(is_used[:, None] & is_used, innovation.covariance, unit_if_unused)
         whitened = whiten(covariance, jnp.where(is_used, innovation.value, 0.0))

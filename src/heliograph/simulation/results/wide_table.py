@@ -86,13 +86,14 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
 
 
 def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
-    """Return the estimate of a node's filter from a table; `key`: that of its covariance, which says the claim.
+    """Return the estimate of a node's filter from a table.
 
-    `places` of the columns and `values` (run, time, component), by key.
+    A key is (node, filter, quantity). `key`: the key of the covariance, whose quantity says the claim. `places`: of
+    each key, the places of its columns. `values`: arrays (run, time, component) by key.
     """
     node, name, quantity = key
     mean, covariance = values[node, name, "mean"], values[key]
-    # The last level of a mean's columns numbers the states of attitudes, "0", "1" and so on; it is "" of all others.
+    # The last level of a mean's columns numbers the states of attitudes "0", "1" and so on. For others it is "".
     numbers = [frame.columns[i][LEVELS.index("other")] for i in places[node, name, "mean"]]
     attitude_states = len(numbers) - numbers.count("")
     return Estimate(
@@ -105,9 +106,10 @@ def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key,
 
 
 def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
-    """Return what quantizers sent, by fusion, its nodes side by side; `values` (run, time, component) by key.
+    """Return what quantizers sent to each fusion, with its nodes side by side.
 
-    A key: (node, fusion, quantity). SENT: the two quantities, whether a quantizer saturated and how many symbols.
+    `values`: arrays (run, time, component) by key (node, fusion, quantity). SENT: the two quantities, whether a
+    quantizer saturated and how many symbols it sent.
     """
     nodes_of: dict[str, list[str]] = {}
     for node, name, quantity in values:
@@ -121,9 +123,9 @@ def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
 
 
 def _keep_labels(columns: Sequence[Column]) -> Any:
-    """Return the column labels as an index of pandas, as they are: none becomes a number or a missing value.
+    """Return the column labels as a pandas index that keeps them as they are.
 
-    LEVELS: names of the parts of a label.
+    With levels of objects, pandas makes no label a number or a missing value. LEVELS: names of the parts of a label.
     """
     import pandas as pd
 

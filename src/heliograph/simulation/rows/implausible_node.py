@@ -69,16 +69,16 @@ class _RowWithoutNode(NamedTuple):
 def _judge_rows(
     filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
 ) -> Float[np.ndarray, "row filter 4"]:
-    """Return each filter's judgement whether measurements in these rows are plausible, from its states before them.
+    """Return each filter's judgement whether the measurements of these rows are plausible, from its states before.
 
-    The last axis: the fields of a Judgement. By native code where there is any, else by XLA.
+    The last axis holds the fields of a Judgement. Native code computes it, or XLA if there is none.
 
     Args:
-        filters: by name.
-        before: their states before each row of all, by name.
-        z: measurements for `rows` alone, one row each.
-        u: inputs of all rows.
-        rows: numbers of the rows to be judged, in which one may stand several times.
+        filters: the filters by name.
+        before: their states before each row of the recording, by name.
+        z: measurements, one row for each entry of `rows`.
+        u: inputs of all rows of the recording.
+        rows: numbers of the rows to be judged, which may repeat.
     """
     judgements = []
     for name, filter in filters.items():
@@ -93,9 +93,9 @@ def _judge_rows(
 
 
 def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
-    """Return a filter's judgement whether measurement z is plausible in step k with inputs u, from its state before."""
+    """Return a filter's judgement whether measurement z of step k is plausible, from its `state` before the step."""
     _, output = filter_step(filter, state, z, u, k, smooths=False, judges=True)
-    assert output.judgement is not None  # as it judges
+    assert output.judgement is not None  # since judges=True
     return output.judgement
 
 

@@ -104,10 +104,10 @@ def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterCo
 
 
 def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighingColumns]:
-    """Return where a row of outputs has what each filter that weighs made of its components, by node and filter.
+    """Return the columns in a row of outputs that say what filters that weigh made of their components.
 
-    `outcome`: outputs of a step, with the number of its column in place of each value; by kind of filter, None of kinds
-    that do not weigh. FUSED is the "node" of central filters.
+    They are given by (node, filter); central filters have the node FUSED. `outcome`: the outputs of a step with the
+    number of its column in place of each value, and None for kinds of filters that do not weigh.
     """
     columns_by_place = {
         name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
@@ -124,12 +124,13 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
 
 
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
-    """Return where a row of outputs has each field of a filter's judgement of its measurement, by node and filter.
+    """Return, by node and filter, the columns in a row of outputs that hold the fields of a filter's judgement.
 
-    `outcome`: outputs of a step, with the number of its column in place of each value. FUSED: of central filters.
+    `outcome`: the outputs of a step with the number of its column in place of each value. Central filters have the node
+    FUSED.
     """
     judged = {"estimates": outcome["judged"], "fused": {}}
-    # Each field of the judgements, of which the axes are the last two, (filter, node).
+    # Split each field of the judgements, whose last two axes are (filter, node).
     fields = range(len(JudgementColumns._fields))
     columns_by_field = [split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields]
     by_node = {

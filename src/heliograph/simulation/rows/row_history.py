@@ -31,9 +31,9 @@ class RowHistory(NamedTuple):
     outputs: PyTree
 
     def read_row(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the measurements, the inputs and the time of a row, which stand in it side by side.
+        """Return the measurements, the inputs and the time of a row, which stand side by side in `self.rows[row]`.
 
-        `held` has as many inputs as a row gives.
+        `self.held` (row, inputs) has a column for each input that a row gives.
         """
         inputs = self.held.shape[1]
         numbers = self.rows[row]
@@ -46,19 +46,20 @@ class RowHistory(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[row], self.state)
 
     def inputs_into_row(self, row: jax.Array, dt: int) -> jax.Array:
-        """Return the inputs that led to a row: those held before it, with the time since then at place `dt`."""
+        """Return the inputs that led to a row: those held at the previous row, and the time since it at place `dt`."""
         held_inputs = self.held[row - 1]
         _, _, time = self.read_row(row)
         _, _, time_before = self.read_row(row - 1)
         return jnp.concatenate([held_inputs[:dt], (time - time_before)[None], held_inputs[dt:]])
 
     def read_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return measurements and inputs at step k, which is the row's or one between it and the row before.
+        """Return measurements and inputs at step k, the row's own step or one between it and the previous row.
 
-        Between rows nothing is measured (NaN), and inputs are those held since the row before, as are inputs that the
-        row does not give (NaN).
+        Between rows nothing is measured (NaN), and the inputs held since the previous row apply. They also replace
+        inputs that the row does not give (NaN).
         """
         z, u_of_row, step_of_row = self.read_row(row)
-        is_row, held_inputs = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
-        u = jnp.where(is_row, jnp.where(jnp.isnan(u_of_row), held_inputs, u_of_row), held_inputs)
-        return jnp.where(is_row, z, jnp.nan), u
+        is_step_of_row, held_inputs = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
+        u_given_or_held = jnp.where(jnp.isnan(u_of_row), held_inputs, u_of_row)
+        u = jnp.where(is_step_of_row, u_given_or_held, held_inputs)
+        return jnp.where(is_step_of_row, z, jnp.nan), u

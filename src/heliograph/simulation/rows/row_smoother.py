@@ -49,20 +49,20 @@ class BackwardSweep(Module):
     def step(
         self, history: RowHistory, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, NetworkSmootherStep]:
-        """Step all filters by step k into a row, without measurements that were implausible there.
+        """Step all filters by step k, at or before a row, without measurements that they refused in this row.
 
         Args:
-            history: what the filters made of each row at first.
+            history: the rows, with the filters' states and outputs after each.
             row: number of the row.
-            state: of the filters before the step.
+            state: states of the filters before the step.
             received: measurements of all nodes at step k.
             u: inputs of the plant over the step.
-            k: number of the step, which is the row's or before it.
+            k: number of the step: the row's own, or an earlier one.
 
         Returns:
             The filters' states after the step, and their smoother steps.
         """
-        # Where the row was judged at first, with the reason not to use a measurement: that holds again.
+        # Refuse again the measurements that were refused when the row was filtered.
         by_kind, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
         z = self.network_step.group_measurements(received)
@@ -78,13 +78,13 @@ class BackwardSweep(Module):
     def make_estimates(
         self, steps: NetworkSmootherStep, later: PyTree
     ) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
-        """Return the smoothed estimates after a step: of nodes by kind, of the centre by name, with fused ones.
+        """Return the smoothed estimates after a step, those of nodes by kind, central and fused ones by name.
 
-        `steps`: smoother steps into it, what each filter's backward pass needs. `later`: each filter's Gaussian of the
-        state given all data, in the same form.
+        `steps`: the smoother steps into it, which hold what each filter's backward pass needs. `later`: for each
+        filter, the Gaussian law of the state given all data, in the same form.
         """
         by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
-        # Fusions find their estimates by number of the kind: kinds that cannot be smoothed are None, and not fused.
+        # Fusions find estimates by the number of the kind. Kinds that cannot be smoothed are None, and are not fused.
         estimates_by_kind = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
             no_state, step_number = (), jnp.asarray(0)
@@ -94,9 +94,10 @@ class BackwardSweep(Module):
 
 
 def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
-    """Return function(smoother step, ...) of every filter: of nodes by kind (filter, node, ...), central ones by name.
+    """Return function(smoother step, ...) of every filter, as a pair: nodes' filters by kind, and central ones by name.
 
-    `rest`: its further arguments, in the form of `steps`: a pair of both.
+    Results of a kind have leading axes (filter, node). `rest`: further arguments of the function, each a pair like
+    `steps`.
     """
     steps_by_kind, central_steps = steps
     function_of_stack = jax.vmap(jax.vmap(function))  # over filters and nodes
@@ -143,13 +144,14 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
         def step_back(
             i: jax.Array, carry: tuple[StepOfRow, NetworkSmootherStep, PyTree]
         ) -> tuple[StepOfRow, NetworkSmootherStep, PyTree]:
-            """Go one step back, i from 0 on: x_k|N from x_(k+1)|N and the smoother step into k + 1; at i = 0, x_N|N.
+            """Go one step back: return x_k|N, from x_(k+1)|N and the smoother step into k + 1.
 
-            The carry: the step k + 1 (row and number), the smoother step into it, and x_(k+1)|N of each filter.
+            `i` counts steps back from 0; at i = 0 the result is x_N|N, the filters' own estimates. The carry holds the
+            step k + 1 (row and number), the smoother step into it, and x_(k+1)|N of each filter.
             """
             place, steps_after, later = carry
             steps = step_into(sweep, history, place)
-            # From the estimate after the step, or at the last row from the filter's own.
+            # Smooth with the later estimate, except at the last row, where the filter's own estimate has all data.
             smoothed = _map_filters(lambda step, later: step.back(later), steps_after, later)
             filtered = _map_filters(lambda step: step.end, steps)
             later = jax.tree.map(lambda last, back: jnp.where(i == 0, last, back), filtered, smoothed)
@@ -169,9 +171,10 @@ def _make_step_into_row(dt: int) -> StepInto:
     """
 
     def step_into_row(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
-        """Return the smoother step into a row, of all filters, from their states after the row before.
+        """Return what the backward pass needs to smooth over the step into a row, for all filters.
 
-        `dt`: place of the time between rows among the inputs.
+        It is computed from their states after the previous row. `dt`: the place among the inputs of the time between
+        rows.
         """
         row, _ = step_of_row
         state = sweep.states_after(history, row - 1)
@@ -190,9 +193,10 @@ def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
 
 
 def _compute_step_into_k(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
-    """Return the smoother step into step k, what the backward pass needs of it, of all filters.
+    """Return what the backward pass needs to smooth over step k, for all filters.
 
-    They step on from the row before, without measurements up to k. `step_of_row`: the row that k is or leads to, and k.
+    The filters step on from the previous row, without measurements before k. `step_of_row`: the row at k or the next
+    row after it, and k.
     """
     row, k = step_of_row
 
@@ -257,13 +261,13 @@ class RowSmoother:
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
-        """Return the program for histories of this length, kept by length: native code, or XLA's where that refuses.
+        """Return the program for histories of this length: native code, or XLA if native code refuses it.
 
-        `_numbers`: the arrays of the sweep, which are the program's first arguments.
+        Programs are kept by length. `self._numbers`: the arrays of the sweep, which are the program's first arguments.
         """
         key = len(history.rows), read_forced_engine()
         if key not in self._programs:
-            # Rows from `begin` to `stop`; no argument has an axis of runs, since there is one run alone.
+            # `span`: first and last row. No argument has an axis of runs, since there is only one run.
             span = np.zeros(2, dtype=np.int32)
             choice = choose_code(self._run, (self._numbers, history, span), differs_by_run=[False] * 3)
             if choice.code is None:
@@ -304,9 +308,9 @@ def _take_only_run(results: PyTree) -> PyTree:
 
 
 def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Estimate:
-    """Return the estimate at an index (filter, node) of stacked ones, with this claim.
+    """Return the estimate at an index (filter, node) of stacked estimates, with this claim.
 
-    "none" where its mean is no number or its covariance is none.
+    The claim is lowered to "none" if the mean is not finite or the covariance is none.
     """
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
     mean, covariance = (np.asarray(stacked_values)[index] for stacked_values in (outputs.mean, outputs.covariance))
@@ -319,9 +323,9 @@ def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
 
 
 def _can_smooth(filter: AbstractFilter) -> bool:
-    """Return whether a filter can be smoothed: whether its steps return what a backward pass over the data needs.
+    """Return whether a filter's steps can return what a backward pass over the data needs.
 
-    Only the shapes of a step's result are computed; a filter that cannot be smoothed raises InputError.
+    Only the shapes of a step's result are computed, which raises InputError if the filter cannot be smoothed.
     """
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:

@@ -45,18 +45,17 @@ class NetworkStep(Module):
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
-        """Hold the filters, and by group of nodes the indices of each node's components in the joined measurement."""
+        """Store the filters and, by group of nodes, the indices of each node's components in the joined measurement."""
         self.filters = filters
         indices = {name: tuple(rows) for name, rows in network.rows.items()}
         self.places = tuple(tuple(indices[name] for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """Return all filters' states after step k, taken without implausible measurements, and the outputs.
+        """Return all filters' states after step k, without implausible measurements, and the outputs.
 
-        `received`: measurements of all nodes in their order.
-
-        The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
-        kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
+        `received`: measurements of all nodes in their order. The outputs are "estimates" by kind of filter and "fused"
+        by name, and the judgements of the measurements, "judged" by kind and "judged_centrally" by name. Filters that
+        weigh also have "weighed" by kind and "weighed_centrally" by name.
         """
         z = self.group_measurements(received)
         after, outputs = step_plausibly(self.filters, state, z, u, k)
@@ -88,7 +87,7 @@ class RowLayout(NamedTuple):
         return self.state.size + self.received + self.inputs + 1
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
-        """Return the filters' states, the measurements, the inputs and the step number, side by side in a row."""
+        """Return the filters' states, measurements, inputs and step number, which stand side by side in a row."""
         state, data_of_row = row[: self.state.size], row[self.state.size :]
         z, u = data_of_row[: self.received], data_of_row[self.received : self.received + self.inputs]
         k = data_of_row[-1].astype(np.int64)
@@ -150,10 +149,11 @@ class RowStep:
 
     @property
     def _rows_of_call_and_turn(self) -> tuple[int, int]:
-        """Return how many rows a call of XLA's program takes, and how many one turn of its loop.
+        """Return how many rows one call of XLA's program takes, and how many one turn of its loop.
 
-        The layout alone decides, so that a result depends on no number of rows. One turn steps at most TOGETHER rows in
-        parallel, one call at most WIDTH; fewer if rows are long, as NUMBERS_TOGETHER and NUMBERS limit their numbers.
+        The layout alone decides, so that a result does not depend on the number of rows. A turn steps at most TOGETHER
+        rows in parallel, and a call at most WIDTH rows. Long rows are fewer, since NUMBERS_TOGETHER and NUMBERS limit
+        the numbers in a turn and in a call.
         """
         longest = max(self._layout.size, self.state.size + self.outputs.size)
         together = min(max(NUMBERS_TOGETHER // longest, 1), TOGETHER)
@@ -186,14 +186,14 @@ class RowStep:
         step: Float[np.ndarray, " row"],
         outputs: Float[np.ndarray, "row output"],
     ) -> RowHistory:
-        """Return rows in order, with the states and outputs after each as they are laid out, for a `RowSmoother`.
+        """Return rows in order, with the states and outputs after each as trees, for a `RowSmoother`.
 
         Args:
             rows: measurements of all nodes, inputs, and the time.
             state: the filters' states after each row.
-            held: inputs held there.
-            step: number of the step.
-            outputs: what `RowStep` returned.
+            held: inputs held after each row.
+            step: number of each row's step.
+            outputs: what `RowStep` returned for each row.
         """
         return RowHistory(rows, self.state.tree(state), held, step.astype(int), self.outputs.tree(outputs))
 
@@ -202,9 +202,9 @@ class RowStep:
         return OneRowStep(self, None if self._code is None else self._code.make_in_place_code(1))
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
-        """Return the states and outputs after each row's step.
+        """Return the states and outputs after a row, which is given in parts that stand side by side.
 
-        `alone`: for calls with a single row, for which XLA needs no loop.
+        Native code computes them, or XLA if there is none (`self._code` is None). The next call overwrites the result.
         """
         if self._code is not None:
             stepped: np.ndarray = self._code(rows)
@@ -248,9 +248,9 @@ class OneRowStep:
 
 
 def _check_reports(filters: AllFilters) -> None:
-    """Raise ValueError for nodes' reports to a centre over random links.
+    """Raise ValueError if nodes report to a centre over random links.
 
-    A row says what a node measured, not which report arrived.
+    A row says what a node measured, but not which report arrived.
     """
     for name, by_report in filters.reporting.items():
         if by_report.uplinks.groups:
@@ -265,10 +265,11 @@ def _make_shape(shape: tuple[int, ...], dtype: Any) -> Any:
 
 @lru_cache
 def _make_step(layout: RowLayout) -> Any:
-    """Return the compiled function (numbers, row) -> (states after the row, outputs) of networks of one structure.
+    """Return the compiled function (numbers, row) -> (states after the row, outputs) for networks of one structure.
 
-    `numbers` are the arrays of a network's step: networks that differ in these alone share the function, and its trace
-    serves the layout of the outputs, the native code and the program's text. `layout.static`: all else of the step.
+    `numbers` are the arrays of a network's step. Networks that differ only in these share the function. Its trace
+    serves the layout of the outputs, the native code and the program's text. `layout.static`: everything else of the
+    step.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
@@ -282,9 +283,9 @@ def _make_step(layout: RowLayout) -> Any:
 
 @lru_cache
 def _make_row_function(layout: RowLayout) -> Any:
-    """Return the function (numbers, row) -> row of states and outputs, the same one for layouts that are equal.
+    """Return the function (numbers, row) -> row of states and outputs; equal layouts get the same function.
 
-    `numbers`: the arrays of a network's step, `layout`: all else of it, and where a row's parts stand.
+    `numbers`: the arrays of a network's step. `layout`: everything else of it, and where the parts of a row stand.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
@@ -296,9 +297,9 @@ def _make_row_function(layout: RowLayout) -> Any:
 
 
 def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
-    """Return the step of a row as JAX traces it, which it keeps for networks that differ in numbers alone.
+    """Return the step of a row as JAX traces it; JAX keeps the trace for networks that differ only in numbers.
 
-    `numbers`: shapes and types of the step's arrays. `layout`: all else of it, and the length of a row.
+    `numbers`: shapes and types of the step's arrays. `layout`: everything else of it, and the length of a row.
     """
     with jax.enable_x64(True):
         return _make_step(layout).trace(list(numbers), _make_shape((layout.size,), np.float64))
@@ -320,10 +321,10 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
     step = _make_row_function(layout)
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        """Return the states and outputs after each of `width` rows, zero behind the first `turns` turns of the loop.
+        """Return the states and outputs after each of `width` rows; only the first `turns` turns are computed.
 
-        A turn steps `together` rows in parallel; `numbers`: the arrays of a network's step. Closed over: `step` of one
-        row; `layout` and `outputs`, the lengths of a row's state and outputs.
+        A turn steps `together` rows in parallel. `numbers`: the arrays of a network's step. From outside: `step` of one
+        row; `layout` and `outputs`, with the lengths of a row's state and outputs.
         """
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:

@@ -40,7 +40,7 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
 
 
 def _find_default_folder() -> Path:
-    """Return the folder of compiled programs in the user's cache, which the variable XDG_CACHE_HOME or ~ tells."""
+    """Return the folder of compiled programs in the user's cache, in $XDG_CACHE_HOME or in ~/.cache."""
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "heliograph" / "compilations"
     try:
@@ -50,16 +50,16 @@ def _find_default_folder() -> Path:
 
 
 def _make_private(path: Path) -> None:
-    """Make a folder to which only its owner can write; raise ValueError if it is another user's but root's (number 0).
+    """Make a folder to which only its owner can write; raise ValueError if it belongs to another user than root.
 
-    PRIVATE: the mode of a folder of its owner alone; OTHERS_WRITE: the bits by which others may write.
+    PRIVATE: mode bits of a folder for its owner alone. OTHERS_WRITE: bits that let others write. Root is user 0.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=PRIVATE, exist_ok=True)
         status = path.stat()
         if hasattr(os, "getuid") and status.st_uid == os.getuid() and status.st_mode & OTHERS_WRITE:
-            path.chmod(PRIVATE)  # as an earlier release made it
+            path.chmod(PRIVATE)  # an earlier release made folders to which others could write
             status = path.stat()
     except OSError as error:
         raise _make_error(f"folder {path}", "one that can be made", error.strerror) from None

@@ -47,23 +47,23 @@ class RunLanes:
             together: advances all lanes at once, with a leading axis of lanes.
             start: makes the carry of a lane before its first block.
             first_run: number of the first run.
-            one_by_one: one lane at a time, for programs that decompose large matrices: two at once wait for each
-                other's threads forever.
+            one_by_one: True to run one lane at a time. Programs that decompose large matrices need this, since two at
+                once wait for each other's threads forever.
         """
         self.one_by_one = one_by_one
         self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
         devices, is_processor = len(jax.devices()), jax.default_backend() == "cpu"
         self.wide = devices > 1 or not is_processor
-        # Lanes: rounded up to a multiple of the devices.
+        # The number of lanes is rounded up to a multiple of the number of devices.
         lanes = LANES if is_processor else WIDE_LANES
         self.count = devices * -(-lanes // devices)
         self.carries: PyTree = [None] * self.count  # until a lane is used
         self.pool: ThreadPoolExecutor | None = None
 
     def advance(self, start: int, blocks: int) -> PyTree:
-        """Return what is collected of each run of `blocks` blocks, simulated from number `start` on, as NumPy arrays.
+        """Return what is collected of each run in `blocks` blocks from block number `start` on, as NumPy arrays.
 
-        A block is BLOCK runs; blocks are dealt to the lanes in turn, and put in order again.
+        A block is BLOCK runs. Blocks are dealt to the lanes in turn, and their results are put in order again.
         """
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
@@ -79,9 +79,9 @@ class RunLanes:
         """
 
         def advance_lane(lane: int) -> PyTree:
-            """Return what is recorded of one lane's runs, its sums carried on from its earlier blocks.
+            """Return what is recorded of one lane's runs, and add these runs to the lane's sums.
 
-            `lanes`: which of the blocks in `runs` are each lane's.
+            `lanes`: for each lane, which rows of `runs` are its blocks.
             """
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
@@ -93,10 +93,10 @@ class RunLanes:
         return list(self.pool.map(advance_lane, [lane for lane, blocks in enumerate(lanes) if len(blocks)]))
 
     def _run_on_devices(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Return what is recorded of each run, by lane: all lanes run at once, dealt to the devices.
+        """Return what is recorded of each run, by lane; all lanes run at once, dealt to the devices.
 
-        Arguments as of `_run_in_threads`; all lanes have as many blocks. `carries`: the lanes' sums so far, a list
-        before the first call, then stacked on the devices.
+        The arguments are those of `_run_in_threads`; here all lanes have equally many blocks. `self.carries`: the
+        lanes' sums so far, a list before the first call, and then stacked on the devices.
         """
         sharding = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
@@ -108,7 +108,7 @@ class RunLanes:
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
     def total(self) -> PyTree:
-        """Return the sum over all runs: that of the lanes' carries, their sums so far, always in the same order."""
+        """Return the sum over all runs: the lanes' sums so far (`self.carries`), added always in the same order."""
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
@@ -140,17 +140,17 @@ def add_sums(total: PyTree, more: PyTree) -> PyTree:
 
 
 def split_into_chunks(lanes: int, wide: bool, runs: int, chunk: int) -> list[range]:
-    """Return the numbers of the blocks of each chunk of runs, of about `chunk` runs; a block is BLOCK runs.
+    """Return for each chunk of about `chunk` runs the numbers of its blocks; a block is BLOCK runs.
 
-    A chunk has fewer blocks than there are lanes, or a multiple of their number; the last may go beyond the runs.
+    A chunk has fewer blocks than there are lanes, or a multiple of their number. The last may go beyond the runs.
 
     Args:
-        lanes: how many rows of blocks are computed side by side.
-        wide: always a multiple of it.
-        runs: how many there are.
-        chunk: how many a chunk should have.
+        lanes: how many blocks are computed side by side.
+        wide: True if a chunk must have a multiple of `lanes` blocks.
+        runs: number of all runs.
+        chunk: number of runs that a chunk should have.
     """
-    # Quotients are rounded up, -(-a // b).
+    # -(-a // b) is a / b rounded up.
     blocks_of_chunk = -(-min(chunk, runs) // BLOCK)
     if blocks_of_chunk >= lanes or wide:
         blocks_of_chunk = lanes * -(-blocks_of_chunk // lanes)
@@ -161,13 +161,13 @@ def split_into_chunks(lanes: int, wide: bool, runs: int, chunk: int) -> list[ran
 def advance_in_chunks(
     advance: Callable[[int, int], PyTree], chunks: list[range], runs: int, progress: Progress | None
 ) -> list[PyTree]:
-    """Return what is collected of each chunk, advancing over all blocks of BLOCK runs with progress in between.
+    """Return what is collected of each chunk of runs, and report progress after each.
 
     Args:
-        advance: over (number of the first block, count of blocks); returns what is collected.
-        chunks: what `split_into_chunks` returned of the runs.
-        runs: how many there are.
-        progress: is called with how many runs are done, and of how many.
+        advance: function (number of the first block, number of blocks) that simulates these blocks.
+        chunks: numbers of each chunk's blocks, from `split_into_chunks`. A block is BLOCK runs.
+        runs: number of all runs.
+        progress: called with (number of runs done, `runs`).
     """
     collected = []
     for blocks in chunks:
@@ -183,10 +183,11 @@ def count_runs_by_batch(first_run: int, stop: int) -> np.ndarray:
 
 
 def _order_blocks(recorded: np.ndarray, block_numbers: np.ndarray) -> np.ndarray:
-    """Return what was recorded of blocks of runs (block, BLOCK, ...) as (run, ...), in the order of the runs.
+    """Return results recorded by block of runs (block, BLOCK, ...) as (run, ...), in the order of the runs.
 
-    `block_numbers`: number of each block, as they were dealt to lanes.
+    `block_numbers`: number of each recorded block, since blocks were dealt to lanes.
     """
     ordered = np.empty_like(recorded)
     ordered[block_numbers] = recorded
-    return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero
+    # Not reshape(-1, ...), which fails if a length is zero.
+    return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])

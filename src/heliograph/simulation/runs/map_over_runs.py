@@ -23,14 +23,13 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     computes them, or XLA, `width` runs in parallel, for functions that native code does not support
     (`heliograph.engine.engine_of` says which).
 
-    Numbers keep the precision that they have in jax.numpy where doubles are enabled: of rows of float32 alone results
-    are float32, and with the numbers of a filter, which are doubles, they are doubles, bit for bit those of the same
-    rows as doubles. A filter computes in doubles, since in single precision a covariance is lost where variances differ
-    by ten million; `monte_carlo(precision="float32")` has filters that are written for it.
+    Precision follows jax.numpy with doubles enabled: rows of float32 alone give float32 results, but together with a
+    filter's numbers, which are doubles, they give doubles. A filter computes in doubles, since single precision loses a
+    covariance whose variances differ by ten million; `monte_carlo(precision="float32")` has filters written for it.
 
     Args:
-        function: of one run's arrays.
-        arrays: arrays (run, ...) of numbers, with one number of runs.
+        function: a function of one run's arrays.
+        arrays: arrays (run, ...) of numbers, all of the same number of runs.
         width: runs in parallel under XLA; 128 by default.
 
     Raises:
@@ -39,11 +38,11 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     if not callable(function):
         raise fail("function over runs", "a function of one run's arrays", show_value(function))
     check_count("width", width)
-    # Arrays of numbers with one leading axis.
+    # All arrays must have the same leading axis, and none may be empty.
     values = [_read_numbers(a) for a in arrays]
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
-    # Native code where it supports the function.
+    # Use native code if it supports the function.
     choice = choose_code(function, values, differs_by_run=[True] * len(values))
     return choice.results() if choice.code is not None else _apply_by_xla(function, values, width)
 
@@ -77,9 +76,9 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
 
 
 def _apply_in_blocks(function: Callable[..., PyTree], values: list[np.ndarray], blocks: int, width: int) -> PyTree:
-    """Return the function's results (run, ...) of `values` (run, ...), in so many blocks of `width` runs in parallel.
+    """Return the function's results (run, ...) of `values` (run, ...), computed in `blocks` blocks of `width` runs.
 
-    Missing runs are filled up, and their results are cut off again.
+    The runs of a block are computed in parallel. The last block is filled up with runs whose results are cut off again.
     """
     runs = len(values[0])
     padded = [_pad_runs(a, blocks * width) for a in values]
@@ -90,7 +89,7 @@ def _apply_in_blocks(function: Callable[..., PyTree], values: list[np.ndarray], 
 
 
 def _read_numbers(value: PyTree) -> np.ndarray:
-    """Return numbers as an array, masked ones (as of numpy.ma) as NaN; raise ValueError for anything else."""
+    """Return numbers as an array, with masked ones (of numpy.ma) as NaN; raise ValueError for anything else."""
     try:
         values = np.asarray(fill_masked(value))
     except ValueError:  # rows of different lengths

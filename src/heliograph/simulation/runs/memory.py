@@ -37,7 +37,10 @@ def count_bytes(tree: PyTree) -> float:
 
 
 def find_available_memory() -> float | None:
-    """Return the bytes that this machine can still give, at most all of its memory; None where it does not say."""
+    """Return the number of bytes that this machine can still give, or of all its memory if it does not say that.
+
+    The result is None if it says neither.
+    """
     try:
         lines = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
         return 1024.0 * int(lines["MemAvailable"].split()[0])
@@ -50,10 +53,9 @@ def find_available_memory() -> float | None:
 
 
 def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
-    """Raise ValueError for runs that need more memory than there is; do nothing where the machine does not say.
+    """Raise ValueError for runs that need more memory than there is, or do nothing if the available memory is unknown.
 
-    Raises:
-        ValueError: more is needed, with both numbers, the largest part, and what needs less.
+    The error names the needed and the available memory, the largest part, and what would need less.
     """
     total, free = sum(needed), find_available_memory()
     if free is None or total <= free:
@@ -67,11 +69,7 @@ def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
 
 @contextmanager
 def explain_out_of_memory(runs: int, horizon: int) -> Iterator[None]:
-    """Raise one line for memory that was not given after all, in place of an allocator's text, inside of a `with`.
-
-    Raises:
-        ValueError: an allocation that failed.
-    """
+    """Raise ValueError with one clear line if memory cannot be allocated within the `with` block."""
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:

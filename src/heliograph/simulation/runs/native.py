@@ -79,11 +79,11 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
     """Raise ValueError for runs that need more memory than there is.
 
     Args:
-        code: of the first part of a network; the others are no larger.
+        code: program of the first part of a network; the other parts are no larger.
         parts: how many parts the network was split into, whose results are held together.
-        runs: how many.
+        runs: number of runs.
         horizon: number of steps.
-        precision: in which runs are computed.
+        precision: the precision in which runs are computed.
 
     Raises:
         ValueError: more memory than is available.
@@ -93,14 +93,14 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
     threads = min(lanes, os.cpu_count() or 1)
     collected, sums, variables = code.begun.program.measure_memory(runs, lanes, threads)
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
-    # While the sums of a part are added up, the next part is computed.
+    # While the sums of one part are added up, the next part is computed, so that two are held at once.
     sums *= min(parts, 2)
     check_memory(NeededMemory(parts * collected, sums, variables), runs, horizon)
 
 
 @cache_by_object
 def _read_key(key: jax.Array) -> np.ndarray:
-    """Return the two words of a random key of JAX's default hash, Threefry, read once for all parts of a network.
+    """Return the two words of a random key of Threefry, JAX's default hash, read once for all parts of a network.
 
     Raises:
         Unsupported: a key of another hash, which native code does not compute.
@@ -129,10 +129,10 @@ class _KnownEntries:
 
     @classmethod
     def of(cls, array: np.ndarray) -> "_KnownEntries":
-        """Return what is known of an array when a program is made: shape, type, and which entries with which values.
+        """Return what is known of an array when a program is made: its shape and type, and the values of some entries.
 
-        Known are zeros and ones, or all whole numbers; all else is an argument of the program. Of an argument of more
-        than FEW numbers nothing is known.
+        Known are zeros and ones of real arrays, and all entries of other arrays that are no arguments. All else is an
+        argument of the program. Nothing is known of the entries of an argument with more than FEW numbers.
         """
         is_known = _find_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_argument(array))
         if array.size > FEW and _is_argument(array):
@@ -187,9 +187,9 @@ class _Structure(NamedTuple):
 
 
 def _split_arrays(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
-    """Return a tree's structure, which holds all leaves that are no arrays, and its arrays.
+    """Return a tree's structure, with all leaves that are not arrays, and its arrays.
 
-    `_Structure.restore` makes the tree of them again. Structures of equal known entries share a program.
+    `_Structure.restore` makes the tree of both again. Structures with equal known entries of arrays share a program.
     """
     leaves, structure = jax.tree.flatten(tree)
     is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
@@ -208,11 +208,10 @@ def _split_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
 def _find_program(
     world: _Structure, rest: _Structure, counting: bool, precision: Precision
 ) -> tuple[Any, Any] | Unsupported:
-    """Return the program that `_compile_program` makes, cached, or the reason why there is none, which is cached too.
+    """Return the program that `_compile_program` makes, or the reason why there is none; both are cached.
 
-    `world`, `rest`: all of what is simulated, and of what is made of it, but the arrays.
-
-    `counting` (JAX's way of counting draws) is only part of the cache's key: what is traced depends on it.
+    `world`, `rest`: everything but the arrays of what is simulated, and of what is computed from it. `counting`, JAX's
+    way of counting draws, is only part of the cache's key, since what is traced depends on it.
     """
     try:
         return _compile_program(world, rest, precision)
@@ -231,7 +230,7 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
     result_trees: list[Any] = []  # one, which is found when `run` is traced
 
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
-        """Return what is summed over runs, and what is kept of this one, from all arrays and, last, its number."""
+        """Return what is summed over runs, and what is kept of this run, from all arrays and, last, its number."""
         *arrays, number = leaves
         remaining = iter(arrays)
         world, (smoother, inputs, reducer) = of_world.restore(remaining), of_rest.restore(remaining)
@@ -240,7 +239,7 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
             reduced = _simulate_run(world, u, reducer, run_key)
         else:
             reduced = _simulate_smoothed_run(world, smoother, u, reducer, run_key)
-        # Sums over runs by batch; flags too, which hold for a batch if the sum is above zero.
+        # Flags are summed over runs like numbers: a flag holds for a batch of runs if its sum is above zero.
         sums, ever = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
         result_trees[:] = [jax.tree.structure(OfStep(sums, ever, reduced.collected))]
         return (sums, ever), reduced.collected
@@ -265,7 +264,7 @@ def _step_world(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Arra
 def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
     """Return what the reducer makes of one run with these inputs (horizon, inputs), stacked over time.
 
-    The world: plant, channels and filters. The reducer's flags (`ever`) hold if true at any step.
+    The world is plant, channels and filters. A flag of the reducer (`ever`) holds if it is True at any step.
     """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
@@ -282,7 +281,7 @@ def _simulate_smoothed_run(
 ) -> OfStep:
     """Return what the reducer makes of one run's filtered and smoothed estimates, as `reduce_run` does.
 
-    The world: plant, channels and filters; `smoother` smooths their estimates when the run is over.
+    The world is plant, channels and filters. `smoother` smooths their estimates when the run is over.
     """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
@@ -356,7 +355,7 @@ def _simulate_in_parts(
     results: list[Result] = []
 
     def finish_part(started: NativeRuns, part: Network) -> None:
-        """Append the result of the next of `parts` parts of a network to `results`; show its progress in the whole."""
+        """Append the results of the next of a network's `parts` parts to `results`; show progress in the whole."""
 
         def show_progress(done: int, total: int) -> None:
             if progress is not None:
@@ -391,9 +390,9 @@ def compile_network_runs(
     smoothing: SmoothingPlan | None = None,
     precision: Precision = "float64",
 ) -> NativeProgram:
-    """Return the native code of a network's runs, as `compile_runs` of its world: plant, channels and filters.
+    """Return the native code of a network's runs, compiled from its world: plant, channels and filters.
 
-    `smoothing`: the part of it whose estimates are smoothed, None for none.
+    `smoothing`: which estimates are smoothed; None for none.
     """
     world = build_world(network, None if smoothing is None else smoothing.kinds)
     smoother = None if smoothing is None else smoothing.smoother(world.filters)

@@ -46,15 +46,15 @@ class NativeRuns:
     def __init__(
         self, code: NativeProgram, first_run: int, runs: int, chunk: int, memory: list[list[np.ndarray]] | None = None
     ):
-        """Start the first chunk of runs, whose sums are kept for each of LANES lanes.
+        """Start the first chunk of runs; sums are kept for each of LANES lanes.
 
         Args:
             code: the program.
             first_run: number of the first run.
-            runs: how many.
-            chunk: how many between two reports of progress.
-            memory: sums of earlier runs that nobody needs, taken for those of these, and given back; None: new memory.
-                To allocate those of a few nodes and runs would take as long as to compute them.
+            runs: number of runs.
+            chunk: number of runs between two reports of progress.
+            memory: arrays of earlier runs' sums that can be used again, and are given back in the end; None allocates
+                new ones. For a few nodes and runs, allocating takes as long as computing.
         """
         self.code, self.first_run, self.runs = code, first_run, runs
         self.memory: list[list[np.ndarray]] = [] if memory is None else memory
@@ -63,9 +63,9 @@ class NativeRuns:
         self._first = self._start(self.chunks[0])
 
     def complete(self, progress: Progress | None) -> ReducedRuns:
-        """Return the sums over all runs, and what is collected of each, having computed all chunks but the first.
+        """Return the sums over all runs and what is collected of each run, after computing the remaining chunks.
 
-        `progress` is called after each chunk with how many runs are done, and of how many.
+        `progress` is called after each chunk with the number of runs done and the number of all runs.
         """
         collected_by_chunk = advance_in_chunks(self._advance, self.chunks, self.runs, progress)
         return self._total()._replace(collected=self._join_chunks(collected_by_chunk))
@@ -77,7 +77,7 @@ class NativeRuns:
         used = [lane for lane, runs in runs_of_lane.items() if len(runs)]
 
         def simulate_lane(lane: int) -> list[np.ndarray | None]:
-            """Return what is collected of a lane's runs, in a thread of its own; they are added to the lane's sums."""
+            """Return what is collected of a lane's runs, and add them to the lane's sums; runs in its own thread."""
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.make_zero_sums(self.memory)
             collected: list[np.ndarray | None] = self.code.begun.add_runs(runs_of_lane[lane], sums)
             return collected
@@ -88,12 +88,12 @@ class NativeRuns:
         )
 
     def _advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Return what is collected of the runs of `blocks` blocks from number `start` on, in order, by leaf of results.
+        """Return what is collected of the runs in `blocks` blocks from block `start` on, in order, as a list of leaves.
 
-        A leaf is (run, ...), None where all runs share it.
+        A leaf is (run, ...), or None if all runs share it.
         """
         running = self._first if start == self.chunks[0].start else self._start(range(start, start + blocks))
-        # Each leaf of all lanes, with the runs sorted by their numbers; None where all runs share it.
+        # Join each leaf over all lanes, and sort its runs by their numbers.
         order = np.argsort(running.runs, kind="stable")
         leaves: list[np.ndarray | None] = []
         for values_by_lane in zip(*running.collected_by_lane, strict=True):
@@ -125,9 +125,9 @@ class NativeRuns:
         return ReducedRuns(sums=sums, common=same, runs=count, collected=None)
 
     def _join_chunks(self, collected_by_chunk: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Return what is collected of all runs (run, ...), from what `_advance` returned of each chunk of them.
+        """Return what is collected of all runs (run, ...), from what `_advance` returned for each chunk.
 
-        A result that all runs share (`shared`, else None) is a view of one.
+        `shared`: by leaf, the value that all runs share, or None. A shared value is repeated as a view.
         """
         leaves: list[Any] = []
         for shared_value, *values_by_chunk in zip(self.code.begun.shared, *collected_by_chunk, strict=True):
@@ -135,7 +135,7 @@ class NativeRuns:
                 leaves.append(np.broadcast_to(to_double(shared_value), (self.runs, *shared_value.shape)))
             elif len(values_by_chunk) > 1 and values_by_chunk[0] is not None:
                 leaves.append(np.concatenate(values_by_chunk))
-            else:  # one chunk is not copied; None is what is not collected
+            else:  # a single chunk need not be copied; None: the leaf is not collected
                 leaves.append(values_by_chunk[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected
 

@@ -30,7 +30,7 @@ NODES = 4  # simulated by one program: the plant is simulated again for each so 
 def is_apart(network: Network) -> bool:
     """Return whether all nodes have filters and share nothing but the plant: no fusion, sensor, hop or memory.
 
-    Then a few nodes can be simulated by themselves, with the same results.
+    Then some of the nodes can be simulated alone with the same results.
     """
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
     all_have_filters = len(nodes) == len(network.nodes)
@@ -54,12 +54,11 @@ def count_parts(network: Network) -> int:
 
 @cache_by_object
 def split_nodes(network: Network) -> tuple[tuple[Network, World], ...]:
-    """Return networks of at most NODES nodes each, of one structure, and their worlds, of one whose nodes are apart.
+    """Return (network, world) for parts of at most NODES nodes of one structure, of a network whose nodes are apart.
 
-    Nodes are apart if they share nothing but the plant; a world is what is simulated: plant, channels and filters.
-
-    The nodes of a structure are stacked once, and a part takes its rows: to stack those of each part would take longer
-    than to simulate three hundred runs, and so would to split the network again for each simulation of it.
+    Nodes are apart if they share nothing but the plant. A world is what is simulated: plant, channels and filters.
+    The nodes of a structure are stacked once, and each part takes its rows. Stacking each part would take longer than
+    simulating three hundred runs, and so would splitting the network again for each simulation.
     """
     networks_with_worlds = []
     for names in network.groups:
@@ -95,7 +94,7 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
 
 
 def _with_fields(module: M, **changed: object) -> M:
-    """Return a copy of a module with these fields changed, without its constructor, which would compute them."""
+    """Return a copy of a module with these fields changed, made without its constructor, which would compute them."""
     changed_copy = object.__new__(type(module))
     for field in fields(module):
         value = changed.get(field.name, getattr(module, field.name))
@@ -104,7 +103,7 @@ def _with_fields(module: M, **changed: object) -> M:
 
 
 def _select_rows(world: World, nodes: slice) -> World:
-    """Return the world of some nodes of one whose nodes are all of one structure: their rows of all that is stacked."""
+    """Return the world of some nodes, from one whose nodes all have one structure: their rows of stacked arrays."""
     assert isinstance(world.medium, SeparateChannels)
 
     def select(leaf: PyTree) -> PyTree:
@@ -121,9 +120,9 @@ def _select_filters(stacked: StackedFilters, nodes: slice) -> StackedFilters:
     count = len(range(*nodes.indices(stacked.nodes)))
 
     def select(leaf: PyTree) -> PyTree:
-        """Return the rows of `nodes`, `count` of them, of an array (filter and node, ...), for each filter.
+        """Return, for each filter, the rows of `nodes` (`count` of them) of an array (filter and node, ...).
 
-        `stacked`: how many filters and nodes it has. Anything but an array is returned as it is.
+        `stacked`: how many filters and nodes the array has. Anything but an array is returned as it is.
         """
         if not eqx.is_array(leaf):
             return leaf

@@ -83,9 +83,9 @@ def filter_step(
 
 
 def get_weighed_components(innovation: Innovation) -> Weighed | None:
-    """Return value, variance and weight of each component of an innovation, of a filter that weighs; None of others.
+    """Return value, variance and weight of each component of an innovation, or None if the filter does not weigh.
 
-    A filter that weighs leaves out a part of what is unlikely: the weight is from 0 (left out) to 1.
+    A filter that weighs leaves out a part of what is unlikely. A weight is from 0 (left out) to 1.
     """
     if innovation.weight is None:
         return None
@@ -132,9 +132,10 @@ class StackedFilters(Module):
         def step_one(
             filter: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
         ) -> tuple[PyTree, StepOutput]:
-            """Return one filter's state after step k with inputs u, and the outputs of its step, at one node.
+            """Return one filter's state after step k with inputs u at one node, and the outputs of the step.
 
-            `skip`: code of the reason not to use z, 0 where it is used. `smooths`, `judges`: which outputs are wanted.
+            `skip`: the number of the reason not to use z, or 0 to use it. `self.smooths`, `self.judges`: whether
+            outputs for smoothing, and judgements, are wanted.
             """
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
@@ -152,16 +153,18 @@ class StackedFilters(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> PyTree:
-        """Return function(filter, state, z, u, k) of filter number f at each node, with a leading axis of nodes.
+        """Return function(filter, state, z, u, k) of one filter at each node, with a leading axis of nodes.
 
-        `states`: of all filters before step k. `z`: measurements (node, received).
+        `filter_number`: the number of the filter at its node.
+
+        `states`: states of all filters before step k. `z`: measurements (node, received).
         """
         filters, states = self.take_filter(filter_number, states)
         return map_all(lambda node, state, z: function(node, state, z, u, k), self.nodes)(filters, states, z)
 
     def take_filter(self, filter_number: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
-        """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
-        begin = filter_number * self.nodes  # all nodes of the first filter stand first, and so on
+        """Return filter number `filter_number` of each node and its state, both with a leading axis of nodes."""
+        begin = filter_number * self.nodes  # the stack has the first filter of all nodes, then the second, and so on
         rows = slice(begin, begin + self.nodes)
 
         def take_rows(leaf: PyTree) -> PyTree:
@@ -178,9 +181,9 @@ def initial_state(filter: AbstractFilter) -> PyTree:
 
 
 def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
-    """Return the function of stacks of `size` that applies a function of one to each; its arguments are arrays' rows.
+    """Return a function of stacks of `size` rows that applies `function` to each row.
 
-    `size` is given, since a stack may hold no array. One alone is not vectorised: that takes half as long to trace.
+    `size` is given, since a stack may hold no array. A single row is not vectorised, which halves the time to trace.
     """
     if size == 1:
         return partial(_apply_to_one, function)

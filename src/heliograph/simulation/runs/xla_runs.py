@@ -89,7 +89,7 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
 
 
 def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
-    """Return the leaves of `values` (or their shapes) on which some result of the function depends."""
+    """Return the leaves of `values` (numbers or their shapes) on which some result of the function depends."""
     leaves, tree = jax.tree.flatten(values)
 
     def call_with_leaves(*leaves: PyTree) -> PyTree:
@@ -97,7 +97,7 @@ def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> li
         return function(jax.tree.unflatten(tree, leaves))
 
     traced = jax.make_jaxpr(call_with_leaves)(*leaves)
-    # JAX's removal of dead code says which arguments are used.
+    # JAX's dead-code elimination tells which arguments are used.
     _, are_used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
     return [leaf for leaf, is_used in zip(leaves, are_used, strict=True) if is_used]
 
@@ -105,7 +105,8 @@ def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> li
 def _start_runs(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
     """Return the leaves of all runs' first states, which of them differ between runs, and their structure.
 
-    `init`: makes a run's first state of its key. Leaves that differ between runs are (..., run), others without runs.
+    `init`: makes a run's first state from its key. A leaf that differs between runs is (..., run); others have no axis
+    of runs.
     """
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
     varies = _mark_dependent_results(traced, [True])
@@ -122,7 +123,7 @@ def _drop_unused(program: ClosedJaxpr) -> ClosedJaxpr:
 def _find_dependent_variables(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
     """Return the variables of a traced program that depend on the inputs marked True.
 
-    Each operation is assumed to use all its arguments.
+    Each operation is assumed to use all of its arguments.
     """
     dependent = {variable for variable, is_marked in zip(program.jaxpr.invars, inputs, strict=True) if is_marked}
     for operation in program.jaxpr.eqns:

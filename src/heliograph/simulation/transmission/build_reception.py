@@ -48,7 +48,7 @@ def make_reception(network: Network) -> AbstractMedium:
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
-    """Return the medium of a network's relays: how they send to each other in slots, one after another in a step."""
+    """Return the medium of a network's relays, which send to each other in slots, one after another within a step."""
     number_of_listener = {name: i for i, name in enumerate(relays.filters)}
     listeners_by_group = [tuple(number_of_listener[name] for name in names) for names in network.groups]
     hops = {name: hop.channel for name, hop in find_hops_with_memory(relays).items()}
@@ -104,11 +104,11 @@ def _get_carrying_channel(node: Node) -> Channel:
 
 
 def _split_seeds(observed: tuple[AnySensor, Channel], seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which of the numbers that seed the memories of a sensor and a channel are the sensor's, and the channel's.
+    """Return the seeds of the sensor's memories and those of the channel's memories, out of the seeds of both together.
 
-    A memory that they share is in both.
+    A memory that both have is in both results.
     """
-    # A memory's identity: its name, or one of its own.
+    # `memories` returns {identity: memory}; an identity is the memory's name, or unique if it has none.
     seed_by_identity = dict(zip(memories(observed), seeds, strict=True))
     sensor, channel = observed
     of_sensor = [seed_by_identity[identity] for identity in memories(sensor)]

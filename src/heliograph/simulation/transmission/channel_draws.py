@@ -43,21 +43,21 @@ PLANT = "plant"  # whose memories others may share, with a name or without
 
 
 def number_memory_seeds(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
-    """Return by channel the numbers that seed its memories' draws, as of fading: equal ones for shared memories.
+    """Return for each channel the numbers that seed the draws of its memories, such as fading.
 
-    They come from the memories' names, or from the channel's where these have none.
+    Shared memories have equal numbers. A number comes from the memory's name, or from the channel's if it has none.
 
     Args:
-        channels: by name; each may be any tree of models, such as a sensor and its channel.
-        plant: a memory that it has too is the plant's.
+        channels: channels by name; each may be any tree of models, such as a sensor and its channel.
+        plant: the plant; a memory that it has too is seeded as the plant's.
 
     Raises:
-        ValueError: one name for memories that differ.
+        ValueError: memories that differ have one name.
     """
     of_plant = {identity: i for i, identity in enumerate(memories(plant))}
     # One object under many names is looked at once.
     channel_by_id = {id(channel): channel for channel in channels.values()}
-    memories((plant, tuple(channel_by_id.values())))  # raises where one name stands for memories that differ
+    memories((plant, tuple(channel_by_id.values())))  # raises if memories that differ have one name
     memories_of = {key: memories(channel) for key, channel in channel_by_id.items()}
     unique_memories(memory for by_identity in memories_of.values() for memory in by_identity.values())  # raises too
     numbers = {}
@@ -69,7 +69,7 @@ def number_memory_seeds(channels: Mapping[str, PyTree], plant: PyTree = ()) -> d
 
 
 def _name_source(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[str, int]) -> str:
-    """Return the name by which a memory's draws are seeded: its own, the plant's number of it, or the channel's.
+    """Return the name that seeds a memory's draws: the memory's own, or one by the plant, or one by the channel.
 
     `i`: number of the memory in the channel `name`. `of_plant`: numbers of the plant's memories, by identity.
     """
@@ -135,9 +135,10 @@ class LateChannelState(NamedTuple):
 
 
 def start_channel(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
-    """Return a channel's state before the first step of the run with this key; a late one's has past signals, zeros.
+    """Return a channel's state before the first step of the run with this key.
 
-    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
+    A channel that delivers late also keeps past signals, which are zeros here. `source`: the number that seeds its own
+    draws. `shared`: the numbers that seed those of its memories.
     """
     link, link_key = at(channel, k=0), draw_key(key, k=0, source=source, purpose=CHANNEL_START)
     keys = [draw_key(key, k=0, source=memory, purpose=MEMORY_START) for memory in shared]
@@ -155,9 +156,9 @@ def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[
 def move_modes(
     models: PyTree, states: tuple[jax.Array, ...], key: jax.Array, k: jax.Array, shared: MemoryNumbers
 ) -> tuple[jax.Array, ...]:
-    """Return the states of the memories (modes) of a plant or sensor at the step after k, drawn by the run's key.
+    """Return the states of the memories (modes) of a plant or sensor at the step after k, drawn with the run's key.
 
-    `shared`: numbers that seed their draws; memories of one number move alike.
+    `shared`: the numbers that seed their draws. Memories with one number move alike.
     """
     states_and_seeds = zip(memories(models).values(), states, shared, strict=True)
     return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in states_and_seeds)
@@ -166,13 +167,13 @@ def move_modes(
 def deliver_signal(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
-    """Return a channel's next state, and what it makes of y at step k, a late one of past signals too.
+    """Return a channel's next state, and what it delivers of y at step k; a late channel delivers past signals too.
 
-    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories. `matrix`: [G n; 0 1]
-    as drawn.
+    `source`: the number that seeds its own draws. `shared`: the numbers that seed those of its memories. `matrix` in
+    the code is the drawn [G n; 0 1].
     """
     link, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
-    if link.past:  # a late link carries y and the signals before it, the last first
+    if link.past:  # a late link carries y and the signals before it, the latest first
         signals = jnp.concatenate([y, state.line])
         after, matrix = _draw_link(link, state.channel, key, k, link_key, shared)
         return LateChannelState(after, signals[: -len(y)]), apply(matrix, signals)
@@ -183,9 +184,10 @@ def deliver_signal(
 def _draw_link(
     link: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
-    """Return a link's next state, and its matrix [G n; 0 1] drawn at step k, memories by keys of their own.
+    """Return a link's next state, and its matrix [G n; 0 1] drawn at step k.
 
-    `shared`: numbers that seed the memories' draws; `link_key`: of all other draws.
+    `shared`: the numbers that seed the draws of its memories, each with a key of its own. `link_key`: the key of all
+    other draws.
     """
     if not len(shared):
         return link.draw(state, link_key)

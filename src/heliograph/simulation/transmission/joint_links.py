@@ -87,7 +87,7 @@ def join_links(network: Network, states: int, counts_all: bool) -> JointLinks:
 
 
 def _read_constant_channel(channel: Channel) -> AbstractRandomAffine:
-    """Return a channel that neither varies nor delays nor tells its gain as it is; raise ValueError for another."""
+    """Return the channel as it is; raise ValueError if it varies over time, delays, or tells its gain in messages."""
     if isinstance(channel, OverTime):
         raise fail("channel", "one that does not vary", "one that varies")
     if channel.past:

@@ -44,15 +44,15 @@ class AbstractMedium(Module):
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, Measurements]:
-        """Return the medium's next state, and the measurements that nodes receive at step k, (node, received) by group.
+        """Return the medium's next state, and what the nodes receive at step k, (node, received) by group.
 
-        NaN where nothing arrives.
+        Numbers that do not arrive are NaN.
 
         Args:
-            state: of the medium before the step.
-            x: state of the plant (n,), to which u led.
+            state: state of the medium before the step.
+            x: state of the plant (n,) after the inputs u.
             u: inputs of the plant over the step.
-            key: of the run.
+            key: key of the run.
             k: number of the step.
         """
         raise unwritten(self, "receive")
@@ -128,7 +128,7 @@ class SeparateChannels(AbstractMedium):
         """Return the links' states before the first step by group, (node, ...); () of nodes without a sensor."""
 
         def start_node(group: NodeGroup) -> LinkState:
-            """Return the initial state of one node's link: channel, sender's rule, modes, and estimate fed back."""
+            """Return the initial state of one node's link: channel, sender's trigger, sensor's modes, and feedback."""
             feed_back = None if group.reference_filter is None else _get_initial_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
@@ -150,9 +150,9 @@ class SeparateChannels(AbstractMedium):
         """
 
         def receive_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> tuple[PyTree, jax.Array]:
-            """Return the state of the links of one group of nodes after the step, and what its nodes receive.
+            """Return the links of one group of nodes after the step, and what its nodes receive.
 
-            x: the plant's state, u: its inputs; a node without a sensor receives no numbers.
+            From outside: x, the plant's state, and u, its inputs. A node without a sensor receives no numbers.
             """
             if isinstance(group, NodesWithoutSensor):
                 return link, jnp.zeros((group.count, 0))
@@ -166,13 +166,13 @@ class SeparateChannels(AbstractMedium):
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Return the links' state with the present estimate of each filter that is fed back to its sensor.
 
-        `estimates`: of the nodes' filters by kind, (filter, node, ...).
+        `estimates`: the nodes' estimates by kind of filter, (filter, node, ...).
         """
 
         def feed_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> PyTree:
             """Return the links of one group of nodes with the estimates that are fed back to their senders.
 
-            `informed_at`: (kind, filter) whose estimates these are, None of groups without.
+            `group.informed_at`: (kind, filter) of these estimates, or None if nothing is fed back.
             """
             if group.informed_at is None:
                 return link
@@ -227,7 +227,8 @@ def _send_through_channel(
 ) -> tuple[jax.Array, jax.Array, PyTree]:
     """Return what was sent of y, what is received of it, and the channel's memory after step k.
 
-    An encoder sends words of few bits, carried by numbers of which the reader makes words again.
+    With an encoder, y is sent as words of few bits. The channel carries them as numbers, of which `group.reader` makes
+    words again.
     """
     if group.encoder is None or group.reader is None:
         memory, z = deliver_signal(group.channel, memory, y, key, k, group.checksums, group.memories)
@@ -261,9 +262,9 @@ class CommonChannel(AbstractMedium):
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, Measurements]:
-        """Return the channel's next state, and what each node receives through the one channel of all, by group.
+        """Return the channel's next state, and what each node receives through the one channel of all nodes, by group.
 
-        Each gets rows of its own (`rows`). Arguments as of `AbstractMedium`.
+        Each node gets its own rows of it (`self.rows`). The arguments are those of `AbstractMedium.receive`.
         """
         sensor, source = at(self.sensor, k), checksum(SENDER)
         y = measure(sensor, x, draw_key(key, k, source, SENSOR))

@@ -24,10 +24,10 @@ SENDER = checksum("transmit")
 
 
 def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0) -> Float[np.ndarray, "steps outputs"]:
-    """Transmit a recorded signal through a channel, with independent draws at each step; links with memory have theirs.
+    """Transmit a recorded signal y through a channel, z_k = G_k y_k + n_k, with new draws of G_k and n_k at each step.
 
-    z_k = G_k y_k + n_k. NaN in the signal was not sent: outputs that depend on it (G_k not zero there) are NaN, all
-    others arrive. The result is NaN too where the channel loses it.
+    Draws are independent unless the channel has memory. NaN in the signal was not sent: outputs to which G_k carries it
+    are NaN. Outputs that the channel loses are NaN too.
 
     Args:
         signal: (steps, inputs), or (steps,) for a channel with one input; a table of pandas or polars too.
@@ -60,11 +60,11 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
-        """Return the channel's next state, and what arrives of y in row k; `matrix`: the drawn [G n; 0 1]."""
+        """Return the channel's next state, and what arrives of y in row k, by the drawn `matrix` [G n; 0 1]."""
         k, y_k = row
         is_missing = jnp.isnan(y_k)
         state, matrix = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
-        # Outputs to which the gain carries a number that was not sent.
+        # An output lacks an input if the gain carries a number to it that was not sent.
         gain = matrix[:-1, :-1]
         lacks_input = jnp.any((gain != 0) & is_missing, axis=1)
         received = apply(matrix, jnp.where(is_missing, 0.0, y_k))
@@ -112,10 +112,10 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 
 
 def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (steps, m) of what a node received, and the delay of each (steps,), NaN where it is lost.
+    """Return the values (steps, m) of what a node received, and the delay of each row in steps (steps,).
 
-    In steps: 0 without a delay, the link's where it is constant, else the time stamp, which is the last number of each
-    row of z and is taken off.
+    The delay is 0 without delays, and the link's if that is constant. If messages have time stamps, it is the last
+    number of each row of z, which is taken off, and NaN for a lost message.
     """
     channel = node.channel if isinstance(node, Node) else None
     link = first(channel)

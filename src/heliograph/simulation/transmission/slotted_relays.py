@@ -116,7 +116,7 @@ class SlottedRelays(AbstractMedium):
         ) -> dict[str, jax.Array]:
             """Return what each listener receives at step k, by name, in the slot at this position of the stack.
 
-            `sent`: signal of each sender, `key`: of the run.
+            `sent`: the signal of each sender, by name. `key`: key of the run.
             """
             slot: PyTree = at(stacked, position) if isinstance(stacked, OverTime) else stacked
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
@@ -140,9 +140,9 @@ class SlotHop(NamedTuple):
 
 
 def find_hops_with_memory(relays: RelayNetwork) -> dict[str, SlotHop]:
-    """Return the hops whose channels have memory, by a name of slot, listener and sender.
+    """Return the hops whose channels have memory, by the name "SLOT LISTENER SENDER".
 
-    In each slot of a step, listeners have hops from those who send to them.
+    In each slot of a step, each listener has hops from those who send to it.
     """
     return {
         f"{number} {listener} {sender}": SlotHop(number, listener, sender, hop)
@@ -156,15 +156,15 @@ def find_hops_with_memory(relays: RelayNetwork) -> dict[str, SlotHop]:
 def _receive_sum(
     hops: Mapping[str, Channel], listener: str, size: int, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
 ) -> jax.Array:
-    """Return the sum of what arrives at a listener over its hops without memory; NaN where nobody sends to it.
+    """Return the sum of what arrives at a listener over its hops without memory, or NaN if nobody sends to it.
 
     Args:
-        hops: to the listener in this slot, by sender.
-        listener: its name.
+        hops: hops to the listener in this slot, by sender.
+        listener: name of the listener.
         size: how many numbers it receives.
         k: number of the step.
         sent: signal of each sender, by name.
-        key: of the run.
+        key: key of the run.
     """
     received = []
     for sender, hop in hops.items():
@@ -174,5 +174,5 @@ def _receive_sum(
             received.append(z)
     if received:
         return jnp.sum(jnp.stack(received), axis=0)
-    # Hops with memory alone are added elsewhere.
+    # If all hops have memory, the sum here is 0: the caller adds what arrives over these.
     return jnp.zeros(size) if hops else jnp.full(size, jnp.nan)
