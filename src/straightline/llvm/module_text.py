@@ -296,7 +296,7 @@ def _write_mover_call(
 def _request_rows_ahead(
     writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
-    """Let the longest loop, if there is one, prefetch the next block's inputs (`taken`) and this one's outputs (`given`).
+    """Let the longest loop, if there is one, prefetch the next block's inputs (`taken`) and its own outputs (`given`).
 
     `names` maps a buffer to the name of the pointer to its memory in LLVM's text.
     """
