@@ -93,7 +93,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
 
 
 def _parse_toml(text: str, name: str) -> dict[str, object]:
-    """Return the table of a campaign's TOML text; `name`: of its file, for errors."""
+    """Return the table in a campaign's TOML text; `name` is that of its file, for errors."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -220,7 +220,7 @@ def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureCho
 
 
 def name_undrawn_figures(names: Sequence[str], where: str) -> list[Text]:
-    """Return a text that names what is not drawn for lack of room, and `where` its numbers are; [] if `names` is empty."""
+    """Return a text that names what is not drawn for lack of room, and `where` its numbers are; [] without names."""
     if not names:
         return []
     return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]

@@ -116,7 +116,7 @@ class Translator:
         return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
 
     def left_out(self) -> list[str]:
-        """Return lines on messages that were not used, such as those of unknown topics, and on oddities in the others."""
+        """Return lines on messages that were not used, such as those of unknown topics, and on oddities in others."""
         lines, unknown = [], +self.sources.unknown  # counts by topic; the sign + leaves out zeros
         if unknown:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))

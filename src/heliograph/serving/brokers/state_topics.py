@@ -101,7 +101,7 @@ class _StateWriter(Connection):
                 self._publish(body)
 
     def _publish(self, body: bytes) -> None:
-        """Publish an estimate's states; with `discovery`, first tell Home Assistant of sensors that it does not know."""
+        """Publish an estimate's states; with `discovery`, first tell Home Assistant of sensors that are new to it."""
         topic = self._topics.address.topic
         if self._topics.discovery:
             for message in make_discovery_messages(topic, self._states, body, self._topics.discovery):

@@ -172,7 +172,7 @@ class Store:
             raise self._make_unreadable_error("no network that it is of") from None
 
     def _check_layout(self, carried: bool) -> None:
-        """Raise ValueError if the store has another layout, unless its plants are `carried` over and this is possible."""
+        """Raise ValueError if the store has another layout, unless its plants are `carried` over and can be."""
         layout, release = self.identity.get(LAYOUT_KEY), self.identity.get("heliograph", "an unknown release")
         if layout == LAYOUT or (carried and layout in CARRIED):
             return
