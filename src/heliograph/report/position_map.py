@@ -59,7 +59,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
 
 
 def _draw_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.ndarray, colour: str) -> None:
-    """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 with centre m and covariance P; draw nothing for an invalid P."""
+    """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 with centre m and covariance P, or nothing for a wrong P."""
     if not (np.isfinite(covariance).all() and np.isfinite(center).all()):
         return
     eigenvalues, vectors = np.linalg.eigh(covariance)

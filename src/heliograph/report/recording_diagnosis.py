@@ -215,7 +215,7 @@ class Health:
     def explains_all_innovations(self, health: FilterHealth, error: ConstantError) -> bool:
         """Return whether innovations without a constant error are as large as claimed and have no memory.
 
-        `error.white` are these innovations over their deviations, and `error.squares` their squares, NaN where none came.
+        `error.white` are these innovations over their deviations, and `error.squares` the squares, NaN where none came.
         """
         level = self._level_of_one_test() / error.squares.shape[1]
         for squares_of_output in error.squares.T:
@@ -392,7 +392,7 @@ def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "ste
 
 
 def _test_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
-    """Return the test of innovations' correlation between messages, or None for too few (up to LAGS, 10) or all zeros."""
+    """Return the test of innovations' correlation between messages, or None for too few (LAGS, 10) or all zeros."""
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):

@@ -73,7 +73,7 @@ class BurstLossLaw(NamedTuple):
 
     @staticmethod
     def fit_to_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "BurstLossLaw":
-        """Return the law of greatest likelihood: the shares of arrivals that follow one, and of losses that end a burst.
+        """Return the law of greatest likelihood: shares of arrivals that follow one, and of losses that end a burst.
 
         An interval of 1 is an arrival in the row after an arrival. An interval of k > 1 has k - 1 losses, and the last
         of them ends the burst.
