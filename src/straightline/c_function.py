@@ -132,9 +132,9 @@ def to_c(
 
 
 def _refuse_random_numbers(equations: Sequence[Any]) -> None:
-    """Raise Unsupported, with its line of code, for the first operation that draws random numbers.
+    """Raise Unsupported if an operation draws random numbers; the error names its line of code.
 
-    RANDOM are the beginnings of their names in JAX.
+    RANDOM holds the beginnings of such operations' names in JAX.
     """
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
@@ -181,7 +181,10 @@ def _write_assignments(source: CSource, results: Sequence[CArray], flat: Sequenc
 
 
 def _declare_function(name: str, arguments: Sequence[CArray], results: Sequence[CArray]) -> str:
-    """Return the head of a C function, with its arguments and results; one of over 100 characters on several lines."""
+    """Return the head of a C function, with its arguments and then its results.
+
+    A head of more than 100 characters has one argument a line.
+    """
     every = [*(x.argument_declaration for x in arguments), *(x.result_declaration for x in results)]
     line = f"void {name}({', '.join(every)})"
     return line if len(line) <= 100 else f"void {name}(\n    " + ",\n    ".join(every) + ")"
@@ -208,7 +211,10 @@ def _describe_results(
 
 
 def _is_symmetric(value: np.ndarray) -> bool:
-    """Return whether a matrix of nodes, of two rows or more, has the same node (operation) across its diagonal."""
+    """Return whether a square matrix of nodes is symmetric: entries (i, j) and (j, i) are the same node.
+
+    A node is a scalar operation. A matrix of one row does not count.
+    """
     if value.ndim != 2 or value.shape[0] != value.shape[1] or len(value) < 2:
         return False
     return all(value[i, j] is value[j, i] for i in range(len(value)) for j in range(i))
@@ -238,7 +244,10 @@ def _name_arrays(
 
 
 def _name_leaves(label: str, tree: PyTree) -> list[str]:
-    """Return a name in C for each array of a tree: `label` and its path, as in state_speed_0; other signs become _."""
+    """Return a name in C for each array of a tree: `label` and the array's path, as in state_speed_0.
+
+    Characters that C does not allow in a name become _.
+    """
     names = []
     for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]:
         # An entry of the path is an attribute's name, a dictionary's key, or an index.
@@ -255,11 +264,12 @@ def _find_code_line(operation: str, equations: Sequence[Any]) -> str:
 
 
 def _yield_equations(jaxpr: Any) -> Iterator[Any]:
-    """Yield all operations of a traced program, also those of programs within (loops, branches, calls)."""
+    """Yield all operations of a traced program, and those of the programs inside it (loops, branches, calls)."""
     for equation in jaxpr.eqns:
         yield equation
         for param in equation.params.values():
             for inner in param if isinstance(param, tuple | list) else (param,):
+                # A Jaxpr has `eqns`; a ClosedJaxpr holds one as `jaxpr`.
                 if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
                     yield from _yield_equations(getattr(inner, "jaxpr", inner))
 

@@ -40,23 +40,26 @@ class ZeroFoldingGraph(Graph):
         self.finite: set[Node] = set()  # numbers that are computed from these alone
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
-        """Return a node (scalar operation), 0 for a product of zero and a number that is finite whatever the data.
+        """Return the node of a scalar operation; zero times a number that is always finite is the constant 0.
 
-        The node is noted as finite (`self.finite`) if its arguments are and its operation is one of PRESERVING, whose
-        results are finite then, or a selection.
+        `self.finite` holds the nodes that are finite whatever the data. The new node joins them if its arguments are
+        finite and its operation keeps finite numbers finite: one of PRESERVING, or a selection.
         """
         if op == "mul" and type in REAL:
             for a, b in (args, args[::-1]):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
                     return self.constant(0.0, type)
         node = super().node(op, type, *args, value=value)
-        numbers = args[1:] if op == "select" else args  # of a selection the condition does not count
+        numbers = args[1:] if op == "select" else args  # args[0] of a selection is its condition, a flag
         if type in REAL and (op in PRESERVING or op == "select") and all(map(self._is_finite, numbers)):
             self.finite.add(node)
         return node
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Return the node of buffer[offset + sum strides * indices]; note it as finite if all of its buffer are."""
+        """Return the node of buffer[offset + sum strides * indices].
+
+        The node is noted as finite if all numbers of its buffer are known to be finite.
+        """
         made = super().load(buffer, offset, strides, indices)
         if buffer in self.finite_buffers:
             self.finite.add(made)
@@ -76,18 +79,20 @@ class CLowering(Lowering):
         self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Return the results of one operation of JAX; arithmetic is written out entry by entry.
+        """Return the results of one operation of JAX, with arithmetic written out entry by entry.
 
-        So arrays in memory are loaded first, unless they have more than LOADED numbers, or are only viewed (VIEWS).
+        Arithmetic needs nodes, so arrays in memory are loaded first. Not loaded are arrays of more than LOADED numbers,
+        and arguments of operations that only view an array (VIEWS).
         """
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
             inputs = [self.nodes(x) if isinstance(x, StridedArray) and x.size <= LOADED else x for x in inputs]
         return super().lower_equation(equation, inputs)
 
     def make_known_array(self, number: Any) -> Value:
-        """Return an array of known numbers as a table in memory, of which an entry at a known place is a constant.
+        """Return an array of known numbers as a table in memory.
 
-        Single numbers, empty arrays and keys of random numbers are made as elsewhere.
+        An entry of the table at a known place is read as a constant. Single numbers and empty arrays get no table:
+        the base class makes them. An array of objects holds nodes already, and is returned as it is.
         """
         if not isinstance(number, np.ndarray | np.generic | jax.Array) or not np.shape(number) or not np.size(number):
             return super().make_known_array(number)

@@ -54,7 +54,10 @@ UNSIGNED: dict[str, Callable[..., str]] = {
 
 
 def c_type(type: Type, real: Real) -> str:
-    """Return the C type of a number in the program; `real` is that of double precision, "double" or "float"."""
+    """Return the C type of a number in the program.
+
+    `real` is the C type in which numbers of double precision are computed: "double" or "float".
+    """
     if type in REAL:
         return real if type == "f64" else "float"
     return {"bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}[type]
@@ -136,16 +139,16 @@ def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
 
 
 def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
-    """Return the C expression of an operation on integers, defined where C leaves it open (overflow, long shifts).
+    """Return the C expression of an operation on integers, in a form that C defines for all arguments.
 
-    So it is computed on unsigned numbers. UNSIGNED and WHOLE are the templates by operation; the first has those that
-    are simpler for unsigned types.
+    C leaves signed overflow and long shifts undefined, so the operation is computed on unsigned numbers. WHOLE holds
+    a template for each operation; UNSIGNED holds simpler ones for operations on unsigned types.
     """
     bits, is_unsigned = int(type[1:]), type[0] == "u"
     unsigned, signed = f"uint{bits}_t", f"int{bits}_t"
     if is_unsigned and op in UNSIGNED:
         return UNSIGNED[op](*arguments, t=unsigned)
-    # A signed number is shifted by at most all bits but one, which leaves the sign.
+    # A longer shift becomes one by bits - 1, which leaves only copies of the sign.
     shift = arguments[-1]
     in_range = f"{shift} < {bits}" if is_unsigned else f"{shift} >= 0 && {shift} < {bits}"
     limited_shift = f"(({in_range}) ? {shift} : {bits - 1})"
@@ -174,10 +177,10 @@ def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
 
 
 def _write_bitcast(source: Type, target: Type, name: str, real: Real) -> str:
-    """Return the expression that reads the bits of a number as another type, by a union.
+    """Return the C expression that reads the bits of the variable `name` as another type, through a union.
 
-    Integers alone need none, but a cast. In the union a real number has its own width, whatever precision the C
-    computes in.
+    Two integer types need only a cast. `real` is the C type in which reals are computed. In the union an f64 is a C
+    double even if `real` is float, since the bits that are read are those of its own width.
     """
     if not {source, target} & REAL:
         return f"({c_type(target, real)}){name}"
@@ -198,26 +201,27 @@ class CSource:
     """
 
     def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
-        """Begin with no statement; `roots` are the nodes to compute, `places` tell where arguments are read.
+        """Begin a source without statements.
 
-        `real` is the type of numbers, and `prefix` begins the tables' names.
+        `roots` are the nodes to compute. `places` maps each argument's or result's buffer to a function that returns
+        the C text of its entry at an index. `real` is the C type of reals, and `prefix` begins the tables' names.
         """
         self.places, self.real, self.prefix = places, real, prefix
         self.needed = list_needed_items(roots)
         self.names: dict[Node, str] = {}  # variable of each node that is computed
         self.arrays: dict[Buffer, str] = {}  # local array of each buffer that is filled
         self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}  # name and definition, by type and numbers
-        self.operations: dict[str, int] = {}  # how many of each
-        self.count = 0  # of variables
+        self.operations: dict[str, int] = {}  # how often each operation was written
+        self.count = 0  # how many variables there are
 
     def name_node(self, node: Node) -> str:
         """Return the variable or literal of a number."""
         return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def _clip_to_range(self, node: Node) -> str:
-        """Return the text of a number that bounds a range; in float, a constant beyond float's largest becomes that.
+        """Return the text of an argument of min or max; in float, a constant is clipped to float's range.
 
-        Such a bound bounds no float, and `write_literal` would refuse it as a literal.
+        A constant beyond that range bounds no float, and `write_literal` would refuse it.
         """
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name_node(node)
@@ -262,7 +266,10 @@ class CSource:
         return f"v{self.count}"
 
     def _write_node(self, node: Node, indent: str) -> list[str]:
-        """Return the line of C that computes a node into a variable; none for a constant or what has a name already."""
+        """Return the line of C that computes a node into a new variable, as a list of one.
+
+        The list is empty for a constant, and for a node that a loop or a guard has named already.
+        """
         if node.op in ("constant", "counter", "parameter", "result", "guarded"):
             return []
         if node.op == "load":
@@ -278,8 +285,8 @@ class CSource:
     def _write_entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
         """Return the expression of buffer[offset + sum strides * indices] in C.
 
-        A buffer may be a part of a larger one, `whole`, from `start` on. That is a table of constants, an argument or
-        result (`places` says how an entry of it is written), or a local array.
+        `buffer.owner` is (whole, start): the buffer is the part of a larger one, `whole`, that begins at `start`.
+        `whole` is a table of constants, an argument or result (`places` writes its entries), or a local array.
         """
         whole, start = buffer.owner
         index = self._write_index(start + offset, strides, indices)
@@ -290,7 +297,7 @@ class CSource:
         return f"{self.arrays.setdefault(whole, f'a{len(self.arrays)}')}[{index}]"
 
     def _write_index(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
-        """Return the C expression offset + sum strides * indices, without factors 1 and a zero offset."""
+        """Return the C expression offset + sum strides * indices, without factors of 1 and without a zero offset."""
         terms = [
             f"{s} * {self.name_node(i)}" if s != 1 else self.name_node(i) for s, i in zip(strides, indices, strict=True)
         ]
@@ -337,9 +344,9 @@ class CSource:
         return [*lines, f"{indent}}}"]
 
     def _write_loop_head(self, loop: Loop) -> str:
-        """Return the `for` of a loop, with a counter if its length is known; note the name of the counter's node.
+        """Return the head of a C loop, and note the name of the counter's node.
 
-        A loop of unknown length ends by a check within it.
+        A loop of known length counts its turns. One of unknown length (None) is endless, and a check within it ends it.
         """
         if loop.length is None:
             return "for (;;) {"
@@ -349,10 +356,10 @@ class CSource:
         return f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
 
     def _write_guard(self, guard: Guard, indent: str) -> list[str]:
-        """Return the lines of a guarded block: an `if`; its results are zero where the condition does not hold.
+        """Return the lines of a guarded block: an `if` whose results are zero where the condition does not hold.
 
-        A result's variable is declared as 0 before, and gets its value at the block's end. `needed` are the nodes that
-        the C function's results need.
+        Each result's variable is declared as 0 before the `if`, and gets its value at the block's end. Results that
+        the C function does not need (`self.needed` holds those that it needs) are left out.
         """
         pairs = [(result, value) for result, value in zip(guard.results, guard.values, strict=True)
                  if result in self.needed]  # fmt: skip

@@ -11,16 +11,17 @@ from straightline.result_memory import align_to_cache_line
 
 
 def convert_to_memory(x: Any, dtype: Any) -> np.ndarray:
-    """Return an argument of a call as contiguous numbers of a type; a key of random numbers as its words.
+    """Return an argument of a call as a contiguous array of type `dtype`; a random key becomes its integer words.
 
-    Real numbers are not made whole ones: they are refused where an integer or a flag is expected.
+    Reals are not rounded to integers: ValueError is raised where an integer or a flag is expected and a real is given.
     """
     if type(x) is np.ndarray and x.dtype == dtype and x.flags.c_contiguous:
-        return x
+        return x  # it needs no copy
     if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jax.random.key_data(x)
     array = np.asarray(x)
-    if array.dtype.kind not in ("biuf" if np.dtype(dtype).kind == "f" else "biu"):
+    accepted_kinds = "biuf" if np.dtype(dtype).kind == "f" else "biu"  # b: flag, i and u: integer, f: real
+    if array.dtype.kind not in accepted_kinds:
         raise ValueError(f"arguments: expected numbers of type {np.dtype(dtype)}, got {array.dtype}")
     return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
 

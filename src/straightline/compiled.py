@@ -55,7 +55,7 @@ class CompiledFunction:
         self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
     def with_first_arguments(self, *arguments: PyTree) -> "CompiledFunction":
-        """Return a copy that has the same code, its first arguments (leaves) bound to these: calls leave them out."""
+        """Return a copy with the same code whose first arguments are bound to these; calls of it leave them out."""
         new, leaves = copy(self), jax.tree.leaves(arguments)
         new._first = [convert_to_memory(x, type) for x, type in zip(leaves, self.types, strict=False)]
         new._check_shapes(new._first, first=0, runs=new._count_runs(new._first))
@@ -73,7 +73,7 @@ class CompiledFunction:
         return InPlaceCode(self, runs, inputs)
 
     def generate_code(self, arrays: Sequence[Any] = ()) -> str:
-        """Generate machine code for a first call of these arrays; return why LLVM makes none, "" if it does."""
+        """Generate machine code for a first call of these arrays; return why LLVM makes none, "" if it makes code."""
         if self._refusal is None:  # the answer is kept: a later call generates nothing
             runs = self._count_runs(arrays)
             try:
@@ -96,7 +96,7 @@ class CompiledFunction:
         return 1 if self._by_run is None or self._by_run >= len(arrays) else len(arrays[self._by_run])
 
     def _convert_arguments(self, arguments: PyTree) -> list[np.ndarray]:
-        """Return the bound first arguments and a call's own, leaf by leaf, of the types and shapes that code has."""
+        """Return the bound first arguments and then a call's own, leaf by leaf, in the types that the code expects."""
         leaves, count = jax.tree.leaves(arguments), len(self._first)
         if len(leaves) != len(self.types) - count:
             raise ValueError(f"arguments: expected {len(self.types) - count} arrays, got {len(leaves)}")
@@ -105,7 +105,7 @@ class CompiledFunction:
         return arrays
 
     def _check_shapes(self, arrays: Sequence[np.ndarray], first: int, runs: int) -> None:
-        """Raise unless arrays, arguments from number `first` on, have their shapes, led by `runs` where runs differ."""
+        """Raise ValueError unless arguments from `first` on have their shapes, led by `runs` where runs differ."""
         expected = zip(arrays, self.shapes[first:], self.differs[first:], strict=False)
         for number, (x, shape, differs) in enumerate(expected, first):
             if x.shape != ((runs, *shape) if differs else shape):
@@ -145,10 +145,10 @@ class CompiledFunction:
         return jax.tree.unflatten(self.tree, outputs)
 
     def _compute_shared(self, arrays: list[np.ndarray], outputs: list[np.ndarray]) -> np.ndarray:
-        """Return the memory of what all runs share, computed from a call's arguments; copy shared results to `outputs`.
+        """Return the memory of the numbers that all runs share, and copy the shared results to `outputs`.
 
-        `once` computes it, None if there is nothing. It is kept for later calls where it follows from the bound first
-        arguments alone: where all others differ between runs.
+        `self.once` is the code that computes them, None if there are none. If all arguments but the bound first ones
+        differ between runs, `self._shared` keeps the memory for later calls.
         """
         if self.once is None:
             return allocate_aligned(self.code.shared)
@@ -167,7 +167,7 @@ class CompiledFunction:
         return np.array([*self._addresses, *own, *self._tables, *list_addresses([*outputs, shared])], dtype=np.uint64)
 
     def _compute_blocks(self, call: "MemoryOfCall", cores: int | None) -> None:
-        """Compute all blocks of a call, each the runs of one vector: here if that is little work, else in threads."""
+        """Compute all blocks (runs of one vector) of a call: in this thread if that is little work, else in several."""
         blocks, scratch = divide_rounded_up(call.runs, call.machine.width), self.code.scratch
         # Blocks that a thread computes at a time: an even share, but no less than is worth a thread.
         even_share = divide_rounded_up(blocks, (cores or cpu_count()) * SHARES)
@@ -178,7 +178,7 @@ class CompiledFunction:
         list(get_thread_pool().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_shared_outputs(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
-        """Copy the outputs that all runs share to every run, from their places (bytes) in the shared memory."""
+        """Copy the outputs that all runs share (`code.common`) from their bytes in shared memory to every run's row."""
         places = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
         for array, is_common, offset, buffer in places:
             if is_common:
@@ -231,10 +231,10 @@ class InPlaceCode:
             self._compute_shared(compiled.once)
 
     def _make_inputs(self, in_place: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """Return an array for each argument of a call: the one that is read in place, else a new one.
+        """Return an array for each argument of a call: the one in `in_place`, by its number, or else a new one.
 
         Raises:
-            ValueError: an array of another shape or type, or not contiguous; several runs that share all arguments.
+            ValueError: an array has another shape or type or is not contiguous, or several runs share all arguments.
         """
         compiled, left_out, runs = self._compiled, len(self._compiled._first), self.runs
         arguments = list(zip(compiled.shapes, compiled.types, compiled.differs, strict=True))[left_out:]
@@ -249,10 +249,10 @@ class InPlaceCode:
         return inputs
 
     def __call__(self) -> None:
-        """Compute `outputs` from `inputs`: first what all runs share, if it varies; here if little, else in threads."""
+        """Compute `outputs` from `inputs`: first what all runs share, if it may have changed, and then the runs."""
         if self._shared_varies and self._compiled.once is not None:
             self._compute_shared(self._compiled.once)
-        if self._is_common:
+        if self._is_common:  # all runs share all results
             return
         machine = self._tiers.choose_machine(self._blocks)
         if self._is_little:
@@ -277,19 +277,19 @@ class SingleRunCode:
         """Write and compile the code of one run, and allocate its memory; the class says what `in_place` is."""
         all_differ, (*_, fuses) = [True] * len(program.inputs), find_processor_features()
         self.code = write_module(program, differing=all_differ, width=1, fuse=fuses, alone=True, last=in_place)
-        level = int(self.code.operations <= ALONE)  # 1, with care, unless the program is long
+        level = int(self.code.operations <= ALONE)  # LLVM's: 1, but 0 for a program that would take long to compile
         self.machine, self.tree, self._in_place = emit_code(self.code.blocks, level, width=1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._allocate_memory([])
 
     def with_new_memory(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
-        """Return a copy with memory of its own; its `first` arguments are these arrays, which calls only read."""
+        """Return a copy of the same code with memory of its own; calls only read its first arguments, `first`."""
         new = copy(self)
         new._allocate_memory(first)
         return new
 
     def _allocate_memory(self, first: Sequence[np.ndarray]) -> None:
-        """Allocate the arrays of calls; results in `_in_place` (result: argument) are written over their argument."""
+        """Allocate the arrays of calls; results in `_in_place` (result: argument) share their argument's array."""
         given = zip(first, self._arguments, strict=False)
         self.inputs = [np.ascontiguousarray(x, type).reshape(shape) for x, (shape, type) in given]
         self.inputs += [np.zeros(shape, type) for shape, type in self._arguments[len(first) :]]
@@ -313,26 +313,26 @@ def compile(
     most: int | None = None,
     single: bool = False,
 ) -> CompiledFunction:
-    """Compile a JAX function of one run's arrays for many runs, in double precision or in single.
+    """Compile a JAX function of one run's arrays into native code for many runs.
 
     The result is called with arrays that have a leading axis of runs, and returns NumPy arrays that have one too. Runs
-    are computed side by side in the lanes of the processor's vectors, on all cores; what depends on shared arguments
+    are computed side by side in the lanes of the processor's vectors, on all cores. What depends on shared arguments
     alone is computed once. A run's bits depend neither on its neighbours nor on the number of cores.
 
     Args:
-        function: of one run's arguments, trees of arrays; any that JAX traces.
-        examples: arguments of one run, of which shapes and types count alone (numbers, arrays, `jax.ShapeDtypeStruct`).
-        shared: numbers of the arguments that all runs share, which calls give without the axis of runs; none by
+        function: a function of one run's arguments, which are trees of arrays. JAX must be able to trace it.
+        examples: arguments of one run: numbers, arrays or `jax.ShapeDtypeStruct`. Only their shapes and types count.
+        shared: positions of the arguments that all runs share. Calls give these without the axis of runs. None by
             default.
-        most: operations above which the function is refused; 400,000 by default.
-        single: whether numbers are float32, as those of JAX are by default, with twice as many runs in a vector; as
-            under `jax.enable_x64` unless so, where an array may still be of float32.
+        most: the largest number of operations; a longer function is refused. 400,000 by default.
+        single: whether numbers are float32, as in JAX by default; a vector then has twice as many runs. Otherwise the
+            function is traced under `jax.enable_x64`, where an array may still be of float32.
 
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
     find_processor_features()  # refuses a processor that LLVM does not know
-    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
+    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]  # leaf by leaf
     return CompiledFunction(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
 
@@ -344,16 +344,16 @@ def compile_one(
 ) -> SingleRunCode:
     """Compile a JAX function for one run that is computed again and again, such as a step of a controller.
 
-    The result has memory of its own: arrays `inputs` and `outputs`, leaf by leaf, and a call, which takes no arguments
-    and less than a microsecond beside the arithmetic, computes the one from the other. `again` makes another such
-    memory for the same code.
+    The result has memory of its own: lists of arrays `inputs` and `outputs`, one for each leaf. A call takes no
+    arguments: it computes `outputs` from `inputs`, and costs less than a microsecond beside the arithmetic.
+    `with_new_memory` makes a copy of the same code with other memory.
 
     Args:
-        function: of trees of arrays; any that JAX traces.
-        examples: arguments, of which shapes and types count alone.
-        in_place: which results, by their number among the leaves (from the last if negative), are written over which
-            arguments, by theirs; none by default.
-        single: whether numbers are float32; double unless so.
+        function: a function of trees of arrays. JAX must be able to trace it.
+        examples: arguments; only their shapes and types count.
+        in_place: maps a result to the argument that it is written over. Both are numbers of leaves; a negative result
+            counts from the last. Empty by default.
+        single: whether numbers are float32; by default they are double.
 
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
@@ -366,13 +366,13 @@ def compile_one(
 def explain(
     function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = (), single: bool = False
 ) -> str:
-    """Say of how many operations the code of a function would be, loads of arguments among them, or why there is none.
+    """Say how many operations a function's code would have, or why no code can be made.
 
     Args:
-        function: of one run's arguments, as for `compile`.
-        examples: arguments of one run, of which shapes and types count alone.
-        shared: numbers of the arguments that all runs share; none by default.
-        single: whether numbers are float32; double unless so.
+        function: a function of one run's arguments, as for `compile`.
+        examples: arguments of one run; only their shapes and types count.
+        shared: positions of the arguments that all runs share; none by default.
+        single: whether numbers are float32; by default they are double.
 
     Returns:
         "57 operations, 3 of them divisions and roots", or "refused: svd at model.py:12".

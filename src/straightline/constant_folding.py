@@ -38,7 +38,7 @@ class NodeMaker(Protocol):
 
 
 def wrap_integer(number: int, like: Any) -> Any:
-    """Return a number as an integer of the type of `like`: its lowest bits, as arithmetic that overflows has them."""
+    """Return the lowest bits of a number as an integer of the type of `like`, as overflowing arithmetic does."""
     integer_type, bits = type(like), 8 * like.itemsize
     lowest_bits = number % (1 << bits)
     is_negative = lowest_bits > np.iinfo(integer_type).max  # as a signed number in two's complement
@@ -57,9 +57,9 @@ def _shift_right(a: Any, b: Any) -> Any:
 
 
 def _shift_right_signed(a: Any, b: Any) -> Any:
-    """Return a >> b with copies of the highest bit from the left, also of an unsigned a.
+    """Return a >> b, filled from the left with copies of the highest bit of a, even if a is unsigned.
 
-    All bits are such copies if b is below 0, or the number of bits or more.
+    If b is negative, or at least the number of bits, every bit of the result is such a copy.
     """
     highest = 8 * a.itemsize - 1  # number of the highest bit
     is_negative = int(a) >> highest == 1  # an unsigned number whose highest bit is set is read as one below zero
@@ -69,14 +69,17 @@ def _shift_right_signed(a: Any, b: Any) -> Any:
 
 
 def _divide(a: Any, b: Any) -> Any:
-    """Return a / b; of integers rounded toward zero, by 0 all bits set, and the least one by -1 itself, as XLA does."""
+    """Return a / b as XLA does; integers are rounded toward zero.
+
+    An integer divided by 0 gives -1 (all bits set). The least integer divided by -1 overflows to itself.
+    """
     if isinstance(a, np.floating):
         return np.divide(a, b)
     return wrap_integer(_divide_toward_zero(int(a), int(b)) if b else -1, a)
 
 
 def _remainder(a: Any, b: Any) -> Any:
-    """Return what is left of a / b, with the sign of a; of an integer by 0 all of a is left."""
+    """Return the remainder of a / b, which has the sign of a; an integer's remainder by 0 is a itself."""
     if isinstance(a, np.floating):
         return np.fmod(a, b)
     return wrap_integer(int(a) - _divide_toward_zero(int(a), int(b)) * int(b) if b else int(a), a)
@@ -109,9 +112,10 @@ def _round_away(a: Any) -> Any:
 
 
 def _power(a: Any, b: Any) -> Any:
-    """Return a^b as the C library does, by math.pow; NumPy takes the root for b = 1/2, also of -0 and -infinity.
+    """Return a^b as the C library does, by math.pow.
 
-    Where math.pow raises an error, NumPy's infinity or NaN is C's too.
+    NumPy's power is not used: for b = 1/2 it takes the square root, which differs at -0 and -infinity. Where math.pow
+    raises an error, NumPy's infinity or NaN is also the C library's result.
     """
     try:
         return type(a)(math.pow(a, b))
@@ -120,9 +124,9 @@ def _power(a: Any, b: Any) -> Any:
 
 
 def _convert_number(a: Any, kind: Any) -> Any:
-    """Return a number as one of the type `kind`.
+    """Return a number converted to the type `kind`.
 
-    A real one as an integer is truncated, the type's limit where it is beyond, and 0 of NaN.
+    A real number is truncated to an integer. Beyond the integer type's limits it becomes the limit, and NaN becomes 0.
     """
     if not isinstance(a, np.floating) or kind in (np.float64, np.float32, np.bool_):
         return a.astype(kind)
@@ -148,9 +152,9 @@ EVALUATED: dict[str, Callable[..., Any]] = {
 
 
 def fold_node(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
-    """Return an existing or simpler node of the same value as op(args), a constant if all args are; None if none is.
+    """Return a simpler node of the same value as op(args), or None if there is none.
 
-    SIMPLER has a rule for the operations that can be simplified.
+    It is a constant if all arguments are. SIMPLER holds a rule for each operation that can be simplified.
     """
     if all(a.op == "constant" for a in args):
         return _evaluate(graph, op, type, args)
@@ -189,11 +193,14 @@ def _is_constant(node: Node, number: float) -> bool:
 
 
 def is_finite(node: Node) -> bool:
-    """Return whether a number is known to be finite (no NaN, no infinity) whatever the data; False if not known."""
+    """Return whether a number is known to be finite (neither NaN nor infinite) whatever the data.
+
+    False means that it is not known.
+    """
     if node.type not in REAL or (node.op == "constant" and math.isfinite(node.value)):
         return True
     if node.op == "convert":
-        return node.args[0].type not in REAL
+        return node.args[0].type not in REAL  # an integer or a flag becomes a finite real
     return node.op == "select" and all(is_finite(a) for a in node.args[1:])
 
 
@@ -214,7 +221,8 @@ def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Return a simpler node for a - b, by x - 0 = x, -0 - x = -x and a - (-x) = a + x; None if nothing is simpler."""
     if _is_constant(b, 0):
         return a
-    if type in REAL and _is_constant(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
+    # -0 - x is -x, but +0 - x is not: at x = 0 it is +0, and -x is -0.
+    if type in REAL and _is_constant(a, 0) and math.copysign(1, a.value) < 0:
         return graph.node("neg", type, b)
     if type in REAL and b.op == "neg":
         return graph.node("add", type, a, b.args[0])
@@ -242,7 +250,7 @@ def _fold_mul(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_div(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Return a / b for a power of two b as the product with its reciprocal, which is exact; None for any other b."""
+    """Return a / b as the product a (1/b) if b is a power of two, where this is exact; None for any other b."""
     if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
     # A power of two has the mantissa 1/2; both it and its reciprocal must be normal numbers.
@@ -325,9 +333,10 @@ def _make_equality_rule(op: str) -> Callable[..., Node | None]:
     """Return the rule that simplifies == or !=."""
 
     def fold_flag_comparison(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-        """Return a comparison (`op` is "eq" or "ne") of a flag with 0 or 1 as the flag or its negation; else None.
+        """Return a simpler node for a comparison by `op` ("eq" or "ne"), or None if there is none.
 
-        One of a number with itself is a constant, unless that may be NaN, which equals nothing.
+        A comparison of a flag with 0 or 1 becomes the flag or its negation. A comparison of a number with itself is a
+        constant, unless the number may be NaN, which does not equal itself.
         """
         if a is b and (a.type not in REAL or a in graph.never_nan or is_finite(a)):
             return graph.constant(op == "eq", "bool")
@@ -350,9 +359,9 @@ def _make_flag_order_rule(strict: bool, turned: bool) -> Callable[..., Node | No
     """
 
     def fold_flag_order(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-        """Return the order of two flags, false before true, as logic, since LLVM compares no flags; None of numbers.
+        """Return a comparison of the order of two flags as logic, where false < true; None for numbers.
 
-        `strict`: a < b rather than a <= b; `turned`: b comes first.
+        LLVM cannot compare flags by order. `strict`: the comparison is < rather than <=. `turned`: b is on the left.
         """
         if a.type != "bool":
             return None
@@ -364,9 +373,10 @@ def _make_flag_order_rule(strict: bool, turned: bool) -> Callable[..., Node | No
 
 
 def _fold_convert(graph: NodeMaker, type: Type, a: Node) -> Node | None:
-    """Return a simpler node for a converted to a type: itself if it has it, what it was before if nothing was lost.
+    """Return a simpler node for a conversion of `a` to `type`, or None if there is none.
 
-    A flag is written as a != 0. None where nothing is simpler.
+    If `a` has the type already, it is `a`. A float that was converted to double and goes back is the first float.
+    A conversion to a flag becomes the comparison a != 0.
     """
     if a.type == type:
         return a

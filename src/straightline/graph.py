@@ -28,7 +28,7 @@ class Graph:
         self.never_nan: set[Node] = set()  # nodes that are known not to be NaN, whatever the data
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
-        """Return a node of an operation: a constant, a simpler or an equal node that exists, or a new one.
+        """Return the node of an operation: a constant, a simpler node, an equal node that exists, or a new node.
 
         Arguments of COMMUTATIVE operations are put in one order, so that a + b and b + a are one node.
         """
@@ -40,7 +40,10 @@ class Graph:
         return self._find_or_make(op, type, args, value)
 
     def constant(self, value: Number, type: Type) -> Node:
-        """Return the node of a constant, one for equal ones, rounded to single precision if it is of that type."""
+        """Return the node of a constant; equal constants share one node.
+
+        A constant of type "f32" is rounded to single precision.
+        """
         value = DTYPES[type](value).item() if type == "f32" else value
         key = (type, value if value != 0 or type not in REAL else str(value))  # 0.0 == -0.0, but they differ
         node = self.top.seen.get(key)
@@ -49,10 +52,10 @@ class Graph:
         return node
 
     def make_fresh_node(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
-        """Return a new node, that no other stands for, with the next number (`serial`); no block contains it yet.
+        """Return a new node with the next serial number, even if an equal one exists; no block contains it yet.
 
         Raises:
-            Unsupported: a program of too many operations.
+            Unsupported: the program has more than `max_nodes` nodes.
         """
         self.serial += 1
         if self.serial > self.max_nodes:
@@ -61,9 +64,10 @@ class Graph:
 
     @contextmanager
     def limit_new_nodes(self, count: int) -> Iterator[None]:
-        """Allow so many more nodes within the block; one more raises Unsupported, as does one above the whole limit.
+        """Allow at most `count` new nodes inside the `with` block, within the whole limit; more raise Unsupported.
 
-        At the end, also then, the limit is as before, and the block of operations that was open is open again.
+        `serial` counts the nodes that exist, and `current` is the block of operations that is open. After the `with`
+        block, even after an exception, both the limit and the open block are as before.
         """
         before, block = self.max_nodes, self.current
         self.max_nodes = min(before, self.serial + count)
@@ -73,14 +77,18 @@ class Graph:
             self.max_nodes, self.current = before, block
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Return the node of buffer[offset + sum strides * indices], no further out than the block that fills that."""
+        """Return the node of buffer[offset + sum strides * indices].
+
+        It lies in no block outside the one that fills the buffer (`buffer.block`). `buffer.first` says of each place
+        in a row which earlier place surely holds the same number; it is empty if nothing is known.
+        """
         # Indices that are known become part of the offset; `varying` are the strides and indices of all others.
         varying = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
         if buffer.table is not None and not varying:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
-        # If the other indices choose a row alone, it is known which entry of the row is loaded: of entries that are the
-        # same number (`first`), the first one.
+        # If the other indices only choose a row, it is known which place of the row is loaded. Load instead the first
+        # place that holds the same number.
         row_length = len(buffer.first)
         if row_length and all(s % row_length == 0 for s, _ in varying):
             offset += buffer.first[offset % row_length] - offset % row_length

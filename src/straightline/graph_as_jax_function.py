@@ -38,7 +38,10 @@ class _JaxEvaluation:
     """Values of nodes and numbers in memory while JAX traces the function."""
 
     def __init__(self, program: Program):
-        """Find the nodes that a program's results need; raise Unsupported where a result is a random key."""
+        """Find the nodes that a program's results need (`needed`); raise Unsupported if a result is a random key.
+
+        `values` will hold the value of each node, and `memory` the flat array of each buffer.
+        """
         self.program = program
         nodes = [n for x in program.outputs if not isinstance(x, StridedArray) for n in x.ravel().tolist()]
         if not all(isinstance(n, Node) for n in nodes):
@@ -48,9 +51,10 @@ class _JaxEvaluation:
         self.memory: Memory = {}
 
     def evaluate(self, arrays: tuple[Any, ...]) -> list[jax.Array]:
-        """Return the results for these arguments, leaf by leaf, by JAX operation for operation of the graph.
+        """Return the results for these arguments, leaf by leaf: each operation of the graph is computed by JAX.
 
-        Memory are flat arrays by buffer: inputs, tables, and zeros for what the program will fill.
+        `self.memory` maps each buffer to a flat array. Inputs and tables begin with their numbers, and buffers that
+        the program fills begin with zeros.
         """
         for buffer, array in zip(self.program.inputs, arrays, strict=True):
             self.memory[buffer] = jnp.asarray(array, DTYPES[buffer.type]).reshape(-1)
@@ -61,10 +65,10 @@ class _JaxEvaluation:
         return [self._gather_result(x) for x in self.program.outputs]
 
     def _gather_result(self, value: Any) -> jax.Array:
-        """Return an array of the result: its nodes' values stacked, or read from memory.
+        """Return a result as an array: either its nodes' values stacked, or its numbers read from memory.
 
-        There, entry (i, j, ...) lies at start + offset + strides * (i, j, ...) + the sum of the moves, each a stride
-        times the value of a node.
+        In memory, entry (i, j, ...) lies at start + offset + strides . (i, j, ...) + sum_k s_k x_k. `value.moves` holds
+        pairs (s_k, n_k) of a stride and a node, and x_k is the value of the node n_k.
         """
         if not isinstance(value, StridedArray):
             numbers = [self.value(n) for n in value.ravel().tolist()]
@@ -99,7 +103,10 @@ class _JaxEvaluation:
                 self.values[statement] = self._evaluate_node(statement)
 
     def _evaluate_node(self, node: Node) -> jax.Array:
-        """Return a node's value, by the operation of JAX that has its name, or that OPERATIONS has for it."""
+        """Return a node's value, computed by JAX.
+
+        OPERATIONS maps some names of operations to functions; any other is the function of `jax.lax` of that name.
+        """
         if node.op == "load":
             buffer, offset, strides = node.value
             return self.memory[buffer.owner[0]][self._locate_entry(buffer, offset, strides, node.args)]
@@ -136,10 +143,10 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
-            """Set `self.values` and `self.memory` as a turn begins: those from outside the loop, and the carry.
+            """Set `self.values` and `self.memory` to what they are when a turn of the loop begins.
 
-            The carry is a pair: the numbers of the parameters whose places are `carried`, and the arrays of the
-            buffers `filled`, which the loop fills.
+            They hold what is known outside the loop, and the carry. The carry is a pair: numbers, one for each
+            parameter whose place is in `carried`, and arrays, one for each buffer in `filled`.
             """
             numbers, arrays = carry
             self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
@@ -148,13 +155,17 @@ class _JaxEvaluation:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
         def run_turn(counter: Any, carry: PyTree) -> PyTree:
-            """Return the carry after a turn: the `carried` numbers for the next, and what the buffers `filled` hold."""
+            """Return the carry after a turn of the loop.
+
+            It is a pair: the numbers that the next turn gets for the parameters in `carried`, and the arrays that the
+            buffers in `filled` hold.
+            """
             begin_turn(carry, counter)
             self.evaluate_block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
 
         def goes_on(carry: PyTree) -> jax.Array:
-            """Return the loop's condition, after the part of the body before its check."""
+            """Return whether the loop goes on: compute the body up to its check, and return the loop's condition."""
             begin_turn(carry, 0)  # a loop that ends by a condition has no counter
             check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, LoopExit))
             self.evaluate_block(loop.body.items[:check])
@@ -176,10 +187,10 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(guard.body), self.values, self.memory
 
         def evaluate_body() -> PyTree:
-            """Return the guarded block's values that are used outside it, and what the buffers that it fills hold.
+            """Return the guarded block's values that are used outside it, and the arrays of the buffers that it fills.
 
-            `used` are the places of the former in `guard.values`, `filled` are the latter. `self.values` and
-            `self.memory` begin as they are outside of the block.
+            `used` holds places in `guard.values`, and `filled` the buffers. `self.values` and `self.memory` begin as
+            they are outside the block.
             """
             self.values, self.memory = dict(outer_values), dict(outer_memory)
             self.evaluate_block(guard.body.items)

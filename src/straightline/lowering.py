@@ -50,7 +50,7 @@ class Lowering:
     def inline_program(
         self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()
     ) -> list[Value]:
-        """Return the results of a traced program for these arguments, operation by operation that they need."""
+        """Return the results of a traced program for these arguments; only operations that they need are lowered."""
         jaxpr: Any = program
         if isinstance(program, ClosedJaxpr):
             jaxpr, consts = program.jaxpr, program.consts
@@ -62,7 +62,10 @@ class Lowering:
         return [self._look_up_argument(values, v) for v in jaxpr.outvars]
 
     def lower_whole_program(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
-        """Return the results of a whole program; one without entries has no node, and is an empty view of its type."""
+        """Return the results of a whole program.
+
+        An empty result has no node that would tell its type, so it becomes an empty view of memory of its type.
+        """
         avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
         values = self.inline_program(program, inputs)
         return [x if x.size else self._make_empty_view(a) for x, a in zip(values, avals, strict=True)]
@@ -75,7 +78,7 @@ class Lowering:
         """Return the results of one operation of JAX (`equation`) as nodes or arrays in memory, by its rule.
 
         Raises:
-            Unsupported: no rule takes it, or the rule fails, which is said once for a line of code.
+            Unsupported: there is no rule for the operation, or the rule fails; the latter also warns.
         """
         name = equation.primitive.name
         try:
@@ -91,7 +94,11 @@ class Lowering:
             raise make_refusal(name, error, code_line(equation)) from error
 
     def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
-        """Return the results by the rule of an operation: IN_MEMORY has those for inputs in memory, RULES for nodes."""
+        """Return the results of an operation by its rule.
+
+        IN_MEMORY holds the rules that take arrays in memory, and RULES those that take nodes. An operation in both is
+        lowered by IN_MEMORY if one of its inputs is in memory.
+        """
         if name in IN_MEMORY and (name not in RULES or any(isinstance(x, StridedArray) for x in inputs)):
             return IN_MEMORY[name](self, equation, inputs)
         if name not in RULES:
@@ -103,7 +110,7 @@ class Lowering:
         return value.nodes(self.graph) if isinstance(value, StridedArray) else value
 
     def get_only_node(self, value: Value) -> Node:
-        """Return the node of a value of one entry; refuse any other, of which each entry would be a condition."""
+        """Return the only node of a condition; raise Unsupported if it has several entries."""
         nodes = self.nodes(value)
         if nodes.size != 1:
             raise Unsupported("a condition for each entry of an array")
@@ -111,7 +118,10 @@ class Lowering:
         return node
 
     def make_known_array(self, number: Any) -> Value:
-        """Return an array of known numbers: as constants, or above TABLE numbers as a table in memory; keys as keys."""
+        """Return an array of known numbers as constants, or as a table in memory if it has more than TABLE numbers.
+
+        An array of objects holds nodes already, and is returned as it is. Random keys become keys of known words.
+        """
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
@@ -133,9 +143,10 @@ def _convert_literal(number: Any, variable: Any) -> Any:
 
 
 def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
-    """Return the refusal (Unsupported) of a program whose native code failed by an error, and warn once for a line.
+    """Return the refusal (Unsupported) of a program whose native code failed with an error; warn once for each text.
 
-    Such an error is a defect here, or LLVM's: XLA then computes. `where` is the line of code, "" if not known.
+    Such an error is a defect of this package or of LLVM; XLA then computes the program. `where` is the line of code
+    that the operation comes from, "" if it is not known.
     """
     refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
     warn_once(f"no native code: {refused}")
@@ -144,7 +155,7 @@ def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
 
 @contextmanager
 def turn_failures_into_refusals(what: str) -> Iterator[None]:
-    """Turn any error within the block, which makes native code of `what`, into Unsupported: a refusal."""
+    """Turn any error within the `with` block, which makes native code of `what`, into the refusal Unsupported."""
     try:
         yield
     except Unsupported:
@@ -160,8 +171,9 @@ def warn_once(text: str) -> None:
 
 
 def arrange_nodes(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return nodes, in row-major order, as an array of objects of this shape."""
+    """Return nodes, given in row-major order, as an array of objects of this shape."""
     flat = list(nodes)
+    # NumPy must not look into the nodes, as np.array(flat) would.
     array = np.empty(len(flat), dtype=object)
     array[:] = flat
     return array.reshape(shape)
@@ -180,7 +192,7 @@ def list_nodes(value: np.ndarray) -> list[Node]:
 
 
 def type_of(value: Any) -> Type:
-    """Return the type of a number, or of an array's numbers."""
+    """Return the type of a number, or of an array's numbers; raise Unsupported if native code has no such type."""
     dtype = value.dtype
     # NAMES keeps the names of dtypes, which NumPy takes long to spell.
     if dtype not in NAMES:
@@ -208,17 +220,18 @@ def make_placeholder(shape: Sequence[int], dtype: Any) -> Any:
 
 
 def known_integers(value: np.ndarray) -> np.ndarray | None:
-    """Return an array of nodes as integers, None if one of them depends on data (is no constant)."""
+    """Return an array of nodes as integers, or None if one of the nodes is not a constant."""
     flat: list[Node] = value.ravel().tolist()
     if any(x.op != "constant" for x in flat):
         return None
+    # A larger unsigned number would not fit an int64.
     return np.array([min(int(x.value), sys.maxsize) for x in flat], dtype=np.int64).reshape(value.shape)
 
 
 def code_line(equation: JaxprEqn) -> str:
-    """Return the line of code, file:number, that an operation comes from; "" if not known.
+    """Return the line of code, as file:number, that an operation comes from; "" if it is not known.
 
-    It is the innermost outside of JAX, equinox and this package (HERE).
+    It is the innermost line that is not in JAX, in equinox or in this package (HERE).
     """
     traceback = equation.source_info.traceback
     frames: list[Any] = [] if traceback is None else traceback.frames
@@ -254,7 +267,10 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
     structure: list[Any] = []
 
     def call(*leaves: Any) -> list[Any]:
-        """Return the arrays of the function's results from its arguments' leaves; note the results' `structure`."""
+        """Return the leaves of the function's results from the leaves of its arguments; note the results' `structure`.
+
+        Parts that are not arrays become _NonArrayPart, which has no leaves and so stays in the structure.
+        """
         returned = function(*jax.tree.unflatten(tree, leaves))
         arrays, form = jax.tree.flatten(
             jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _NonArrayPart(x), returned)
@@ -269,8 +285,8 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
 
 
 def _list_used_equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
-    """Return the operations on which a program's results depend, or which do something beside, such as printing."""
-    # From the last operation back, since only then it is known which results of one are needed.
+    """Return the operations that a program's results need, and those with effects, such as printing."""
+    # Go backward, since all uses of an operation's results come after it.
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     used: list[JaxprEqn] = []
     for equation in reversed(jaxpr.eqns):

@@ -23,7 +23,7 @@ def find_llvm_target() -> llvm.Target:
     """Return the LLVM target of this machine.
 
     Raises:
-        Unsupported: LLVM does not know its processor, which is said once.
+        Unsupported: LLVM does not know the processor. A warning says so once.
     """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
@@ -51,16 +51,18 @@ class MachineCode:
     """
 
     def __init__(self, source: FunctionSource, level: int, width: int):
-        """Generate code of a text for vectors of `width` runs, at LLVM's level 0 (in haste) or 1 (with care)."""
+        """Generate machine code from a function's LLVM text, for vectors of `width` runs.
+
+        `level` is LLVM's level of optimisation: 0 in haste, 1 with care.
+        """
         self.level, self.width = level, width
         cpu, flags, *_ = find_processor_features()
         machine = find_llvm_target().create_target_machine(cpu=cpu, features=flags, opt=level)
         module = llvm.parse_assembly(source.text(width))
         module.verify()
-        # An object file first: the engine only loads it.
+        # Make an object file, which the engine only loads: an engine that made the code would verify the module again.
         code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
-        module.close()  # three times the memory of its code
-        # An engine that generates the code itself would verify the module again.
+        module.close()  # it takes three times the memory of its code
         self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         self.engine.add_object_file(code)
         self.engine.finalize_object()
@@ -89,13 +91,13 @@ def _get_hasty_thread() -> ThreadPoolExecutor:
 
 @turn_failures_into_refusals("a program")
 def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
-    """Return machine code, generated outside of the main thread, at LLVM's `level` (0 in haste, 1 with care).
+    """Return machine code for vectors of `width` runs, made at LLVM's `level`: 0 in haste, 1 with care.
 
-    Vectors are of `width` runs. Python raises what a signal asks for in the main thread, between any two of its
-    operations: an object of LLVM made there could change its owner and nobody note it, and be freed twice.
+    The code is never generated in the main thread. There Python may raise a signal's exception between any two
+    operations. An LLVM object that is just changing its owner would then be freed twice.
 
     Raises:
-        Unsupported: LLVM makes no code of it, which is said once.
+        Unsupported: LLVM makes no code. A warning says so once.
     """
     if current_thread() is not main_thread():
         return MachineCode(source, level, width)
@@ -103,7 +105,10 @@ def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
 
 
 def _generate_with_care(source: FunctionSource, width: int, hasty: MachineCode) -> MachineCode:
-    """Return code generated with care (optimised, LLVM's level 1); if that fails, warn once and return `hasty`."""
+    """Return code generated with care (LLVM's level 1, optimised); if this fails, warn once and return `hasty`.
+
+    `hasty` is the code that was generated in haste (level 0).
+    """
     try:
         return MachineCode(source, 1, width)
     except Exception as error:
@@ -122,7 +127,10 @@ class TieredCode:
     """
 
     def __init__(self, source: FunctionSource, widths: tuple[int, int]):
-        """Begin without code; `widths`: runs of a vector of code in haste, and of code made with care."""
+        """Begin without machine code.
+
+        `widths`: how many runs a vector has in code made in haste, and in code made with care.
+        """
         self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
         self._machine: MachineCode | None = None
         self._careful: Future[MachineCode] | None = None
@@ -152,7 +160,10 @@ class TieredCode:
             return machine
 
     def _make_first(self, executions: float) -> MachineCode:
-        """Return the code that the first call makes, later ones find: in haste (0) or with care (1) by `executions`."""
+        """Return the first machine code, and make it if this is the first call.
+
+        `executions`, how often the code will run, decides whether it is made in haste (level 0) or with care (1).
+        """
         if self._machine is None:
             level = self._choose_level(executions)
             self._machine = emit_code(self._source, level, self._widths[level])

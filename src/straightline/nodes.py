@@ -47,7 +47,7 @@ class Node:
         self.op, self.type, self.args, self.block, self.value, self.serial = op, type, args, block, value, serial
 
     def __repr__(self) -> str:
-        """Return a constant's value, of any other node %7=add(%3, %5), by the serials of it and its arguments."""
+        """Return a constant's value, or for any other node its serial, operation and arguments: %7=add(%3, %5)."""
         if self.op == "constant":
             return str(self.value)
         return f"%{self.serial}={self.op}({', '.join(f'%{a.serial}' for a in self.args)})"
@@ -73,15 +73,21 @@ class Block:
     __slots__ = ("depth", "items", "owner", "parent", "pinned", "seen")
 
     def __init__(self, parent: "Block | None", pinned: bool = False):
-        """Make an empty block within `parent`; `pinned`: nodes made here are not moved out of it."""
+        """Make an empty block inside the block `parent`; None makes the outermost block.
+
+        `pinned`: nodes that are made in the block stay there, and are not moved to a block around it.
+        """
         self.parent, self.pinned = parent, pinned
-        self.owner: Loop | Guard | None = None
+        self.owner: Loop | Guard | None = None  # the statement whose body this block is
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.items: list[Node | Loop | Guard | Store | LoopExit] = []
         self.seen: dict[Any, Node] = {}  # nodes made here, by operation and arguments, which equal ones reuse
 
     def free_contents(self) -> None:
-        """Empty this block and those inside: without cycles of references all is freed at once, without a search."""
+        """Empty this block and the blocks inside it.
+
+        This breaks the cycles of references, so that Python frees the nodes at once and need not search for cycles.
+        """
         for statement in self.items:
             if isinstance(statement, Node):
                 statement.value = None
@@ -123,20 +129,20 @@ class Buffer:
     __slots__ = ("block", "first", "inside", "kind", "parts", "shape", "stores", "table", "type")
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
-        """Hold the description of an array in memory, which nothing fills yet and no other buffer contains.
+        """Describe an array in memory that no statement fills yet and no other buffer contains.
 
         Args:
-            kind: what fills it: "input", "scratch", "table" or "carried".
-            type: of its numbers.
-            shape: of the array of one run.
-            block: of the program, in which it is filled.
-            table: the numbers of a "table", which all runs share; None of other kinds.
+            kind: what fills the array: "input", "scratch", "table" or "carried".
+            type: the type of its numbers.
+            shape: the shape of one run's array.
+            block: the block of the program that fills the array.
+            table: the numbers of a "table", which all runs share; None for other kinds.
         """
         self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
         self.stores: list[Store] = []  # statements that fill it
         self.inside: tuple[Buffer, int] | None = None  # the buffer that it is a part of, and from which entry on
         self.parts: list[Buffer] = []  # buffers inside it
-        self.first: list[int] = []  # of each entry of a row the first that is the same number, if some are
+        self.first: list[int] = []  # for each place in a row the first place with the same number; empty if all differ
 
     def place_buffer_inside(self, inner: "Buffer", start: int) -> None:
         """Place another buffer inside this one, from an offset on."""
@@ -145,7 +151,11 @@ class Buffer:
 
     @property
     def owner(self) -> "tuple[Buffer, int]":
-        """Return the buffer whose memory this one uses, the outermost that it is `inside`, and the offset in it."""
+        """Return the outermost buffer that this one lies in, and this one's offset in it.
+
+        `inside` is the pair of the buffer that directly contains this one, and the offset there. It is None if this
+        buffer has memory of its own, and the answer is then the buffer itself and 0.
+        """
         if self.inside is None:
             return self, 0
         whole, start = self.inside[0].owner
@@ -165,7 +175,7 @@ class Store:
     def __init__(
         self, block: Block, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]
     ):
-        """Make the statement buffer[offset + sum strides * indices] = node, of a block."""
+        """Make the statement buffer[offset + sum strides * indices] = node, which stands in `block`."""
         self.block, self.buffer, self.node, self.offset = block, buffer, node, offset
         self.strides, self.indices = tuple(strides), tuple(indices)
 
@@ -180,18 +190,19 @@ class Loop:
     __slots__ = ("block", "body", "condition", "counter", "following", "initial", "length", "parameters", "results")
 
     def __init__(self, body: Block, length: int | None, initial: Sequence[Node]):
-        """Make a loop over `body` of `length` turns, None if a condition ends it; `initial`: carried numbers at first.
+        """Make a loop whose body is the block `body`.
 
-        What a turn carries is set later: its nodes at the beginning of a turn, behind it and behind the last one.
+        `length` is the number of turns, None if a condition ends the loop. `initial` holds the carried numbers before
+        the first turn. The other lists have an entry for each carried number, and are filled later.
         """
         self.body, self.length, self.initial = body, length, list(initial)
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self
-        self.parameters: list[Node] = []
-        self.following: list[Node] = []
-        self.results: list[Node] = []
-        self.condition: Node | None = None
-        self.counter: Node | None = None
+        self.parameters: list[Node] = []  # carried numbers at the beginning of a turn
+        self.following: list[Node] = []  # carried numbers at the end of a turn
+        self.results: list[Node] = []  # carried numbers after the last turn
+        self.condition: Node | None = None  # the loop goes on while it holds; None if `length` is known
+        self.counter: Node | None = None  # the number of the turn; None if nothing uses it
 
 
 class LoopExit:
@@ -214,5 +225,5 @@ class Guard:
         self.body, self.condition = body, condition
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self
-        self.values: list[Node] = []  # nodes of the body that are used outside
-        self.results: list[Node] = []  # what stands for them there: zero where the body is skipped
+        self.values: list[Node] = []  # nodes of the body whose values are used outside
+        self.results: list[Node] = []  # for each of them the node that stands for it outside: 0 if the body is skipped

@@ -63,10 +63,10 @@ def lower_function(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Return a function of one run, for arguments of these shapes, as a program of at most `most` scalar operations.
+    """Return a function of one run as a program of at most `most` scalar operations.
 
-    known: entries of arguments, by the number of the leaf, that are the same in every call; single: whether numbers
-    are float32.
+    `examples` give the arguments' shapes and types. `known` maps the number of a leaf of the arguments to the entries
+    that are the same in every call. `single`: whether numbers are float32.
     """
     return lower_traced(*trace_function(function, *examples, single=single), most, known, single)
 
@@ -107,9 +107,10 @@ def lower_traced(
 
 
 def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarray, numbers: np.ndarray) -> Value:
-    """Return an argument with constants where `mask` says that its numbers are known; a long one stays in memory.
+    """Return an argument with constants for the entries that `mask` marks as known; `numbers` holds their values.
 
-    All known, it is one known array; else each entry is a constant or a load of it, up to TABLE of them.
+    If all entries are known, it is a known array. Else each entry becomes a constant or a load. An argument of more
+    than TABLE entries that are not all known stays in memory as it is.
     """
     if mask.all():
         return lowering.make_known_array(numbers.astype(DTYPES[view.type]))
@@ -122,9 +123,9 @@ def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarr
 
 
 def list_needed_items(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
-    """Return the nodes, loops, guards, buffers and stores that these numbers need, as keys, in an order without chance.
+    """Return the nodes, loops, guards, buffers and stores that `roots` need, as the keys of a dictionary.
 
-    A set would have an order that changes from process to process, and with it the program's text.
+    A dictionary keeps their order. The order of a set, and with it the program's text, would change between processes.
     """
     needed: dict[Any, None] = {}
     to_visit: list[Any] = list(roots)
@@ -145,7 +146,10 @@ def needs_arguments_alone(node: Any) -> bool:
 
 
 def _list_needs(node: Any) -> list[Any]:
-    """Return what a node, a buffer or a statement needs: arguments, memory, and the loop or guard around it."""
+    """Return what a node or a statement needs: its arguments, memory, and the loop or guard around it.
+
+    A buffer needs the statements that fill it, its parts, and the buffer that it lies in.
+    """
     if isinstance(node, Buffer):
         within = [] if node.inside is None else [node.inside[0]]
         return [*node.stores, *node.parts, *within]
@@ -177,8 +181,10 @@ def _list_dependencies(node: Any) -> list[Any]:
 
 
 def find_fused_product(node: Node, products: set[Node]) -> Node | None:
-    """Return the argument of a sum or difference that is a product fused with it (`find_fusable_products`), or None."""
-    # The value of such a product is the sum that it is fused with.
+    """Return the argument of a sum or difference that is a product fused with it, or None if there is none.
+
+    `products` comes from `find_fusable_products`, which sets the `value` of a product to the sum that it is fused with.
+    """
     for a in node.args:
         if a.value is node and a in products:
             return a
@@ -209,7 +215,7 @@ def find_fusable_products(items: Iterable[Any]) -> set[Node]:
 
 
 def list_used_nodes(node: Any) -> Sequence[Node]:
-    """Return the nodes that an item of a program (node, store, guard, loop; a buffer none) uses directly."""
+    """Return the nodes that an item of a program (node, store, guard or loop) uses directly; a buffer uses none."""
     if isinstance(node, Node):
         return node.args
     if isinstance(node, Store):
@@ -222,13 +228,17 @@ def list_used_nodes(node: Any) -> Sequence[Node]:
 
 
 def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
-    """Return items sorted: each number after those that it is computed of, but for what a loop carries; buffers first.
+    """Return items sorted so that each comes after those that it is computed from; buffers come first.
 
-    Nodes are numbered as they are made, and so after their arguments: by these serials.
+    Nodes are numbered (`serial`) as they are made, so a node has a higher number than its arguments. Only what a loop
+    carries to its next turn may come after its use.
     """
 
     def position(x: Any) -> int:
-        """Return the serial (nodes are numbered as they are made) of the node behind which an item stands, or -1."""
+        """Return the serial by which an item is sorted: its own, or that of the node that it stores or depends on.
+
+        A buffer, and a loop or guard without a condition, has -1 and comes first.
+        """
         if isinstance(x, Store):
             return x.node.serial
         if isinstance(x, Loop | Guard):
@@ -247,10 +257,9 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
 
     @cache
     def list_owners(block: Block) -> list[Any]:
-        """Return the loops and guards around a block that may make it differ: a loop of a known length cannot.
+        """Return the guards, and the loops that end by a condition, around a block.
 
-        All runs make the same turns of such a loop; only guards, which have no length, and loops that end by a
-        condition are left.
+        These may make runs differ within the block. A loop of known length cannot: all runs make the same turns.
         """
         return [
             b.owner
@@ -277,14 +286,14 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
 
 
 def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return which of these items, in order, differ between runs: what varies with these inputs, and some memory.
+    """Return which of the sorted `items` differ between runs: those that vary with `inputs`, and some memory.
 
-    What runs share is computed once, before them. Of an array that a loop carries in memory only the numbers of the
-    last turn are left then: where runs need those of every turn, the array counts as differing, and each run has one.
+    What runs share is computed once, before all runs. Of an array that a loop carries in memory, only the last turn's
+    numbers are then left. If runs need the numbers of every turn, the array counts as differing: each run has its own.
     """
     differing = find_varying_items(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
-    # Carried memory that runs read within the loop joins what differs, and what follows from it, until none is left.
+    # Add carried memory that runs read within the loop, and what follows from it, until there is no more.
     while read_in_turns := (
         carried and _find_memory_read_in_parts(find_crossing_items(items, differing)) & carried - differing
     ):
@@ -293,16 +302,20 @@ def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]
 
 
 def _find_memory_read_in_parts(items: Iterable[Any]) -> set[Buffer]:
-    """Return the buffers of which items read a part that is filled in a block (a loop's turn) inside their own."""
+    """Return the buffers that items read by parts which a loop's turn fills.
+
+    Such a part is filled in another block than the buffer that it lies in. That buffer is returned.
+    """
     used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_list_dependencies(x)) if isinstance(n, Node))
     parts = {n.value[0] for n in used if n.op == "load"}
     return {part.owner[0] for part in parts if part.block is not part.owner[0].block}
 
 
 def find_crossing_items(items: Iterable[Any], spread: set[Any]) -> set[Any]:
-    """Return which items the function of what differs between runs (`spread`) has to write: these, and statements.
+    """Return which items the function of blocks, which computes what differs between runs, has to write.
 
-    Statements are the stores into their memory, and the loops and guards around them.
+    They are the items in `spread` (those that differ), the stores into their memory, and the loops and guards around
+    them.
     """
     written = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
     to_visit = list(written)
@@ -361,7 +374,10 @@ def row_length_of_sums(width: int, batches: int) -> int:
 
 
 def fold_rows_into_batches(sums: np.ndarray, batches: int) -> np.ndarray:
-    """Return sums (..., batch) from rows (..., `row_length_of_sums`), whose place k is of batch k mod `batches`."""
+    """Return the sum of each batch, (..., batches), from rows of partial sums (..., row).
+
+    Place k of a row is a partial sum of batch k mod `batches`. `row_length_of_sums` gives the length of a row.
+    """
     totals = sums[..., :batches].copy()
     for start in range(batches, sums.shape[-1], batches):
         beyond = sums[..., start : start + batches]

@@ -25,9 +25,9 @@ class _LoanedBytes:
     """Kept bytes lent to an array: NumPy holds this object for it and its views, and drops it with the last one."""
 
     def __init__(self, memory: np.ndarray):
-        """Hold the array of bytes that is lent, and offer it to NumPy."""
+        """Hold an array of bytes that is lent to a result, and offer its memory to NumPy."""
         self._memory = memory
-        # NumPy's protocol, by which an array of this object's bytes holds the object.
+        # By this protocol NumPy makes an array of the bytes, which keeps this object alive.
         self.__array_interface__ = memory.__array_interface__
 
     def __del__(self, ends: Callable[[], bool] = sys.is_finalizing) -> None:
@@ -36,9 +36,9 @@ class _LoanedBytes:
 
 
 def make_aligned_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Return an array whose numbers are to be filled, at an address that is a multiple of a cache line.
+    """Return an array of undefined numbers at an address that is a multiple of a cache line.
 
-    One of LEAST bytes or more takes memory of an earlier result that is free again, if any fits.
+    An array of LEAST bytes or more reuses the memory of an earlier result that is free again, if any fits.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize  # bytes
     needed = size + LINE  # room to begin at a multiple of a cache line
@@ -54,9 +54,10 @@ def align_to_cache_line(memory: np.ndarray) -> np.ndarray:
 
 
 def _take_memory(size: int) -> np.ndarray:
-    """Return at least so many bytes: the last kept ones of which at most half would be idle, else fresh ones.
+    """Return an array of at least `size` bytes: kept memory of at most twice the size, or else fresh memory.
 
-    Other threads may take and keep memory meanwhile: what `pop` returns is this thread's.
+    The memory that was kept last is tried first. Other threads may take memory meanwhile; what `pop` returns belongs
+    to this thread alone.
     """
     for key in reversed(tuple(_kept)):
         memory = _kept.get(key)  # None where another thread took it
@@ -66,7 +67,10 @@ def _take_memory(size: int) -> np.ndarray:
 
 
 def _keep_memory(memory: np.ndarray) -> None:
-    """Keep bytes for later results, and give back what was kept first beyond MOST bytes and ARRAYS pieces in all."""
+    """Keep memory for later results, and give back the oldest kept memory if there is too much.
+
+    At most MOST bytes and at most ARRAYS arrays are kept in all.
+    """
     if len(memory) <= MOST:
         _kept[id(memory)] = memory
     for key in _list_surplus():
@@ -74,7 +78,10 @@ def _keep_memory(memory: np.ndarray) -> None:
 
 
 def _list_surplus() -> Iterator[int]:
-    """Yield the keys of what is to be given back, the first kept first: at most MOST bytes and ARRAYS are kept."""
+    """Yield the keys of the kept memory that is to be given back, the oldest first.
+
+    The rest has at most MOST bytes and at most ARRAYS arrays.
+    """
     kept = tuple(_kept.items())
     size, count = sum(len(memory) for _, memory in kept), len(kept)
     for key, memory in kept:

@@ -43,10 +43,10 @@ class RecurringNodes(NamedTuple):
 
 
 def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
-    """Rewrite each counted loop of one run in which many values may repeat; return what the outputs need then.
+    """Rewrite each counted loop of one run in which many values may repeat; return what the outputs then need.
 
-    A rewritten loop reads the values of turns that repeat from memory. Many are more than DEAR operations, beside those
-    whose results have to be stored since others need them.
+    A rewritten loop reads repeated values from memory. A loop is rewritten if this saves more than DEAR operations,
+    not counting the operations whose results must be stored because others need them.
     """
     items = list_needed_items(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
@@ -103,9 +103,9 @@ def _list_nodes_of_body(nodes: Sequence[Node], body: Block) -> list[Node]:
 
 
 def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
-    """Return which numbers of a loop's body follow from memory filled before the loop and the turn's number alone.
+    """Return the numbers of a loop's body that follow only from the turn's number and from memory filled before.
 
-    They are those of the rows that a turn reads; no carried number is in them. `nodes` are the body's, in order.
+    They are computed from the rows that a turn reads, and from no carried number. `nodes` are the body's, in order.
     """
     results, known = dict[Node, None](), {loop.counter}
     for node in nodes:
@@ -122,8 +122,9 @@ def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
 
 
 def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, None]:
-    """Return which of the numbers `rows`, in order, these tests are computed of, and the tests themselves."""
+    """Return those of the nodes `rows` that the tests are computed from, and the tests themselves, in order."""
     wanted = set(tests)
+    # Go backward, since a node comes after its arguments.
     for n in reversed(list(rows)):
         if n in wanted:
             wanted.update(n.args)
@@ -131,9 +132,10 @@ def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, Non
 
 
 def _leave_fused_products_in_turn(needed: Iterable[Any], found: dict[Node, None]) -> None:
-    """Remove from `found` the products that will be fused with a sum outside of it.
+    """Remove from `found` the products that will be fused with a sum that is not in `found`.
 
-    Fused, product and sum are rounded once; a product that is stored apart is rounded itself, and bits would change.
+    A fused product and sum are rounded once. A product that is stored apart would be rounded itself, which changes
+    the bits of the result.
     """
     users: defaultdict[Node, list[Any]] = defaultdict(list)
     for item in needed:
@@ -155,11 +157,14 @@ class RingBuffer:
     """Memory for rows of some numbers of these types, one buffer for each type; filled in the turns of a loop."""
 
     def __init__(self, graph: Graph, types: Sequence[Type], loop: Loop, rows: int = RING):
-        """Allocate memory around a loop for the newest `rows` rows, each of one number of each of `types`."""
+        """Allocate memory, in the block around a loop, for the newest `rows` rows of numbers.
+
+        Number k of a row has the type types[k]. There is one buffer (rows, numbers) for each type.
+        """
         count_by_type = Counter(types)
         buffers = {type: Buffer("scratch", type, (rows, n), loop.block) for type, n in count_by_type.items()}
         self._graph = graph
-        # Of each number of a row its buffer and its column there: how many numbers of its type come before it.
+        # For each number of a row: its buffer, and its column there, the count of earlier numbers of the same type.
         self._places = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
@@ -247,10 +252,12 @@ def _move_to_guarded_block(
 
 
 def _choose_ring_row(graph: Graph, now: Sequence[Node], tests: RingBuffer, row: Node, period: Node) -> RingTurn:
-    """Choose a turn's row of the ring: the next of a cycle if that has the tests of now, else one that is computed.
+    """Choose a turn's row of the ring, which holds the last turns' values in RING rows.
 
-    The ring has the last turns' values, in RING rows. now: the outcomes of the turn's tests; tests: the ring with those
-    of each row; row: the last turn's row; period: of the cycle, 0 where none is known.
+    It is the next row of the cycle if the tests had the same outcomes there. Else the turn computes its values anew.
+
+    `now`: outcomes of this turn's tests. `tests`: the ring of earlier outcomes, by row. `row`: the last turn's row.
+    `period`: how many rows the cycle has, 0 where no cycle is known.
     """
     node, zero, one = graph.node, graph.constant(0, "i64"), graph.constant(1, "i64")
     following = node("add", "i64", row, one)
@@ -258,7 +265,7 @@ def _choose_ring_row(graph: Graph, now: Sequence[Node], tests: RingBuffer, row: 
     unknown = node("eq", "bool", period, zero)
     differing_tests = [node("xor", "bool", *pair) for pair in zip(now, tests.load(of_cycle), strict=True)]
     seeks = reduce(partial(node, "or", "bool"), differing_tests, unknown)
-    # A cycle that was left, and a full ring, are begun anew.
+    # The ring begins anew at row 0 if a cycle was left or if the ring is full.
     full = node("eq", "bool", row, graph.constant(RING - 1, "i64"))
     begins = node("or", "bool", node("not", "bool", unknown), full)
     sought = select(graph, begins, zero, following)
@@ -287,7 +294,10 @@ def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], begins
 
 
 def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
-    """Let the loop carry an integer, `start` before the first turn; return its parameter, the node of it in a turn."""
+    """Let the loop carry one more integer, which is `start` before the first turn.
+
+    Returns its parameter: the node that stands for the integer within a turn.
+    """
     place = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))
     loop.parameters.append(graph.make_fresh_node("parameter", "i64", (), loop.body, place))

@@ -24,12 +24,12 @@ class StridedArray:
         offset: int = 0,
         moves: tuple[tuple[int, Node], ...] = (),
     ):
-        """Make the view whose entry (i, j, ...) is buffer[offset + strides * (i, j, ...) + sum of moves].
+        """Make the view whose entry (i, j, ...) is buffer[offset + strides . (i, j, ...) + sum_k s_k n_k].
 
-        A move is a stride times a node, which data decide.
+        `moves` holds the pairs (s_k, n_k) of a stride and a node. Data decide a node's value.
         """
         self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
-        # The nodes that load its entries, behind the block that they were made in; None before they are made.
+        # The block in which the nodes that load the entries were made, and these nodes; None before they are made.
         self.loaded: tuple[Block, np.ndarray] | None = None
 
     @classmethod
@@ -55,11 +55,14 @@ class StridedArray:
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
     ) -> "StridedArray":
-        """Return another view of the same memory: its offset is added to this one's, its moves (stride, node) too."""
+        """Return another view of the same memory; `offset` and `moves` (stride, node) are added to this view's."""
         return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
     def row(self, index: Node | int) -> "StridedArray":
-        """Return the view of entry `index` along the first axis; one that a node says is a move of the address."""
+        """Return the view of entry `index` along the first axis.
+
+        A known index is added to the offset. An index that depends on data, a node, becomes a move.
+        """
         shape, strides, stride_of_row = self.shape[1:], self.strides[1:], self.strides[0]
         if isinstance(index, int):
             return self.view(shape, strides, offset=stride_of_row * index)
@@ -68,16 +71,17 @@ class StridedArray:
         return self.view(shape, strides, 0, (stride_of_row, index))
 
     def get_known_numbers(self) -> np.ndarray:
-        """Return the numbers of a known array: a view of its table with these strides, which NumPy counts in bytes."""
+        """Return the numbers of an array whose buffer is a table, as a NumPy view of the table."""
         assert self.buffer.table is not None
         table = np.ascontiguousarray(self.buffer.table).ravel()[self.offset :]
+        # NumPy counts strides in bytes.
         return np.lib.stride_tricks.as_strided(table, self.shape, [s * table.itemsize for s in self.strides])
 
     def nodes(self, graph: Graph) -> np.ndarray:
-        """Return a node for each entry, which loads it: once in a block, for the blocks inside it too.
+        """Return a node for each entry, which loads it; nodes of the open block or one around it are used again.
 
         Raises:
-            Unsupported: an array of more than LOADED numbers.
+            Unsupported: the array has more than LOADED numbers.
         """
         if self.loaded is None or self.loaded[0] not in graph.current.list_enclosing_blocks():
             if self.size > LOADED:
@@ -86,7 +90,7 @@ class StridedArray:
         return self.loaded[1]
 
     def _load_entries(self, graph: Graph) -> np.ndarray:
-        """Return an array of nodes, each of which loads its entry: at a known offset, moved by what nodes say."""
+        """Return an array of nodes, each of which loads its entry from memory."""
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
         nodes = np.empty(self.shape, dtype=object)
         for index in product(*map(range, self.shape)):
@@ -95,8 +99,8 @@ class StridedArray:
         return nodes
 
     def view_in_shape(self, shape: tuple[int, ...]) -> "StridedArray | None":
-        """Return a view of the same numbers in another shape, None if no strides describe it."""
-        # Axes of one run of memory are merged, and those of the new shape split off again.
+        """Return a view of the same numbers in another shape, or None if no strides describe it."""
+        # Axes that are contiguous in memory are merged, and then split into the axes of the new shape.
         if not self.size:
             return self.view(shape, (0,) * len(shape))
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
@@ -105,9 +109,9 @@ class StridedArray:
 
 
 def _merge_axes(axes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return axes, pairs of length and stride, with each that continues the next one merged with it.
+    """Return axes, pairs (length, stride), after merging each axis with the next one where memory allows.
 
-    Axis a continues axis b behind it if its stride is b's length times b's stride: both are one of length n_a n_b.
+    Two neighbouring axes (n_a, s_a) and (n_b, s_b) with s_a = n_b s_b are the same as one axis (n_a n_b, s_b).
     """
     merged: list[tuple[int, int]] = []
     for length, stride in reversed(axes):

@@ -27,9 +27,11 @@ class SummingProgram:
     """
 
     def __init__(self, program: Program, summed: SummedOutputs):
-        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number.
+        """Write the code of a program.
 
-        That argument alone differs between runs. `once` computes what all runs share, `blocks` all else.
+        `summed` says which results are summed, and which argument (`number`) is the number of the run. Only that
+        argument differs between runs. `self.once` computes what all runs share (None if there is nothing), and
+        `self.blocks` everything else.
         """
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
@@ -42,10 +44,10 @@ class SummingProgram:
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
 
     def measure_memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
-        """Return the bytes of three: results collected run by run, sums, and variables while runs are computed.
+        """Return three sizes in bytes: of results collected run by run, of sums, and of a computation's variables.
 
-        There are `lanes` sums kept apart, each a number for each lane and batch. Of the variables all runs share some;
-        each of the blocks that are computed at once (`in_flight`) has others.
+        `lanes` sums are kept apart, each with a number for each lane and batch. All runs share some of the variables.
+        Each of the `in_flight` blocks that are computed at once has variables of its own.
         """
         length = row_length_of_sums(self.width, self.summed.batches)
         bytes_of_run = bytes_of_sums = 0.0
@@ -67,18 +69,18 @@ class SummingProgram:
         return SummingProgramWithArguments(self, arguments, runs)
 
     def __call__(self, *arguments: PyTree, runs: int, first: int = 0) -> PyTree:
-        """Compute runs on all cores; return a tree of sums, (..., batch), and of what is collected, (run, ...).
+        """Compute runs on all cores; return the pair of sums (..., batch) and of what is collected (run, ...).
 
-        The runs are split into at most PARTS parts, each with sums of its own, which are added in order: the parts
-        depend on the count of runs alone, so that the bits do not depend on the number of cores.
+        The runs are split into at most PARTS parts. Each part has sums of its own, and these are added in order. The
+        parts depend only on the count of runs, so that the result's bits do not depend on the number of cores.
 
         Args:
             arguments: trees like the examples.
-            runs: how many.
-            first: number of the first one; 0 by default.
+            runs: how many runs to compute.
+            first: number of the first run; 0 by default.
         """
         bound, end = self.bind_arguments(jax.tree.leaves(arguments), runs), first + runs
-        # A part is some whole vectors of runs: a PARTS-th of all vectors, rounded up.
+        # A part consists of whole vectors of runs, about a PARTS-th of them.
         part_length = divide_rounded_up(runs, PARTS * self.width) * self.width
         starts = range(first, end, part_length)
         numbers_of_runs = [np.arange(start, min(start + part_length, end)) for start in starts]
@@ -136,13 +138,14 @@ class SummingProgramWithArguments:
         self._machine = None if all(program.common) else program.blocks.choose_machine(blocks)
 
     def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
-        """Return sums over no runs of each summed result that runs do not share, for `add` and `add_partial_sums`.
+        """Return zeros for the sums of each summed result that runs do not share.
 
-        `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
+        `add_runs` adds to them, and `add_partial_sums` totals them. `memory` holds lists of sums that nobody needs any
+        more: the last list is taken and filled with zeros if its shapes fit.
         """
         length = row_length_of_sums(self.program.width, self.program.summed.batches)
         shapes = [(*buffer.shape, length) for buffer, is_summed in self._list_outputs() if is_summed]
-        try:  # threads may take from it at once
+        try:  # not "if memory": another thread may take the last list in between
             taken = [] if memory is None else memory.pop()
         except IndexError:
             taken = []
@@ -153,13 +156,13 @@ class SummingProgramWithArguments:
         return taken
 
     def add_runs(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
-        """Add the runs of these numbers (run,) to `sums` in place; return what is collected of them.
+        """Compute the runs with the numbers `runs`, add them to `sums` in place, and return what is collected.
 
-        That is for each result, leaf by leaf, an array (run, ...), or None where it is summed or all runs share it.
+        That is an array (run, ...) for each leaf of the results, or None if it is summed or if all runs share it.
         """
         numbers = np.ascontiguousarray(runs, dtype=np.uint32)
         outputs, collected = self._allocate_outputs(len(numbers), sums)
-        # There is no code for runs where they share all results.
+        # If runs share all results, there is no code for single runs (`_machine` is None).
         if len(numbers) and self._machine is not None:
             scratch = allocate_aligned(self.program.code.scratch)
             pointers = self._list_pointers(numbers, outputs)
@@ -202,9 +205,9 @@ class SummingProgramWithArguments:
         return [(buffer, summed and not common) for buffer, summed, common in parts]
 
     def _list_pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the addresses (uint64) of inputs, tables, results and the memory that all runs share, as code expects.
+        """Return the addresses (uint64) that the code expects: of inputs, tables, results and shared memory.
 
-        Among the inputs the runs' `numbers` are in the place of the argument that is a run's number.
+        One argument of the program is the run's number; the array of the runs' `numbers` takes its place.
         """
         position = self.program.summed.number
         inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
@@ -249,10 +252,12 @@ def accumulate(
 
 
 def _count_summed_leaves(tree: Any) -> int:
-    """Return how many leaves are summed: those of the first of the pair that a function of a run returns.
+    """Return how many leaves of a function's results are summed: those of the first entry of its pair.
+
+    `tree` is the structure of what the function of a run returns: the pair (what is summed, what is collected).
 
     Raises:
-        ValueError: a tree of results that is no pair.
+        ValueError: the results are not a pair.
     """
     children, container = tree.children(), tree.node_data()
     if container is None or container[0] is not tuple or len(children) != 2:
@@ -263,7 +268,10 @@ def _count_summed_leaves(tree: Any) -> int:
 
 
 def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the sum of arrays, added in order into the first: to allocate more would take longer than to add."""
+    """Return the sum of arrays, added in order into the first, which is overwritten.
+
+    To allocate another array would take longer than the additions.
+    """
     total, *others = sums
     for other in others:
         total += other
@@ -273,7 +281,7 @@ def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
 def _count_runs_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
     """Return how many of the runs from `first` on each batch has; run r is in batch r mod `batches`.
 
-    All have runs // batches of them, and of the remaining runs the batches from that of the first run on one each.
+    Each batch has runs // batches of them. The remaining runs go one each to the batches from first mod `batches` on.
     """
     remaining = np.arange(first, first + runs % batches)
     return np.bincount(remaining % batches, minlength=batches) + runs // batches

@@ -93,7 +93,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
 
 
 def _parse_toml(text: str, name: str) -> dict[str, object]:
-    """Return the table of a campaign's TOML text; `name`: of its file, for errors."""
+    """Return the table in a campaign's TOML text; `name` is that of its file, for errors."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -136,7 +136,7 @@ def _read_timeout(value: object, name: str) -> float:
 
 
 def _read_choice(value: object, choices: Sequence[str], name: str) -> str:
-    """Return a value that is one of the choices; raise ValueError at another, which calls it `name`."""
+    """Return a value if it is one of the choices, or raise ValueError, which calls it `name`."""
     if value not in choices:
         raise fail(name, " or ".join(map(repr, choices)), repr(value))
     return str(value)
@@ -206,7 +206,7 @@ def _read_listed_settings(settings: object, name: str) -> list[Setting]:
 
 
 def _check_json_value(value: object, name: str) -> None:
-    """Raise ValueError at a value that JSON does not represent without loss; `name`: of the value, for errors."""
+    """Raise ValueError if JSON cannot represent a value without loss; `name` is the value's name, for errors."""
     if isinstance(value, dict | list):
         for entry in value.values() if isinstance(value, dict) else value:
             _check_json_value(entry, name)

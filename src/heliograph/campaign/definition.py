@@ -93,7 +93,7 @@ class Campaign:
     def words(self, setting: int) -> tuple[int, int]:
         """Return the two 32-bit words that identify a setting in its key: a hash of its own values.
 
-        So other settings may be added or removed without a change of its runs.
+        Other settings can therefore be added or removed without changing this setting's runs.
         """
         digest = hashlib.sha256(serialise_setting(self.settings[setting]).encode()).digest()
         return int.from_bytes(digest[:4], "big"), int.from_bytes(digest[4:8], "big")

@@ -88,23 +88,23 @@ class ErrorSums(NamedTuple):
 def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray, steps: Sequence[int]) -> ErrorSums:
     """Return how many of some runs are finite, and sums over them of squared errors, variances and their ratios.
 
-    Sums of their squares too, by which standard errors are found.
+    Sums of the squares of these three are returned too; standard errors need them.
 
     Args:
         group: the store, with errors and variances (setting, run, step, node, filter, state).
         setting: number of the setting.
-        runs: which runs.
-        claims: what each filter claims (node, filter); the variance of one that claims "none" need not be finite.
-        steps: at which to sum, from 1.
+        runs: which runs to sum over.
+        claims: what each filter claims (node, filter); if a filter claims "none", its variance need not be finite.
+        steps: the steps at which to sum, from 1.
     """
     error, variance = (np.asarray(group[name][setting, runs]) for name in ("error", "variance"))  # type: ignore[index]
     squared = error**2
-    # Which runs count, (run, node, filter): those that are finite at all steps and in all states.
+    # `counts` (run, node, filter): whether a run is finite at all steps and in all states.
     has_variance = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
     counts = np.isfinite(squared).all(axis=(1, -1)) & has_variance
     with np.errstate(divide="ignore", invalid="ignore"):
         numbers = np.stack([squared, variance, squared / variance])
-    # (number, run, step, node, filter, state): the mean over steps, then the given ones.
+    # Along the axis of steps of (number, run, step, node, filter, state): the mean over all, and then the given steps.
     mean_over_steps, at_steps = numbers.mean(axis=2, keepdims=True), numbers[:, :, [step - 1 for step in steps]]
     selected = np.concatenate([mean_over_steps, at_steps], axis=2)
     selected = np.where(counts[None, :, None, :, :, None], selected, 0.0)
@@ -179,7 +179,7 @@ def write_explore_page_file(results: str | Path, out: str | Path) -> Path:
         out: the folder for the page, made if needed.
 
     Raises:
-        ValueError: a folder without results, or without scores.
+        ValueError: the folder has no results or no scores.
     """
     folder, target = file_path("results folder", results), file_path("output folder", out)
     for name in (STORE, SUMMARY):
@@ -232,7 +232,7 @@ MEANING = (
 
 
 def _describe_shown_part(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
-    """Return in words how many of the settings and rows are on the page, and where all are."""
+    """Return in words how many settings and rows are on the page, and where to find all."""
     if len(shown) == len(scores):
         return f"{len(shown)} rows, one for each setting, node and filter."
     return (
@@ -242,7 +242,7 @@ def _describe_shown_part(settings: int, campaign: Campaign, shown: Sequence[Scor
 
 
 def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
-    """Return the scores of the first settings, each setting as a whole: at most ROWS, but those of one at least."""
+    """Return the scores of the first whole settings: at most ROWS, but at least those of one setting."""
     shown: list[Score] = []
     for _, of_setting in groupby(scores, key=lambda score: score.setting):
         rows = list(of_setting)
@@ -311,9 +311,9 @@ def _make_scores_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explor
 
 
 def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:
-    """Return the table of scores step by step, and how it is drawn at first: over time, a panel for each state.
+    """Return the table of scores step by step; it is drawn at first over time, with a panel for each state.
 
-    `whole`: columns of which all values are shown at first; `unordered`: one along which points are not connected.
+    All values of the columns `whole` are shown at first. Points along the column `unordered` are not connected.
     """
     steps: dict[str, list[Value]] = {"time": [row.step for row in rows]}
     return ExploredTable(
@@ -330,9 +330,9 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explore
 
 
 def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
-    """Return the columns of a table: settings, their parameters, NAMES (as of node and filter), and these fields.
+    """Return the columns of a table of scores: settings, parameters, NAMES (such as node and filter), and `fields`.
 
-    Each has a value for each of `rows`, the scores.
+    Each column has a value for each score in `rows`.
     """
     parameters = {name: list_parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
@@ -343,14 +343,14 @@ def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequen
 
 
 def _choose_axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
-    """Return the column for the axis: the first numeric parameter with several values, any with several, "setting"."""
+    """Return the column for the axis: the first numeric parameter with several values, or any such, or "setting"."""
     varying = [name for name in parameters if len(set(columns[name])) > 1]
     numeric = [name for name in varying if {type(value) for value in columns[name]} <= {int, float}]
     return [*numeric, *varying, "setting"][0]
 
 
 def _round_value(value: object) -> Value:
-    """Return a value for the page: numbers to DIGITS digits, None if not finite; what is no number as text."""
+    """Return a value for the page: a real number to DIGITS digits, None if it is not finite, and others as text."""
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     return value if isinstance(value, int | bool) else str(value)

@@ -42,8 +42,8 @@ def read_failures(out: Path) -> list[FailedJob]:
 
 
 def make_failed_job(campaign: Campaign, out: Path, job: Job, reply: Reply) -> FailedJob:
-    """Return the failure of a job, with all that is needed to repeat it, from its last reply."""
-    # A job without a chunk builds the setting's network: its failure is one of all the setting's runs.
+    """Return the failure of a job, from its last reply, with everything that is needed to repeat it."""
+    # A job without a chunk builds the setting's network, so its failure concerns all the setting's runs.
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]
     return FailedJob(
@@ -59,9 +59,10 @@ def make_failed_job(campaign: Campaign, out: Path, job: Job, reply: Reply) -> Fa
 
 
 def write_failures(out: Path, failures: list[FailedJob], tried: list[Job]) -> None:
-    """Write failures.json next to the store: these, and earlier ones not tried now; without any, remove the file.
+    """Write failures.json next to the store; without failures, remove the file.
 
-    A setting that failed as a whole was tried again where a chunk of it was.
+    It holds these failures, and earlier ones that were not tried again. A setting that failed as a whole counts as
+    tried again if one of its chunks was tried.
     """
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
@@ -70,7 +71,7 @@ def write_failures(out: Path, failures: list[FailedJob], tried: list[Job]) -> No
     entries = [asdict(failure) for failure in (*earlier, *failures)]
     if not entries:
         path.unlink(missing_ok=True)
-        partial.unlink(missing_ok=True)  # of a process that was killed
+        partial.unlink(missing_ok=True)  # left by a process that was killed
         return
     with name_path_in_errors(path):
         partial.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")

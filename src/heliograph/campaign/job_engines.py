@@ -36,10 +36,11 @@ Untyped = Any  # what dask.distributed gives
 def start_engine(
     campaign: str, store: Path, workers: int, scheduler: str | None = None, timeout: float = math.inf
 ) -> AbstractContextManager[Engine]:
-    """Return the engine as a context: on the cluster of a scheduler, else in `workers` processes, or for 0 in this one.
+    """Return a context manager of the engine, which takes jobs and yields each of them with its reply.
 
-    An engine takes jobs and yields each with its reply. `campaign` is JSON, `store` the folder of the results; a job
-    may take `timeout` seconds, which nothing bounds in this process.
+    It runs on the cluster of `scheduler` if that is given, else in `workers` processes, or in this process for 0.
+    `campaign` is JSON, and `store` is the folder of the results. A job may take `timeout` seconds; in this process it
+    has no limit.
     """
     if scheduler is not None:
         return run_on_cluster(campaign, store, scheduler, timeout)
@@ -56,7 +57,7 @@ def run_in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
 
 @contextmanager
 def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
-    """Do one job at a time in each worker process; a process that dies, or that takes too long, is replaced."""
+    """Yield an engine that does one job at a time in each worker process; a process that dies or hangs is replaced."""
     processes = [_WorkerProcess(campaign, store, timeout) for _ in range(workers)]
     try:
         yield lambda jobs: _distribute_jobs_to_workers(processes, deque(jobs))
@@ -71,7 +72,7 @@ def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job
     count = len(waiting)
 
     def take_jobs(worker: _WorkerProcess) -> None:
-        """Take jobs from `waiting`, put them with the worker's reply into `finished`, until none waits or it stops."""
+        """Take jobs from `waiting`, and put each with the worker's reply into `finished`, until none waits or it stops."""
         while not worker.stopped:
             try:
                 job = waiting.popleft()
@@ -89,7 +90,7 @@ class _WorkerProcess:
     """A worker process and the pipes to it: a job is a line of JSON, its reply another."""
 
     def __init__(self, campaign: str, store: Path, timeout: float):
-        """Begin without a process, which the first job starts; `timeout`: the seconds that a job may take."""
+        """Begin without a process, since the first job starts it; a job may take `timeout` seconds."""
         self.greeting, self.timeout = json.dumps([campaign, str(store)]), timeout
         self.process: subprocess.Popen[str] | None = None
         self.stopped = False
@@ -125,7 +126,7 @@ class _WorkerProcess:
         return Reply(error=f"WorkerDied: the worker process ended with {_describe_exit(code)}")
 
     def _ensure_running(self) -> subprocess.Popen[str]:
-        """Return the worker's process, started or, where it has died, started again."""
+        """Return the worker's process; it is started if there is none, and again if it has died."""
         if self.process is not None and self.process.poll() is not None:  # it died since its last job
             self._kill()
         if self.process is None:
@@ -153,14 +154,14 @@ class _WorkerProcess:
             process.wait()
             for pipe in (process.stdin, process.stdout):
                 assert pipe is not None
-                with suppress(OSError):  # what it was still to read cannot be written
+                with suppress(OSError):  # text that waits in the pipe can no longer be written
                     pipe.close()
 
 
 def _send_line(process: subprocess.Popen[str], line: str) -> None:
-    """Send a line to a worker process; one that is dead is noticed later, since no answer comes."""
+    """Send a line to a worker process; a dead process is noticed later, since no answer comes."""
     assert process.stdin is not None
-    with suppress(OSError):  # it is dead: the answer, which does not come, will say so
+    with suppress(OSError):  # the process is dead
         process.stdin.write(line + "\n")
         process.stdin.flush()
 
@@ -245,9 +246,9 @@ def _run_jobs_on_cluster(
 
 
 def _wait_for_next_future(client: Untyped, futures: Untyped, timeout: float) -> Untyped:
-    """Return the next of the futures (jobs on the cluster) that is done; None after `timeout` seconds without one.
+    """Return the next future (job on the cluster) that is done, or None after `timeout` seconds without one.
 
-    It looks each LOOK seconds; LOST is what the error says.
+    It looks each LOOK seconds. LOST holds the words of the error.
 
     Raises:
         ValueError: the connection to the cluster is lost.
@@ -264,7 +265,7 @@ def _wait_for_next_future(client: Untyped, futures: Untyped, timeout: float) -> 
 
 
 def _ask_cluster(ask: Callable[[], Untyped]) -> Untyped:
-    """Return what `ask`, which talks to the cluster, returns; if that fails, say in a line that the cluster is lost."""
+    """Return the result of `ask`, which talks to the cluster; if it fails, raise the error that the cluster is lost."""
     try:
         return ask()
     except (OSError, RuntimeError, TimeoutError):
@@ -277,7 +278,7 @@ def _format_error(error: Exception) -> str:
 
 
 def _read_reply(future: Untyped) -> Reply:
-    """Return the reply of a job that is done, or a reply with the error by which it has none."""
+    """Return the reply of a finished job, or a reply with the error if the job failed."""
     if future.status == "finished":
         reply: Reply = future.result()
         return reply

@@ -58,7 +58,7 @@ def perform_job(campaign: str, store: str, setting: int, chunk: int | None) -> R
     """Return the reply to one job of a campaign given as JSON; an error becomes a reply too.
 
     Args:
-        campaign: as JSON.
+        campaign: the campaign as JSON.
         store: path of the store.
         setting: number of the setting.
         chunk: number of the chunk that is computed and written; None to describe the setting's network.
@@ -101,9 +101,9 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
 
 
 def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
-    """Return the network's inputs over the campaign's steps, (horizon, inputs); None of a network without any.
+    """Return the network's inputs over the campaign's steps, (horizon, inputs), or None if it has no inputs.
 
-    In the campaign each is a number for all steps, or a list of one for each.
+    In the campaign an input is a number for all steps, or a list with a number for each step.
     """
     if sorted(campaign.inputs) != sorted(network.inputs):
         raise fail("inputs", f"values of {list(network.inputs)}", list(campaign.inputs))
@@ -114,7 +114,7 @@ def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | No
 
 
 def _check_versions(campaign: Campaign) -> None:
-    """Refuse a worker whose packages or settings are not those that the campaign was begun with (ValueError)."""
+    """Raise ValueError if this worker's packages or settings are not those with which the campaign began."""
     here = collect_versions()
     if here != campaign.versions:
         raise fail("versions on this worker", str(campaign.versions), here)
@@ -135,9 +135,9 @@ _seen: list[Network] = []
 
 
 def _drop_old_programs(network: Network) -> None:
-    """Drop all compiled programs once networks of COMPILED other structures have been seen before this one.
+    """Drop all compiled programs if networks of COMPILED other structures came before this one.
 
-    `_seen`: a network of each structure since the last time; networks of one structure share their programs.
+    Networks of one structure share their programs. `_seen` holds a network of each structure since the last drop.
     """
     if any(have_same_structure(network, other) for other in _seen):
         return
@@ -190,13 +190,13 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
     world: bool = eqx.field(static=True, default=False)
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Return the errors of one step, of each estimate; with `self.world` also truth and measurements.
+        """Return the errors of each estimate in one step, and with `self.world` also the truth and the measurements.
 
-        `step`: true state, measurements, and estimates of nodes and of fusions (centres), each alike a tree.
+        `step` holds the true state ("truth"), the measurements, and trees of the nodes' estimates and of fused ones.
         """
 
         def is_estimate(leaf: object) -> bool:
-            """Return whether the tree goes no deeper here: an estimate is measured as a whole."""
+            """Return whether a leaf is an estimate, which is measured as a whole."""
             return isinstance(leaf, Estimate)
 
         measure = partial(_measure_errors, step["truth"])
@@ -206,9 +206,10 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
         return OfStep(collected=collected)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
-        """Return the collected errors by node and filter, and with `self.world` truth and measurements.
+        """Return the collected errors by node and filter, and with `self.world` also truth and measurements.
 
-        Collected errors have axes (..., filter, node, state), so that filters are axis -3; NEES has none of states.
+        Collected errors have the axes (..., filter, node, state), so that filters are axis -3. NEES has no axis of
+        states.
         """
         results = {
             field: self.split_by_name(network, collected, itemgetter(field), axis)
@@ -225,9 +226,9 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
 
 
 def _measure_errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    """Return error (..., n), claimed variances (..., n) and NEES per state (...) of an estimate of the true state.
+    """Return an estimate's error (..., n), its claimed variances (..., n) and its NEES per state (...).
 
-    NEES: the error squared over the claimed covariance, divided by the number of states.
+    The NEES per state is e' P^-1 e / n with the error e and the claimed covariance P.
     """
     error, covariance = estimate.error(truth), jnp.asarray(estimate.covariance)
     variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)

@@ -84,7 +84,7 @@ def _describe_failures(failures: Sequence[FailedJob]) -> str:
 
 
 def _list_failures(failures: Sequence[FailedJob]) -> Section:
-    """Return the section that lists the first REPORTED jobs that failed, with their errors, and how to repeat one."""
+    """Return the section on failed jobs: the first REPORTED of them with their errors, and how to repeat one."""
     points = [
         f"setting {failure.setting} {failure.parameters}, runs {failure.runs[0]} to {failure.runs[1]}: {failure.error}"
         for failure in failures[:REPORTED]
@@ -153,7 +153,7 @@ def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[s
 
 
 def _can_be_axis(campaign: Campaign, name: str) -> bool:
-    """Return whether a parameter is always a finite number, and at least two settings differ in nothing but it."""
+    """Return whether a parameter is always a finite number, and some settings differ only in this parameter."""
     values = list_parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
@@ -193,7 +193,7 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
 
 
 def _group_into_panels(campaign: Campaign, scores: Sequence[Score], parameter: str) -> dict[str, list[Score]]:
-    """Return {title of a panel: its scores}, those of one node whose settings differ in nothing but `parameter`."""
+    """Return {title of a panel: its scores}: those of one node whose settings differ only in `parameter`."""
     panels: dict[str, list[Score]] = {}
     for score in scores:
         rest = _drop_parameter(campaign.settings[score.setting], parameter)

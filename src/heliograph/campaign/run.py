@@ -133,10 +133,10 @@ def _compute_missing(
 
 
 def _remove_damaged_and_partial(store: Path, campaign: Campaign) -> tuple[set[tuple[int, ...]], list[Path]]:
-    """Remove damaged and partial files from a store; return (setting, chunk) of what is done, and the damaged files.
+    """Remove damaged and partial files from a store; return the done chunks (setting, chunk), and the damaged files.
 
     Raises:
-        ValueError: a store of another campaign.
+        ValueError: the store is of another campaign.
     """
     if not store.is_dir():
         return set(), []
@@ -182,7 +182,7 @@ def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> li
 
 
 def _count_workers(workers: int | None, jobs: int) -> int:
-    """Return how many processes work: as asked, else one for each processor, and no more than jobs."""
+    """Return how many processes work: `workers`, or by default one a processor, but at most one a job."""
     if workers is None:
         cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         return min(cpus, jobs)
@@ -212,7 +212,7 @@ def _prepare_store(
     described: dict[int, NetworkDescription] = {}
 
     def accept(job: Job, description: NetworkDescription | None, done: int) -> None:
-        """Keep the description of a job's setting in `described`, and show progress: `done` of all `jobs` are built."""
+        """Keep the description of a job's setting in `described`, and show that `done` of all `jobs` are built."""
         assert description is not None  # these jobs only describe
         described[job.setting] = description
         progress("building", done, len(jobs))

@@ -66,7 +66,7 @@ class Score:
 
 
 def read_summary(path: str | Path) -> list[Score]:
-    """Read the scores of a campaign from its summary.csv: one for each setting, node and filter, as numbers and names.
+    """Read the scores of a campaign from its summary.csv: one score for each setting, node and filter.
 
     Args:
         path: the file summary.csv in the folder of the results.
@@ -75,7 +75,7 @@ def read_summary(path: str | Path) -> list[Score]:
         Scores in the order of the rows, with the columns of the file as attributes.
 
     Raises:
-        ValueError: no such file, or one without these columns.
+        ValueError: there is no such file, or columns are missing.
     """
     path, kinds = file_path("summary", path), get_type_hints(Score)
     if not path.is_file():
@@ -113,9 +113,9 @@ def compute_scores(store: Path, campaign: Campaign) -> list[Score]:
 
 
 def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
-    """Return squared errors summed over states, and NEES per dimension, as means over time, (2, run, node, filter).
+    """Return two means over time, (2, run, node, filter): of squared errors summed over states, and of NEES per dimension.
 
-    The error is NaN in runs whose claimed variance is not finite, of filters that claim one.
+    The error is NaN if a filter claims a variance that is not finite in this run.
     """
     names = ("error", "variance", "nees_per_dimension")
     error, variance, nees = (_read_runs(group, name, setting, runs) for name in names)
@@ -156,7 +156,7 @@ def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndar
 
 
 def _compute_mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean of independent values and its standard error; NaN where there are none, or no two of them."""
+    """Return the mean of independent values and its standard error; both are NaN without values, the error for one."""
     count = len(values)
     if count == 0:
         return np.nan, np.nan

@@ -84,7 +84,7 @@ def _print_problems(outcome: CampaignRun, out: Path, with_traceback: bool) -> No
 
 
 def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tuple[int, int]] | None:
-    """Return the pairs (setting, chunk) that --setting and --chunk ask for; None where all are wanted."""
+    """Return the pairs (setting, chunk) that --setting and --chunk ask for, or None for all."""
     if setting is None:
         if chunk is not None:
             raise fail("--chunk", "a --setting whose chunk it is", "none")
@@ -119,9 +119,9 @@ def show_campaign_progress(workers: int) -> Iterator[Progress]:
     with show_countdown(countdown) as show:
 
         def progress(what: str, done: int, total: int) -> None:
-            """Show how many chunks are done; while simulating note it for the time left, `countdown`.
+            """Show how many chunks are done; while simulating, `countdown` notes it to estimate the time left.
 
-            At the first note, as `countdown.first` is None, also say how many chunks were there before.
+            The first time (`countdown.first` is None), also say how many chunks were there before.
             """
             if what == "simulating":
                 if countdown.first is None and done:
@@ -135,7 +135,7 @@ def show_campaign_progress(workers: int) -> Iterator[Progress]:
 def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
     """Print the first ROWS rows of the table of scores: names to the left, numbers to the right."""
     table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    first_number = len(campaign.parameters) + 3  # behind the names of node, filter and claim
+    first_number = len(campaign.parameters) + 3  # after the parameters, node, filter and claim
     for i, header in enumerate(make_score_headers(campaign)):
         side: Literal["left", "right"] = "right" if i >= first_number else "left"
         table.add_column(Text(fill(visible(header), 7)), overflow="fold", justify=side)

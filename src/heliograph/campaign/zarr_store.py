@@ -73,7 +73,7 @@ def restore_labels(table: LabelsAsJson) -> AxisLabels:
 def unite_labels(by_setting: Mapping[int, AxisLabels]) -> AxisLabels:
     """Return the union of the labels (names of nodes and filters) of all settings, in order of first appearance.
 
-    States have to be the same in all; `received`: components of the longest measurement.
+    All settings must have the same states. `received` is the number of components of the longest measurement.
     """
     first_setting, first = next(iter(by_setting.items()))
     for setting, labels in by_setting.items():
@@ -88,9 +88,9 @@ def unite_labels(by_setting: Mapping[int, AxisLabels]) -> AxisLabels:
 
 
 def check_labels_within(labels: AxisLabels, known: AxisLabels, setting: int) -> None:
-    """Raise ValueError if a setting has a name, or a longer measurement, that the store has not.
+    """Raise ValueError if a setting has names that the store lacks, or a longer measurement.
 
-    `labels`: those of the setting; `known`: those of the store.
+    `labels` are those of the setting, and `known` those of the store.
     """
     lacking = [name for name in (*labels.nodes, *labels.filters) if name not in (*known.nodes, *known.filters)]
     if labels.states != known.states or labels.received > known.received or lacking:
@@ -166,9 +166,9 @@ def _make_coordinates(campaign: Campaign, labels: AxisLabels) -> dict[str, np.nd
 
 
 def list_parameter_values(campaign: Campaign, name: str) -> np.ndarray:
-    """Return a parameter's value in each setting: numbers or booleans where all values are, else text.
+    """Return a parameter's value in each setting, as numbers or booleans if all values are such, else as texts.
 
-    Where a setting lacks it NaN of numbers, "" of text.
+    A setting without the parameter has NaN among numbers, and "" among texts.
     """
     values = [setting.get(name) for setting in campaign.settings]
     if all(isinstance(value, bool) for value in values):
@@ -180,7 +180,7 @@ def list_parameter_values(campaign: Campaign, name: str) -> np.ndarray:
 
 
 def _write_as_text(value: object) -> str:
-    """Return a text as it is, None as "", all else as JSON."""
+    """Return a text as it is, None as "", and anything else as JSON."""
     if value is None or isinstance(value, str):
         return value or ""
     return json.dumps(value, sort_keys=True, ensure_ascii=False)
@@ -231,9 +231,9 @@ def _create_array(
 
 
 def _open_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
-    """Return an array of the store, which is to write a chunk's file even if it has only fill values.
+    """Return an array of the store that writes a chunk's file even if the chunk has only fill values.
 
-    That the file is there is what marks the chunk as done.
+    The existence of the file marks the chunk as done.
     """
     array = group[name]
     assert isinstance(array, zarr.Array)
@@ -249,7 +249,7 @@ def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> N
 
 
 def write_claims(path: Path, setting: int, claims: Claims) -> None:
-    """Write what each filter claims of its covariance ("exact", "upper", ...) in one setting, "" where none is."""
+    """Write what each filter claims of its covariance ("exact", "upper", ...) in one setting; "" for no filter."""
     labels = read_labels(path)
     table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
     _open_array(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
@@ -257,7 +257,7 @@ def write_claims(path: Path, setting: int, claims: Claims) -> None:
 
 
 def _sync_files(folder: Path, start: str) -> None:
-    """Make files of a folder whose names begin with `start` outlast a loss of power, and that they are there."""
+    """Flush files whose names begin with `start`, and their folder, to the disk, so that they outlast a loss of power."""
     for file in folder.glob(f"{start}*"):
         sync(file)
     sync(folder)
@@ -274,7 +274,7 @@ def find_described_settings(path: Path) -> set[tuple[int, ...]]:
 
 
 def remove_damaged_chunks(path: Path, campaign: Campaign) -> list[Path]:
-    """Remove the files of chunks that do not agree with their checksums; return these files."""
+    """Remove the files of chunks that do not match their checksums; return their paths."""
     files: list[Path] = []
     for name in list_stored_variables(campaign):
         files += _find_chunk_files(path / name, indices=2).values()
@@ -292,9 +292,9 @@ def _has_right_checksum(file: Path) -> bool:
 
 
 def _find_chunk_files(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
-    """Return {first indices: file} of the files of chunks, named such as "c.0.3.0"; here of two indices (0, 3).
+    """Return {first indices of a chunk: its file}, with as many indices as `indices` says.
 
-    `indices`: how many of the first indices of a chunk are the key.
+    A chunk's file has a name such as "c.0.3.0". Its first two indices are (0, 3).
     """
     found = {}
     for name in os.listdir(folder):
@@ -306,7 +306,7 @@ def _find_chunk_files(folder: Path, indices: int) -> dict[tuple[int, ...], Path]
 
 def remove_partial_files(path: Path) -> None:
     """Remove the partial files of a process that was killed."""
-    # A whole file of a chunk is "c" and numbers; what has more behind them was not finished.
+    # The name of a whole chunk's file is "c" and numbers. A file with more after them was not finished.
     for folder in path.iterdir():
         for file in folder.iterdir() if folder.is_dir() else ():
             if file.name.startswith("c.") and not all(map(str.isdigit, file.name.split(".")[1:])):
@@ -320,7 +320,7 @@ def read_labels(path: Path) -> AxisLabels:
 
 
 def restore_campaign(path: Path) -> Campaign:
-    """Return the campaign that the store was created with, as if its file were next to the store."""
+    """Return the campaign with which the store was created, as if its file were next to the store."""
     attributes: Any = _read_attributes(path)
     stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")
     return replace(stored, versions=attributes["versions"])
@@ -356,7 +356,7 @@ def _read_attributes(path: Path) -> Mapping[str, object]:
 
 
 def _list_differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:
-    """Yield in words each difference of a campaign from that of a store; of the settings, the first."""
+    """Yield in words each difference of a campaign from the store's campaign; only the first one of the settings."""
     for name in ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs"):
         new, old = getattr(campaign, name), getattr(stored, name)
         if new != old:

@@ -52,10 +52,10 @@ def estimates_option() -> Parameter:
 
 
 def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
-    """Return the folder in which a results folder of this name is made: `--out`, or its parent if `--out` has the name.
+    """Return the folder in which the results folder `name` is made: `--out`, or its parent if `--out` has that name.
 
     Raises:
-        ValueError: no `--out`, or a folder that cannot be written.
+        ValueError: there is no `--out`, or the folder cannot be written.
     """
     from heliograph.disk.atomic_files import check_folder_writable
     from heliograph.numerics.check import fail
@@ -67,7 +67,7 @@ def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
 
 
 def _convert_to_int(_: type, tokens: Sequence[Token]) -> int:
-    """Return the integer that an option's digits say; fractions, and underscores between digits, are refused."""
+    """Return an option's text as an integer; fractions, and underscores between digits, raise ValueError."""
     text = tokens[0].value
     if not re.fullmatch(r"[+-]?[0-9]+", text, re.ASCII):
         raise ValueError(f"expected a whole number, got {text!r}")
@@ -75,7 +75,7 @@ def _convert_to_int(_: type, tokens: Sequence[Token]) -> int:
 
 
 def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
-    """Return the path that an option's text is; an empty one, or one with a NUL, is refused."""
+    """Return an option's text as a path; an empty text, or one with a NUL, raises ValueError."""
     text = tokens[0].value
     if not text or "\0" in text:
         raise ValueError(f"expected a path, got {text!r}")
@@ -83,7 +83,7 @@ def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
 
 
 def _convert_to_path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
-    """Return the address of a store of which an option's text is the URL, of any other text the path."""
+    """Return an option's text as the address of a store if it is a store's URL, or else as a path."""
     from heliograph.files.stores.store_address import is_store, parse_store
 
     text = tokens[0].value

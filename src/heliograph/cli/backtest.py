@@ -80,7 +80,7 @@ def backtest(
         )
 
     def make_results(found: "heliograph.forecasting.Backtest") -> "ResultsContent":
-        """Return the content of the results folder; `refit`: rows between fits of the network's numbers, 0 for none."""
+        """Return the content of the results folder; the network is fitted again after each `refit` rows, 0 for never."""
         from heliograph.report.pages.backtest import make_backtest_results
 
         return make_backtest_results(found, network, refit)
@@ -92,7 +92,7 @@ def backtest(
 
 
 def _choose_target(network: str, measurements: Path | StoreAddress, out: Path) -> Path:
-    """Return the folder of the results in `out`; raise ValueError where it holds what is read, by the user's names."""
+    """Return the folder of the results in `out`; raise ValueError if it holds a file that is read."""
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 
     target = choose_results_folder("backtest", out, NAME) / NAME
@@ -101,7 +101,7 @@ def _choose_target(network: str, measurements: Path | StoreAddress, out: Path) -
 
 
 def _parse_rows_ahead(horizons: str) -> list[int]:
-    """Return the horizons of the option, which have to be numbers of rows; raise ValueError at a span or a date."""
+    """Return the option's horizons, which must be numbers of rows; a span of time or a date raises ValueError."""
     from heliograph.numerics.check import check_count, fail
     from heliograph.numerics.times.dates import horizons_in
 
@@ -116,7 +116,7 @@ def _parse_rows_ahead(horizons: str) -> list[int]:
 
 
 def _describe_coverage(score: "heliograph.forecasting.Score") -> str:
-    """Return a line on how often what came was within the intervals of a forecast."""
+    """Return a line on how often the values that came were within a forecast's intervals."""
     shares = ", ".join(f"{share.value:.1%} +- {share.error:.1%}" for share in score.coverage)
     return (
         f"{score.node}/{score.filter} {score.part} {score.name}, {score.horizon} ahead: within the "
@@ -132,7 +132,7 @@ def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "
     build, (z, u, _, _) = NetworkAgain(reference), recording
 
     def fit_to_first(rows: int) -> "Network":
-        """Return the network that `build` makes, its free numbers fitted to so many first rows of z and u.
+        """Return the network that `build` makes, with its free numbers fitted to the first `rows` rows of z and u.
 
         `advance` shows the progress, in rows of the recording.
         """

@@ -53,9 +53,10 @@ for single, arguments in COMMANDS.items():
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback.
+    """Run the command and return its exit code; bad input gives one line on stderr, and a bug its traceback.
 
-    `stopped`: signals that came; what a signal ended has the code SIGNALLED, 128, plus its number.
+    `stopped` holds the signals that came. The exit code of a command that a signal ended is SIGNALLED (128) plus the
+    signal's number.
     """
     stopped: list[int] = []
     try:
@@ -113,7 +114,7 @@ def _print_plain_warnings() -> Iterator[None]:
             message: Warning | str, category: type[Warning], filename: str, lineno: int,
             file: TextIO | None = None, line: str | None = None,
         ) -> None:  # fmt: skip
-            """Print a warning to users as a line; leave others to `of_python`, Python's own way to show them."""
+            """Print a warning to users as a line; leave all others to `of_python`, Python's own function for this."""
             if issubclass(category, UserWarning):
                 from heliograph.disk.quoted_text import visible
 
@@ -126,7 +127,10 @@ def _print_plain_warnings() -> Iterator[None]:
 
 
 def _output_is_lost() -> bool:
-    """Return whether standard output cannot be written, as after `| head`: an OSError does not say where it arose."""
+    """Return whether standard output can no longer be written, as after `| head`.
+
+    An OSError does not say where it arose, so it is tried.
+    """
     try:
         sys.stdout.flush()
     except OSError:

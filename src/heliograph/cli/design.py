@@ -51,7 +51,7 @@ def design(
 
 def count_stages(file: "DesignFile") -> int:
     """Return the approximate number of steps for the progress bar."""
-    # The design, rows of the map, budgets of the front, and some three changes to try for each node.
+    # They are the design, the rows of the map, the budgets of the front, and about three changes for each node.
     from heliograph.planning.design_comparisons import POINTS
 
     rows = 0 if file.map is None else len(file.map.y)

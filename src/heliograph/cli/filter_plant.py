@@ -89,9 +89,9 @@ def write_plant_estimates(
     lag: float | None,
     options: ReadingOptions,
 ) -> list[str]:
-    """Write a plant's estimates, and beside them those given all that came up to `lag` later; return lines on these.
+    """Write a plant's estimates, and beside them those that use everything up to `lag` later; return lines on the latter.
 
-    `lag`: in the unit of time, None for none.
+    `lag` is in the unit of time; None writes no such estimates.
     """
     write = _make_estimates_writer(plant.data, module)
     predicted = _select_times_of_predictions(plant.predicted, plant.data.rows)
@@ -100,14 +100,14 @@ def write_plant_estimates(
 
 
 def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
-    """Return where a plant's estimates go: of several plants each has a file with its name; a store holds them all."""
+    """Return where a plant's estimates go: with several plants, a file with the plant's name; a store holds all."""
     if isinstance(out, StoreAddress) or not several:
         return out
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}")
 
 
 def choose_lagged_output(place: Path | StoreAddress) -> Path | StoreAddress:
-    """Return where estimates of a lag later go, beside `place`: a file or table of their own."""
+    """Return where lagged estimates go: a file or table of their own beside `place`."""
     if isinstance(place, Path):
         return place.with_suffix(f".lagged{place.suffix}")
     return place.with_table(f"{place.table_for_estimates}_lagged")
@@ -121,7 +121,7 @@ def filter_rows(
 ) -> tuple["Record", list[str]]:
     """Return the record of the filtered rows, and the warnings that were given meanwhile as lines.
 
-    `after`: the record of the rows before these.
+    `after` is the record of the earlier rows, None if there are none.
     """
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
@@ -132,7 +132,7 @@ def filter_rows(
 def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
     """Return a line for each output on how many of its values filters doubted, and their bias.
 
-    Only filters that weigh values, by how likely they are, doubt any.
+    Only filters that weigh values by how likely they are can doubt them.
     """
     from heliograph.report.sensor_output_health import summarise_weighed_outputs
 
@@ -152,7 +152,7 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
         return record
 
     def select(estimate: "Estimate") -> "Estimate":
-        """Return these `rows`, a mask, of an estimate; of its modes' probabilities too, if it has any."""
+        """Return the rows of an estimate that the mask `rows` selects, with its modes' probabilities if it has any."""
         return replace(
             estimate,
             mean=np.asarray(estimate.mean)[rows],
@@ -178,9 +178,9 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
 
 
 def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
-    """Return a forecast of each estimate from the last row, by node and filter; inputs stay as they are there."""
+    """Return forecasts from the last row by node and filter; inputs are held as they are there."""
     forecasts = heliograph.forecast(record, ahead, inputs="held")
-    assert isinstance(forecasts, dict)  # of a network
+    assert isinstance(forecasts, dict)  # the record is of a network
     return forecasts
 
 
@@ -195,7 +195,7 @@ def _describe_forecasts(forecasts: "ByFilter") -> str:
 
 
 def _select_times_of_predictions(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
-    """Return what was predicted of some of the rows; `rows`: a mask, None for all."""
+    """Return the predictions of some rows; `rows` is a mask, None for all."""
     if rows is None or rows.all():
         return predicted
     selected = {}
@@ -265,10 +265,10 @@ def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]"
     origin = _find_date_of_time_zero(data)
 
     def write(record: "Record", path: Path | StoreAddress) -> None:
-        """Write the estimates of a record, in the form that the path asks for: a store, a bag (.mcap) or a table.
+        """Write the estimates of a record to a store, a bag (.mcap) or a table, as the path says.
 
-        `data` is the plant that was filtered, `origin` the date of its time 0; `module` has the names in the network's
-        file, of which `pose` says what the poses of a bag are.
+        `data` is the plant that was filtered, and `origin` the date of its time 0. `module` holds the names in the
+        network's file; its `pose` says which states are the pose in a bag.
         """
         if isinstance(path, StoreAddress):
             write_columns_to_store(path, estimate_columns(record), data.plant, origin)

@@ -68,9 +68,9 @@ def fit(
     with GentleStop() as stop:
 
         def learn(advance: "Advance") -> "FitResults":
-            """Return what is learned with the options of the command line, until a signal stops it (`stop`).
+            """Return what is learned with the command line's options, until a signal stops it (`stop`).
 
-            `share`: of the rows, the last ones, that only judge; `advance` shows the progress.
+            `share` is the share of the rows, the last ones, that only judge. `advance` shows the progress.
             """
             return fit_and_judge(
                 network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop
@@ -151,9 +151,9 @@ def fit_and_judge(
 
 
 def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
-    """Return the statistics of losses of the nodes of which some messages arrived and some did not.
+    """Return the statistics of losses for each node with both arrived and lost messages.
 
-    `fates`: by node, sequences of whether each message arrived.
+    `fates` are a node's sequences of flags: whether each message arrived.
     """
     from heliograph.learning.packet_losses.learn_losses import learn_losses
 
@@ -237,10 +237,10 @@ def _fit_with_progress(
     def show_progress(line: str) -> None:
         """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal.
 
-        STEPS: at most so many; `stop` has the signals that came.
+        A search has at most STEPS steps. `stop` holds the signals that came.
         """
         stop.raise_if_requested()
-        stop.note_next_signal_only()  # from here on there is a best so far, which the next signal keeps
+        stop.note_next_signal_only()  # there is a best result so far, which the next signal keeps
         form, _, state_of_search = line.partition(":")
         match = re.match(r" step ([0-9]+)", state_of_search)
         step = int(match[1]) if match else STEPS

@@ -46,9 +46,9 @@ class ReadingOptions:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Return the window, how late an event may come, and how far its time may be past its arrival, in time's unit.
+        """Return how late an event may come (the window), and how far its time may be after its arrival.
 
-        WINDOW and AHEAD stand for options that are not given.
+        Both are in the unit of time. WINDOW and AHEAD stand for options that are not given.
         """
         from heliograph.live.event import AHEAD
         from heliograph.numerics.check import scalar
@@ -120,7 +120,7 @@ def read_measured_plants(
 
 
 def open_path_or_store(location: "Path | StoreAddress") -> "Path | StoreTable":
-    """Return the path itself, or the table that a store answers."""
+    """Return a path as it is, or for the address of a store the table with its rows."""
     if isinstance(location, Path):
         return location
     from heliograph.files.stores.store_tables import query_store
@@ -132,7 +132,7 @@ def take_only_plant(path: object, measured: list[MeasuredPlant]) -> MeasuredPlan
     """Return the measured data of the only plant.
 
     Raises:
-        ValueError: several plants; one line that names the option.
+        ValueError: there are several plants. The error names the option that chooses one.
     """
     from heliograph.numerics.check import fail
 
@@ -172,9 +172,9 @@ def read_events(
 
 
 def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> MeasuredPlant:
-    """Return the rows of time of a table as data of a plant without a name, with warnings on rows that were refused.
+    """Return a table's rows of times as the data of a plant without a name, with warnings on refused rows.
 
-    REASONS: how many reasons a warning names.
+    A warning names at most REASONS reasons.
     """
     from heliograph.files.recording import read_recording_rows
 
@@ -206,7 +206,7 @@ def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptio
 
 
 def describe_unreadable_messages(path: object, events: "EventTable") -> list[str]:
-    """Return lines: how many messages could not be read, why (of the first of them), and where the reading ended."""
+    """Return lines on where reading ended early, and on how many messages could not be read, with the first reasons."""
     from heliograph.model.checks.refusal_reasons import describe_counts
 
     lines = [events.broken] if events.broken else []
@@ -217,7 +217,7 @@ def describe_unreadable_messages(path: object, events: "EventTable") -> list[str
 
 
 def describe_refusals(path: object, what: str, count: int, reasons: Sequence[str], known: str = "") -> str:
-    """Return a line: how many rows or messages were refused, how many for `known` reasons, and why, of the first."""
+    """Return a line on refused rows or messages: their count, the counts by `known` reasons, and the first reasons."""
     in_brackets = f" ({known})" if known else ""
     others = f"; and {count - len(reasons)} more" if count > len(reasons) else ""
     return f"{path}: {what} that could not be read: {count}{in_brackets}; {'; '.join(reasons)}{others}"

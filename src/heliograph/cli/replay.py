@@ -119,7 +119,7 @@ def _yield_events_of_plants(
 
 
 def _describe_too_fine_dates(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
-    """Return a line on how many dates are finer than the microseconds that messages have; [] if none is."""
+    """Return a line on how many dates are finer than a microsecond, to which messages round them; [] if none is."""
     if time.dtype.kind != "M":
         return []
     finer = int((time != time.astype("datetime64[us]")).sum())

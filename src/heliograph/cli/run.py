@@ -108,7 +108,7 @@ def run(
 
 
 def _load_network(reference: str) -> "tuple[Network, Mapping[str, object]]":
-    """Return a network, and the names in its file; raise ValueError for one without filters to run."""
+    """Return a network and the names in its file; raise ValueError if it has no filter to run."""
     from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
 
@@ -119,7 +119,7 @@ def _load_network(reference: str) -> "tuple[Network, Mapping[str, object]]":
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
-    """Return how to smooth by the option: "all" uses all rows, a number so many later ones; None for no word."""
+    """Return how to smooth: with all rows ("all"), with so many later rows (a number), or None for an empty word."""
     from heliograph.numerics.check import fail
     from heliograph.smoothing import FixedInterval, FixedLag
 
@@ -182,7 +182,7 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
-    """Return a line on the errors of each filter if the truth is known: RMSE by state, and NEES (1: claim holds)."""
+    """Return a line on the errors of each filter, if the truth is known: RMSE by state, and NEES (1 if its claim holds)."""
     from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 
     lines = []
@@ -230,9 +230,9 @@ def _refuse_losing_files(
     lag: float | None,
     report: Path | None,
 ) -> None:
-    """Raise ValueError where a file that is read or written would be lost by what is written.
+    """Raise ValueError if a file that is read or written would be overwritten.
 
-    `places`: where estimates go; with a `lag` others go beside these.
+    `places` says where estimates go. With a `lag`, lagged estimates are written beside them.
     """
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 
@@ -266,9 +266,9 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
-        """Return the diagnosis of a plant with its forecasts, predictions, their residuals, and refusals by node.
+        """Return the diagnosis of a plant with its forecasts, predictions, residuals, and refusals by node.
 
-        Residuals, what was not predicted, are there only where predictions were asked for.
+        Residuals are what was not predicted. There are some only if predictions were asked for.
         """
         record, inputs = plant.record, plant.data.recording.inputs
         residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}
@@ -283,7 +283,7 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
         return {plant.data.plant: examine_plant(plant, advance) for plant in plants}
 
     def results_of(health: dict[str, Health]) -> ResultsContent:
-        """Return the content of the results folder: of one plant its page, of several an overview and folders."""
+        """Return the content of the results folder: one plant's page, or an overview and folders of several plants."""
         from heliograph.report.pages.run import make_results_of_plants, make_run_results
 
         if len(health) > 1:

@@ -79,7 +79,7 @@ def run_in_blocks(
 
 
 def is_long(path: Path, limit: BlockSize = LONG) -> bool:
-    """Return whether a table is too long to be read at once: beyond a limit of bytes of CSV, or of rows of Parquet."""
+    """Return whether a table is too long to be read at once: CSV of too many bytes, or Parquet of too many rows."""
     from heliograph.files.text.text_file import find_extension
 
     if not path.is_file():
@@ -91,7 +91,7 @@ def is_long(path: Path, limit: BlockSize = LONG) -> bool:
 
     try:
         return int(pq.read_metadata(path).num_rows) > limit.rows
-    except (pa.ArrowInvalid, OSError):  # the reader says what is wrong
+    except (pa.ArrowInvalid, OSError):  # the reader will say what is wrong
         return False
 
 
@@ -186,13 +186,13 @@ class WrittenRowCounts:
     """
 
     def __init__(self) -> None:
-        """Begin with no row written."""
+        """Begin before any row is written."""
         self.rows = 0
-        # By NODE/FILTER: what its estimates claim, and in how many rows they claim nothing.
+        # By "node/filter": what a filter's estimates claim, and in how many rows they claim nothing.
         self._claims, self._rows_without = dict[str, str](), Counter[str]()
 
     def add(self, record: "Record") -> None:
-        """Count the rows of a record, and by "node/filter" those in which a filter that has a claim claims none."""
+        """Count the rows of a record, and by "node/filter" the rows in which a filter with a claim claims nothing."""
         self.rows += len(record.time)
         for node, filters in record.estimates.items():
             for name, estimate in filters.items():
@@ -203,7 +203,7 @@ class WrittenRowCounts:
     def describe(self, *places: object) -> str:
         """Return a line on what was written where: "out.csv: 3 rows of a/kf (exact, none of 2 rows)".
 
-        These have a claim "exact", but for 2 rows in which nothing is claimed.
+        In the example the claim is "exact", but in 2 rows nothing is claimed.
         """
         filters = []
         for name, claim in self._claims.items():
@@ -216,15 +216,15 @@ class MergedBlockWarnings:
     """Lines on blocks of rows: those that differ in their numbers alone are one, of the first block that has it."""
 
     def __init__(self) -> None:
-        """Begin with no block and no line; `_more`: in how many later blocks a line came again."""
+        """Begin without blocks and lines; the keys of the dictionaries are lines without their numbers."""
         self._blocks = 0
-        self._first = dict[str, tuple[str, str]]()  # by the line without its numbers: rows, line
-        self._more = Counter[str]()
+        self._first = dict[str, tuple[str, str]]()  # words on the block's rows, and the first such line
+        self._more = Counter[str]()  # in how many later blocks such a line came again
 
     def add(self, lines: Iterable[str], first: int, last: int) -> None:
-        """Add the lines on a block, in which rows count from 1; `first` and `last` are the numbers of its rows.
+        """Add the lines on a block, which count rows from 1; `first` and `last` are the numbers of its rows.
 
-        Lines that differ in numbers alone (NUMBER) are kept once; `self._more` counts the later blocks that have one.
+        Lines that differ only in numbers (NUMBER) are kept once. `self._more` counts later blocks with such a line.
         """
         self._blocks += 1
         kinds_in_block = set[str]()
@@ -237,10 +237,7 @@ class MergedBlockWarnings:
             kinds_in_block.add(kind)
 
     def list_lines(self) -> list[str]:
-        """Return the lines, which name the rows of their block if there are several blocks.
-
-        `self._first`: by the line without its numbers the first one, with the rows of its block.
-        """
+        """Return the lines; if there are several blocks, each line names the rows of its block."""
         if self._blocks == 1:
             return [line for _, line in self._first.values()]
         lines = []

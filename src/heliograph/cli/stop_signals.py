@@ -32,9 +32,9 @@ def unwind_on_signals(stopped: list[int]) -> Iterator[None]:
         raise KeyboardInterrupt
 
     def interrupt_later(what: "sys.UnraisableHookArgs") -> None:
-        """Raise an interrupt that Python could not raise once more, SOON seconds later; report all else as before.
+        """Raise an interrupt again SOON seconds later if Python could not raise it; report other errors as before.
 
-        `timers`: those begun, which are cancelled at the end.
+        `timers` holds the timers that were begun. They are cancelled at the end.
         """
         if issubclass(what.exc_type, KeyboardInterrupt):
             timer = Timer(SOON, interrupt_main)  # raised at once, it would be swallowed again
@@ -84,9 +84,10 @@ class GentleStop:
         return SIGNALLED + self._number if self._number else 0
 
     def note_next_signal_only(self) -> None:
-        """Only note the next signal of STOPPING, in place of raising; ones that were ignored stay so.
+        """From now on only note the next signal of STOPPING, and do not raise; ignored signals stay ignored.
 
-        Nothing changes if one came (`self._number`) or this was called before: `self._handlers` has the earlier ones.
+        Nothing changes if a signal came already (`self._number`), or after an earlier call. `self._handlers` keeps the
+        earlier handlers.
         """
         if not self._handlers and not self._number:
             self._handlers = {number: signal.getsignal(number) for number in STOPPING}
@@ -100,9 +101,9 @@ class GentleStop:
             raise KeyboardInterrupt
 
     def run_unless_stopped(self, work: Callable[[], T]) -> T | None:
-        """Return the value of work that may be left out, None if a signal (`self._number`) came before its end.
+        """Return the value of work that may be left out, or None if a signal (`self._number`) came before its end.
 
-        Within it a signal raises KeyboardInterrupt, which is another's where no signal was noted.
+        During the work a signal raises KeyboardInterrupt. If no signal was noted, the interrupt is not ours.
         """
         if self._number:
             return None
@@ -126,7 +127,7 @@ class GentleStop:
         self._restore_handlers()
 
     def _restore_handlers(self) -> None:
-        """Give signals the handlers (`self._handlers`) back that they had before `note_next_signal_only`."""
+        """Restore the signals' handlers (`self._handlers`) from before `note_next_signal_only`."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._handlers = {}

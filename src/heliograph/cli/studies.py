@@ -129,7 +129,7 @@ def run_studies(
 def _check_names(names: Sequence[str], known: Mapping[str, EntryPoint], kind: str) -> None:
     """Raise ValueError for the first name that is no study of this kind, "example" or "publication".
 
-    PAGES: the pages of the documentation that earlier examples are now.
+    PAGES maps earlier examples to the pages of the documentation that replaced them.
     """
     from heliograph.numerics.check import fail
 
@@ -143,10 +143,10 @@ def _check_names(names: Sequence[str], known: Mapping[str, EntryPoint], kind: st
 def change_settings(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
     """Return a study's settings with other values; an error names the option by which a wrong value was given.
 
-    A value that is an `OptionValue` came by an option of its own, others by a general one.
+    An `OptionValue` came by an option of its own. Other values came by the general option.
 
     Raises:
-        ValueError: no such setting, or a value that is none.
+        ValueError: there is no such setting, or its value is wrong.
     """
     from heliograph.numerics.check import fail
 
@@ -192,9 +192,9 @@ def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[st
 
 
 def list_studies(kind: str) -> dict[str, EntryPoint]:
-    """Return the studies of a kind, "publication" or "example", of installed packages, without importing any.
+    """Return the studies of a kind, "publication" or "example", in installed packages, without importing them.
 
-    Packages offer them as entry points of GROUP; the function's name (`attr`) says of which kind one is.
+    Packages offer studies as entry points of GROUP. The name of the function (`attr`) is the kind.
     """
     by_name: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
@@ -226,7 +226,7 @@ def read_first_docstring_line(module: str) -> str:
 
 
 def read_needed_packages(module: str) -> Sequence[str]:
-    """Return the packages of extras that a study's module lists as `NEEDS`, without running it: it may need them."""
+    """Return the packages that a study's module lists as `NEEDS`; the module is not run, since it may need them."""
     for statement in parse_source(module).body:
         match statement:
             case ast.Assign(targets=[ast.Name(id="NEEDS")], value=value):
@@ -236,7 +236,7 @@ def read_needed_packages(module: str) -> Sequence[str]:
 
 
 def parse_source(module: str) -> ast.Module:
-    """Return the source of a module as a tree, without running it; an empty one where there is no source."""
+    """Return the syntax tree of a module's source without running it; it is empty if there is no source."""
     spec = find_spec(module)
     if spec is None or spec.origin is None:
         return ast.Module([], [])

@@ -22,10 +22,10 @@ LOCK = ".lock"
 
 @contextmanager
 def try_lock(path: Path) -> Iterator[bool]:
-    """Try to lock the file or folder at `path`; yields whether the lock was obtained."""
+    """Try to lock the file or folder at `path` for the `with` block; yield whether the lock was obtained."""
     try:
         handle = os.open(path, os.O_RDONLY)
-    except FileNotFoundError:  # its holder has just removed it
+    except FileNotFoundError:  # the holder of the lock has just removed the file
         yield False
         return
     try:
@@ -61,20 +61,20 @@ def lock_folder(folder: Path) -> Iterator[bool]:
 
 
 def _open_locked(path: Path) -> int | None:
-    """Return the handle of the lock file at `path`, made if needed and locked; None if somebody else holds the lock."""
+    """Return the handle of the lock file at `path` after making and locking it; None if somebody else holds the lock."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock_handle(handle):
             os.close(handle)
             return None
-        # The path must still name the locked file: a holder before us may have removed the one that we opened.
+        # The previous holder may have removed the file that we opened. Then the path no longer names it: try again.
         if _is_path_of_handle(path, handle):
             return handle
         os.close(handle)
 
 
 def _is_path_of_handle(path: Path, handle: int) -> bool:
-    """Return whether a path is that of the open file `handle`; False if nothing is there any more."""
+    """Return whether a path still names the open file `handle`; False if the path no longer exists."""
     try:
         handle_of_path = os.open(path, os.O_RDONLY)
     except FileNotFoundError:
@@ -85,7 +85,7 @@ def _is_path_of_handle(path: Path, handle: int) -> bool:
 
 
 def _lock_handle(handle: int) -> bool:
-    """Take the lock of an open file without waiting; return whether it was free (always, where locks do not exist)."""
+    """Take the lock of an open file without waiting; return whether it was free (True on systems without locks)."""
     if fcntl is None:
         return True
     try:
@@ -175,8 +175,8 @@ def _remove_leftover_files(path: Path) -> None:
 
 
 def _is_running(process: str) -> bool:
-    """Return whether a process of this number runs; True where that is unknown."""
-    # Signal 0 is sent to nobody: it only fails where there is no such process.
+    """Return whether a process of this number runs; True if that is unknown."""
+    # Signal 0 is never sent. The call fails if there is no such process.
     try:
         os.kill(int(process), 0)
     except ProcessLookupError:
@@ -220,7 +220,7 @@ def check_folder_writable(folder: str | Path) -> None:
 
 
 def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
-    """Return the extension of a file name in lower case, which determines the format; ValueError at an unknown one."""
+    """Return the extension of a file name in lower case; raise ValueError if it is no known format."""
     kind = path.suffix.lower()
     if kind not in formats:
         raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))
@@ -228,9 +228,10 @@ def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
 
 
 def check_replaceable(target: Path, mark: str) -> None:
-    """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results.
+    """Raise ValueError unless the folder `target` can be written, and is new, empty or holds earlier results.
 
-    A lock file, LOCK, counts as nothing. Folders that killed processes left beside it are removed first.
+    A file `mark` in it shows earlier results. A lock file (LOCK) does not count. Folders that killed processes left
+    beside it are removed first.
     """
     check_folder_writable(target)
     remove_leftover_folders(target)
@@ -290,9 +291,10 @@ def _replace_folder(partial: Path, target: Path) -> None:
 
 
 def remove_leftover_folders(target: Path) -> None:
-    """Remove the temporary folders next to `target` that killed processes left, none that a running process uses.
+    """Remove the temporary folders next to `target` that killed processes left.
 
-    A folder with something else in it is nobody's of ours. Earlier results that were moved aside are put back.
+    A running process holds a lock on its folder, which stays. A folder with other contents is not ours, and stays too.
+    Earlier results that were moved aside are put back.
     """
     if not target.parent.is_dir():
         return

@@ -7,12 +7,12 @@ from heliograph.numerics.check import fail
 
 
 def refuse_replacing(read: Iterable[object], written: Iterable[object], folder: Path | None = None) -> None:
-    """Raise ValueError where a file would be lost by what a command writes.
+    """Raise ValueError if a command would overwrite a file that it reads or has just written.
 
     Args:
-        read: files and folders that the command reads; anything but a path is no file.
-        written: files that it writes.
-        folder: folder that it replaces as a whole; None for none.
+        read: files and folders that the command reads; anything but a path is ignored.
+        written: files that the command writes; anything but a path is ignored.
+        folder: the folder that the command replaces as a whole; None if there is none.
     """
     sources = [path for path in read if isinstance(path, Path)]
     places = [path for path in written if isinstance(path, Path)]

@@ -41,7 +41,7 @@ def unquote_file(text: str) -> str:
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Return names on a line; of more than twice NAMED, the first NAMED and how many there are."""
+    """Return names on a line; if they are more than 2 NAMED, the first NAMED and how many there are."""
     if len(names) <= 2 * NAMED:
         return ", ".join(names)
     return f"{', '.join(names[:NAMED])} … ({len(names)})"

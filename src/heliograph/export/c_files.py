@@ -124,10 +124,10 @@ def write_filter_files(
 
 
 def check_source_path(path: str | Path) -> Path:
-    """Return the path of the source, checked: its name is the prefix of the names in it.
+    """Return the checked path of the C source; the file's name is the prefix of the names in it.
 
     Raises:
-        ValueError: a file that does not end in .c, cannot be written, or whose name C does not take for a function.
+        ValueError: the file does not end in .c, cannot be written, or has a name that is no name of a C function.
     """
     if not isinstance(path, str | Path):
         raise fail("path of the source", "a file that ends in .c", show_value(path))
@@ -214,10 +214,10 @@ def measure_step_cost(header: Path, source: Path, received: int, inputs: int, re
 
 
 def _measure_code_size(folder: Path) -> int | None:
-    """Return the bytes of text and constants of the object file, without debugging data."""
+    """Return the bytes of code and constants in the object file step.o, or None without the program `size`."""
     if shutil.which("size") is None:
         return None
-    # Lines of name, size and address; sections named with two underscores are those of macOS.
+    # Each line holds a section's name, size and address. Names with two underscores are those of macOS.
     table = _run_command("size", "-A", "step.o", folder=folder)
     sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", table, re.MULTILINE)
     code_and_constants = (".text", ".rodata", "__text", "__const")

@@ -5,9 +5,10 @@ from heliograph.export.step_program import Real, StepProgram
 
 
 def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
-    """Return the heads of the functions in C that move the state: of the step, or also of its parts, the step last.
+    """Return the heads of the C functions that move the state: the step, and before it its parts if there are any.
 
-    The parts are prediction and correction; `start_at` makes the state of a given mean and covariance, where one can.
+    The parts are prediction and correction. If `program.start_at` is not None, a function makes the state from a given
+    mean and covariance.
     """
     state = f"{prefix}_state *state"
     step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
@@ -22,9 +23,9 @@ def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
 
 
 def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
-    """Return the declaration in C of what a correction tells beside the estimate; "" of a program of whole steps alone.
+    """Return the C declaration of the innovation that a correction tells, or "" if the program has only whole steps.
 
-    Value and weights of the innovation, nis (its square over its covariance) and how many components arrived.
+    It holds the innovation's value, any weights, nis (its square over its covariance), and how many components arrived.
     """
     if len(program.parts) == 1:
         return ""
@@ -99,7 +100,7 @@ def _generate_measurement_check(program: StepProgram) -> list[str]:
 
 
 def _generate_inputs_check(program: StepProgram) -> list[str]:
-    """Return the statements of C that refuse inputs that are not finite (return 2), and a step past the end (3)."""
+    """Return the C statements that refuse inputs that are not finite (they return 2), and a step past the end (3)."""
     lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
     if program.filter.horizon is not None:
         lines.append(f"    if (state->step >= {program.filter.horizon}) {{ return 3; }}")
@@ -148,8 +149,8 @@ def _generate_part_statements(program: StepProgram, number: int, prefix: str) ->
 def _name_place_of_result(name: str) -> str:
     """Return the C expression for where a result beside the state is written.
 
-    Flags are local variables; all others are members of `news`, the innovation that the function tells. Its single
-    numbers are passed by their address, its arrays as they are.
+    Flags are local variables. All other results are members of `news`, the innovation that the function tells. Single
+    numbers are passed by their address, and arrays as they are.
     """
     if name in ("implausible", "spoilt"):
         return name
@@ -159,8 +160,8 @@ def _name_place_of_result(name: str) -> str:
 def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> str:
     """Return the C expression for the number of the step that a part belongs to.
 
-    A prediction raises the state's count, so that the correction after it belongs to one less. Without a count, of a
-    filter for which all steps are alike, it is 0.
+    A prediction raises the state's count, so that the correction after it belongs to one less. If all steps of the
+    filter are alike, the state has no count, and the number is 0.
     """
     if not program.counts:
         return "0"
@@ -170,9 +171,9 @@ def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> 
 
 
 def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
-    """Return the statements of C of a start from a given mean and covariance; they return 7 where these are invalid.
+    """Return the C statements of a start from a given mean and covariance; they return 7 if these are invalid.
 
-    The state `after` is written to the caller's only where it is valid; the flag `none` is 1 where there is none.
+    The flag `none` is then 1. The new state `after` is copied to the caller's state only if it is valid.
     """
     members = ", ".join(f"after.{member.name}" for member in program.members)
     return [

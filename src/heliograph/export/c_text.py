@@ -165,7 +165,7 @@ def _generate_header_comment(program: StepProgram, form: CTextOptions, window: W
 
 
 def _explain_angles(filter: AbstractFilter) -> list[str]:
-    """Return a note for each state: the unit and range of an angle, what an attitude is; "" for all others."""
+    """Return a note for each state: the unit and range of an angle, a word on an attitude, and "" for others."""
     circular = first(filter.plant).circular if hasattr(filter, "plant") else ()
     notes = {filter.states.index(name): " (radians, from -pi to pi)" for name in circular}
     notes |= dict.fromkeys(filter.attitude, " (of a rotation vector, radians; its errors are turns in the body's axes)")
@@ -173,7 +173,7 @@ def _explain_angles(filter: AbstractFilter) -> list[str]:
 
 
 def _explain_entries(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:
-    """Return a line for each entry of an array, such as "z[0]: position", with its note; "z: not used" of none."""
+    """Return a line for each entry of an array, such as "z[0]: position", with its note; "z: not used" if it is empty."""
     if not names:
         return [f"{array}: not used"]
     return [f"{array}[{i}]: {name}{note}" for i, (name, note) in enumerate(zip(names, notes, strict=True))]

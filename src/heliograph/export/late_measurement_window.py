@@ -111,7 +111,7 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
 
 
 def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
-    """Return the heads of the window's functions in C: its start, a step, and a measurement of steps or time ago."""
+    """Return the heads of the window's C functions: its start, a step, and a late measurement (by steps or age)."""
     pointer = f"{prefix}_window *window"
     how_late = "uint32_t steps" if window.time is None else f"{real} age"
     return [
@@ -205,7 +205,7 @@ def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real:
 
 
 def _generate_array_copy(target: str, source: str, count: int) -> str:
-    """Return the statement of C that copies an array; of an empty one that which says that `source` is not used."""
+    """Return the C statement that copies an array; for an empty one it marks `source` as not used."""
     if not count:
         return f"    (void){source};"
     return f"    for (int c = 0; c < {count}; ++c) {{ {target}[c] = {source}[c]; }}"

@@ -16,9 +16,10 @@ HALF_UNIT = 2.0**-24  # by which single precision rounds, of the number
 
 
 def explain_ranges(filter: AbstractFilter) -> list[str]:
-    """Return a note for each component of z, up to which size its rounding is small beside its noise; "" if unknown.
+    """Return a note for each component of z: up to which size rounding is small beside its noise; "" if unknown.
 
-    HALF_UNIT is the largest relative error of rounding to single precision, SHARE the part of the noise it may be.
+    HALF_UNIT is the largest relative error of rounding to single precision. SHARE is the largest share of the noise's
+    deviation that rounding may have.
     """
     deviations = _find_noise_deviations(filter)
     if deviations is None:
@@ -31,9 +32,9 @@ def explain_ranges(filter: AbstractFilter) -> list[str]:
 
 
 def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
-    """Return lines for the C header: on the ranges of z, if it has notes on them, and on the mean's low digits.
+    """Return lines for the C header on the ranges of z (if `ranged`), and on the mean's low digits if there are any.
 
-    A state in single precision may keep the digits of the mean that a float leaves out in a second array, `low`.
+    A state in single precision may keep the digits of the mean that a float leaves out, in a second array `low`.
     """
     on_ranges = [
         "Up to the size that is noted, single precision rounds a component of z by a hundredth of its noise at most;",

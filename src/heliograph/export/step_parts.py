@@ -73,8 +73,8 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
         """Return the arrays of the state, the estimate and two flags after step k, with measurement z and input u.
 
-        The flags: z or u is implausible (see `is_implausible`); u spoils the digits of numbers of type `real`, of which
-        ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
+        The first flag says that z or u is implausible, the second that u spoils the digits of numbers of type `real`.
+        PRECISION maps this type to NumPy's. `tree` is the structure of the state.
         """
         state = jax.tree.unflatten(tree, arrays)
         state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
@@ -92,7 +92,8 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:
         """Return the arrays of the state, the estimate and two flags after the prediction of step k with input u.
 
-        The flags: u is implausible; u spoils the digits of numbers of type `real`. `tree`: structure of the state.
+        The first flag says that u is implausible, the second that u spoils the digits of numbers of type `real`. `tree`
+        is the structure of the state.
         """
         before = jax.tree.unflatten(tree, arrays)
         prior = filter.predict(before, u, k)
@@ -109,9 +110,10 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 
     @jax.jit
     def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
-        """Return the arrays of the state, the estimate, a flag, and what the correction with z in step k tells.
+        """Return the arrays of the state, the estimate, a flag, and the innovation of the correction with z in step k.
 
-        The flag: z is implausible. Told are innovation, its squared distance, how much arrived, and any weights.
+        The flag says that z is implausible. After it come the innovation, its squared distance, how much arrived, and
+        the weights if there are any.
         """
         prior = jax.tree.unflatten(tree, arrays)
         after, innovation = filter.correct(prior, z, k)
@@ -128,13 +130,11 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 
 
 def is_implausible(filter: AbstractFilter, innovation: Innovation, z: jax.Array, real: str) -> jax.Array:
-    """Return whether some component of z is larger than expected, and too many of its own deviations away from that.
+    """Return whether some component of z is larger than expected, and too many of its own deviations off.
 
-    Or whether one of the filter's angles has too many turns for numbers of type `real`.
-
-    The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
-    z, such as a neighbour's measurement, every component that is so far away counts. A difference within ROUNDING,
-    relative to z, counts nothing.
+    It is also implausible if one of the filter's angles has too many turns for numbers of type `real`. Each component's
+    own deviation is used, since the joint distance would cost more. If the innovation is only of a part of z, such as a
+    neighbour's measurement, every component that is so far off counts. A relative difference up to ROUNDING does not.
     """
     is_far, difference = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if difference.shape == z.shape:

@@ -136,9 +136,10 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
 
 
 def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
-    """Return the first result that is equal to result `number` after every part and at the start; else `number` itself.
+    """Return the first result that always equals result `number`, after every part and at the start, or `number` itself.
 
-    `same`: number of the first result of a part that always equals this one; `named`: numbers at the start.
+    results[n].same is the number of the first result of a part that always equals result n. `named` holds the numbers
+    at the start.
     """
     same = [n for n in range(number) if all(code.results[n].same == code.results[number].same for code in parts)]
     start = named[number].start
@@ -213,16 +214,17 @@ def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str],
 
     @jax.jit
     def start_from_moments(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
-        """Return the members of the state of a mean and covariance, and whether these are invalid.
+        """Return the members of the state with a mean and a covariance, and whether these two are invalid.
 
-        `make_state`: from moments; `kept`: which arrays of state and estimate are members; SAME: 1e-6 deviations, by
-        which a covariance's factors may miss it. What is no covariance has no factors that give it back.
+        `make_state` makes the state, which holds the covariance as factors. An invalid covariance is found by the
+        product of its factors, which must agree with it within SAME (1e-6) deviations. `kept` says which arrays of the
+        state and estimate are members.
         """
         state = make_state(mean, covariance)
         estimate = filter.estimate(state)
         results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
         deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
-        difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)  # of the product of factors from the matrix
+        difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)  # the factors' product less the matrix
         is_covariance = jnp.all(difference <= SAME * jnp.outer(deviations, deviations))
         is_valid = is_covariance & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
         return [*(results[n] for n in kept), ~is_valid]
@@ -239,10 +241,10 @@ def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str],
 
 
 def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
-    """Return which arrays of the state, by number, are always symmetric, so that one triangle of each is enough.
+    """Return the numbers of the state's arrays that are always symmetric, so that one triangle of each is enough.
 
-    By induction: symmetric at the start, and after each part (prediction, correction) from symmetric ones. All that are
-    at the start are assumed so, and those that a part then makes otherwise are dropped, until none is.
+    This is an induction. Arrays that are symmetric at the start are assumed to stay so. Those that a part (prediction
+    or correction) then makes not symmetric are dropped, and the rest is tried again until none is dropped.
     """
     leaves = parts[0].examples[0]
     symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
@@ -261,7 +263,7 @@ def make_unsupported_error(operation: str, where: str) -> InputError:
 
 
 def name_state_arrays(state: PyTree) -> list[str]:
-    """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
+    """Return names in C for the arrays of a state, from their field names; the field `gaussian` is left out."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
         # Each key of the path is that of an attribute, of a dictionary, or an index in a sequence.
@@ -270,7 +272,7 @@ def name_state_arrays(state: PyTree) -> list[str]:
         name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in joined)
         if not name or not name[0].isalpha():
             name = f"state_{name}".rstrip("_")
-        while name in RESERVED | ADDED or name in names:  # words of C, members beside these, names given before
+        while name in RESERVED | ADDED or name in names:  # words of C, other members, and earlier names
             name += "_"
         names.append(name)
     return names

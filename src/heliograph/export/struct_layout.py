@@ -22,7 +22,7 @@ def lay_out_array(type: str, count: int) -> StructLayout:
 def lay_out_struct(parts: Sequence[StructLayout]) -> StructLayout:
     """Return size and alignment, in bytes, of a struct of C with these parts.
 
-    Each part begins at a multiple of its alignment; the whole is filled up to a multiple of the largest of them.
+    Each part begins at a multiple of its alignment. The whole is filled up to a multiple of the largest alignment.
     """
 
     def round_up(size: int, alignment: int) -> int:

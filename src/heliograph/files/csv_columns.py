@@ -22,17 +22,17 @@ WHOLE = re.compile(r"([+-]?\d{1,18}|[+-]?[1-8]\d{18})(?:\.0*)?")  # numbers that
 def read_csv_blocks(
     path: Path, only: Container[str] | None, strict: bool, size: int, progress: Progress | None = None
 ) -> Iterator[TableRows]:
-    """Yield the rows of a CSV file in parts, each of about `size` bytes of lines, and why others cannot be read.
+    """Yield the rows of a CSV file in parts of about `size` bytes, with the reasons why some rows cannot be read.
 
     Args:
         path: the file.
         only: the columns that are read; None for all.
-        strict: whether what cannot be read is an error, or is refused alone.
-        size: bytes.
-        progress: called with how many bytes of the file are read, and of how many (default none).
+        strict: whether a row that cannot be read is an error. Otherwise only this row is refused.
+        size: bytes of lines in a part.
+        progress: called with the number of bytes that were read, and the number of all bytes; None by default.
 
     Raises:
-        ValueError: a header that names no columns; where reading is strict, a row that cannot be read.
+        ValueError: the header names no columns, or reading is strict and a row cannot be read.
     """
     text, columns = CsvReader(str(path), path, marked=False), CsvColumnReader(str(path), path, only, strict)
     blocks = read_line_blocks(path, size, progress)
@@ -72,11 +72,14 @@ class CsvColumnReader:
     """
 
     def __init__(self, source: str, path: Path | None, only: Container[str] | None, strict: bool):
-        """Begin without a header; `only`: columns to read, None for all; `strict`: a row that fails is an error."""
+        """Begin without a header; the first row brings it.
+
+        `only`: the columns to read, None for all. `strict`: whether a row that cannot be read is an error.
+        """
         self.source, self.path, self._only, self._strict = source, path, only, strict
         self.header: list[str] = []
-        self._dated = dict[str, bool]()  # by column whether it is of dates, once a cell has said so
-        self._zoned = dict[str, bool]()  # by column of dates whether these have a zone
+        self._dated = dict[str, bool]()  # for each column whether it holds dates, as soon as a cell tells it
+        self._zoned = dict[str, bool]()  # for each column of dates whether these have a time zone
 
     def read(self, rows: Iterable[CsvRow | InputError]) -> TableRows:
         """Return the rows that can be read, as columns; why the others cannot.
@@ -107,9 +110,10 @@ class CsvColumnReader:
         return TableRows(columns, np.array(numbers, dtype=np.int64), refused)
 
     def accepts_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
-        """Return whether these numbers are what cells say: none in a column of dates, or too large for doubles.
+        """Return whether numbers that were parsed as doubles can stand for the cells.
 
-        From EXACT, 2^53, doubles no longer hold every whole number.
+        They cannot if the header is another one, if a number reaches EXACT (2^53, from where doubles skip integers), or
+        if there is a number in a column of dates.
         """
         if self.header not in ([], header) or np.nanmax(np.abs(numbers), initial=0.0) >= EXACT:
             return False
@@ -173,9 +177,9 @@ class CsvColumnReader:
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
     def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
-        """Return a date as nanoseconds since 1970; raise where dates of one column differ in having a zone.
+        """Return a date as nanoseconds since 1970; raise if some dates of a column have a time zone and others not.
 
-        `self._zoned`: by column whether its first date has one.
+        `self._zoned` says for each column whether its first date has a zone.
         """
         where = f"{row.where}, column {name!r}"
         moment, zoned = parse_moment(cell, where)
@@ -184,13 +188,13 @@ class CsvColumnReader:
         return moment
 
     def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
-        """Return a column as dates, as int64 if its cells are whole numbers that doubles cannot tell apart, or floats.
+        """Return a column as dates, as int64 or as floats.
 
-        `values` of dates are nanoseconds since 1970, NAT for an empty cell; it stands for one among int64 too. EXACT:
-        2^53, up to which doubles are exact.
+        The `values` of dates are nanoseconds since 1970. int64 is used if all cells are integers and one reaches EXACT
+        (2^53), from where doubles skip integers. NAT stands for an empty cell among dates and among int64.
         """
         if self._dated.get(name):
-            # NaN, which alone differs from itself, is in all cells before the first date.
+            # Empty cells before the first date are NaN, which is the only number that differs from itself.
             nanoseconds = [NAT if value != value else int(value) for value in values]
             return np.array(nanoseconds, dtype=np.int64).view("datetime64[ns]")
         numbers = np.array(values, dtype=np.float64)

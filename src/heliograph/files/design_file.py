@@ -71,9 +71,9 @@ def read_design(path: Path) -> DesignFile:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a design file, of which only keys are checked: those at the top and in its tables.
+    """Return the content of a design file after checking its keys, at the top and in its tables.
 
-    KEYS: the keys that are known at the top; TABLES: of each table those that are known in it.
+    KEYS holds the known keys at the top, and TABLES the known keys of each table. Values are not checked here.
     """
     if not path.is_file():
         raise fail(f"design {path}", "a TOML file", "a folder" if path.is_dir() else "no file of that name")
@@ -89,7 +89,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _read_free_transmitters(path: Path, table: Mapping[str, Any]) -> tuple[str, ...] | None:
-    """Return the names of the transmitters whose powers are free; None where the design file does not say it."""
+    """Return the names of the transmitters whose powers are free, or None if the design file does not say it."""
     free = table.get("free")
     if free is None:
         return None
@@ -119,7 +119,7 @@ def _read_number(path: Path, table: Mapping[str, Any], key: str) -> float | None
 
 
 def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
-    """Return the budget of powers: a table of limits, a number that limits their total, or None where there is none."""
+    """Return the budget of powers, or None if the file has none; a plain number limits the total power."""
     value = table.get("budget")
     if value is None:
         return None
@@ -140,7 +140,10 @@ def _read_map_places(path: Path, table: Mapping[str, object]) -> MapPlaces:
 
 
 def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
-    """Return the Python file beside the design file that a value names, as FILE or FILE:NAME, and NAME or ""."""
+    """Return the Python file that a value FILE or FILE:NAME names, and NAME, or "" if there is no name.
+
+    FILE is relative to the folder of the design file.
+    """
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
     # What follows the last colon is a name only if it can be one: paths, as "C:/net.py", have colons too.
@@ -153,7 +156,10 @@ def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
 
 
 def _read_table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
-    """Return the table under a key, one of TABLES (its known keys by name); raise if something else stands there."""
+    """Return the table under a key of the design file; raise if something else stands there.
+
+    TABLES holds the known keys of each table.
+    """
     value = table[key]
     if not isinstance(value, dict):
         raise fail(f"{path.name}, {key}", f"a table of {', '.join(TABLES[key])}", repr(value))
@@ -161,7 +167,7 @@ def _read_table(path: Path, table: Mapping[str, object], key: str) -> dict[str, 
 
 
 def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...]) -> None:
-    """Raise at a key that is not known, with the one most like it."""
+    """Raise ValueError if a key is not known; the error names the known key most like it."""
     for key in table:
         if key not in known:
             close = get_close_matches(key, known, 1)

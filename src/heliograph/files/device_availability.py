@@ -56,9 +56,9 @@ class Available:
             raise fail("Available, offline", "other words than online", both[0])
 
     def of(self, topic: str) -> str:
-        """Return the topic on which the device that sends values on `topic` says whether it is online.
+        """Return the topic on which a device says whether it is online; `topic` is the one of its values.
 
-        It is `self.topic`, where + stands for the level of `topic` at the same place.
+        It is `self.topic` with each + replaced by the level of `topic` at the same place.
         """
         pattern, levels = self.topic.split("/"), topic.split("/")
         if "+" in pattern[len(levels) :]:
@@ -66,10 +66,12 @@ class Available:
         return "/".join(levels[i] if level == "+" else level for i, level in enumerate(pattern))
 
     def says_offline(self, payload: object, where: str) -> bool:
-        """Return whether a payload, a word or an object with one at `self.path`, says offline rather than online.
+        """Return whether a payload says offline (True) or online (False).
+
+        The payload is a word, or an object with a word at `self.path`.
 
         Raises:
-            ValueError: a word that is neither; one line.
+            ValueError: the word is neither in `self.online` nor in `self.offline`.
         """
         value = field_at(payload, self.path, where) if isinstance(payload, dict) else payload
         word = str(value).strip().casefold()
@@ -86,10 +88,11 @@ class DeviceStatuses:
     """
 
     def __init__(self, conditions: Iterable[Available]):
-        """Begin with no word, online or offline, of any device; `conditions`: topics and words by which they say it.
+        """Begin before any device has said whether it is online.
 
-        `_offline`: conditions, with the topic, of which the last word was offline; `_heard`: those that had any word;
-        `_changed`: topics with a new word.
+        A condition says on which topics devices say so, and by which words. `_offline` holds the pairs (condition,
+        topic) whose last word was offline, `_heard` the conditions for which any word came, and `_changed` the topics
+        whose word has changed.
         """
         self._by_pattern: dict[str, list[Available]] = {}
         for condition in dict.fromkeys(conditions):
@@ -113,9 +116,9 @@ class DeviceStatuses:
         return [condition for several in matching for condition in several]
 
     def take_status_message(self, topic: str, payload: object, where: str) -> bool:
-        """Note the last word of a device, online or offline, if a message is one; return whether it is.
+        """Note a device's word, online or offline, if a message is one; return whether it is.
 
-        An empty message, which deletes a stored word, counts as online.
+        An empty message deletes a word that the broker stores, and counts as online.
 
         Args:
             topic: the topic of the message.
@@ -123,12 +126,12 @@ class DeviceStatuses:
             where: place of the message, for errors.
 
         Raises:
-            ValueError: a word that is neither online nor offline; one line.
+            ValueError: the word is neither online nor offline.
         """
         conditions = self.find_conditions(topic)
         if not conditions:
             return False
-        # The words of a topic are a bit for each condition, as they are stored when they have changed.
+        # The words of a topic are one bit for each condition. They are stored when they have changed.
         content, bits_before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
         for condition in conditions:
             self._note_word(condition, topic, offline=content != "" and condition.says_offline(content, where))
@@ -142,13 +145,13 @@ class DeviceStatuses:
         return {topic: self._encode_words_as_bits(topic) for topic in changed}
 
     def restore(self, words: Mapping[str, int]) -> None:
-        """Take last words that were kept: of each topic a number whose bit i is 1 if condition i of it says offline."""
+        """Take over stored words: `words` maps a topic to a number whose bit i is 1 if its condition i is offline."""
         for topic, bits in words.items():
             for i, condition in enumerate(self.find_conditions(topic)):
                 self._note_word(condition, topic, offline=bool((bits >> i) & 1))
 
     def _note_word(self, condition: Available, topic: str, offline: bool) -> None:
-        """Note the word of a topic for a condition: heard, and offline or not (devices count as online until then)."""
+        """Note the last word of a topic for a condition; a device counts as online until it says offline."""
         self._heard.add(condition)
         if offline:
             self._offline.add((condition, topic))
@@ -166,9 +169,9 @@ class DeviceStatuses:
 
 
 def _decode_payload(payload: object, where: str) -> object:
-    """Return what a payload says: what JSON in it encodes, or the text itself where it is none.
+    """Return a payload decoded from JSON, or its text if it is not JSON.
 
-    What is neither bytes nor text was decoded already.
+    A payload that is neither bytes nor text was decoded already, and is returned as it is.
     """
     if isinstance(payload, bytes):
         payload = payload.decode(errors="replace")

@@ -86,9 +86,9 @@ class NodeEvents:
             self.period = reading.period
 
     def count_lost(self) -> int | None:
-        """Return how many messages are missing by the node's count, in order of its times; None without a count (-1).
+        """Return how many messages are missing by the node's running count, or None if messages have no count (-1).
 
-        Those that came and are no events, unread or without a stamp, are in `self.unread`: they were not lost.
+        `self.unread` holds (time, count) of messages that came but are no events; they were not lost.
         """
         time, _, sequence = self.arrays()
         if not len(time) or sequence.min() < 0:
@@ -100,9 +100,9 @@ class NodeEvents:
     def write_losses_before_events(
         self, table: Float[np.ndarray, "rows received"], rows: np.ndarray, counts: Int[np.ndarray, " events"]
     ) -> None:
-        """Write how many messages were lost before each event into the last column of the node's `table`.
+        """Write into the last column of `table` how many messages were lost before each event.
 
-        Only where a message does not say it (NaN), by the running `counts` of the events, in order of time, in `rows`.
+        Only NaN is replaced, where the message did not say it. `counts` are the running counts of the events in `rows`.
         """
         lost = np.diff(counts, prepend=counts[:1]) - 1.0
         lost[lost < 0] = np.nan  # not known of the first message, nor after a restart
@@ -174,9 +174,9 @@ class NodeEvents:
         return UnsetStampNotes(reason=str(why), removed=count)
 
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
-        """Note events with unset stamps as messages that came and are no events: moments near them, and counts.
+        """Note events whose stamps are not set as unread messages, with their counts and the moments they came.
 
-        Without arrivals each came at the time of the last event before it with a set stamp, or else of the first such.
+        If arrivals are not known, the moment is the time of the last earlier event with a stamp, or else of the first.
         """
         time, moments, sequence = self.arrays()
         if not are_arrivals_known:
@@ -279,7 +279,7 @@ def _judge_repeated_events(
 def count_verdicts(
     node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]
 ) -> dict[int, dict[Verdict, int]]:
-    """Return {number of a node: {verdict: how many of its events have it}}; `verdicts`: of each event by its index."""
+    """Return {node: {verdict: count of its events}}; `verdicts` holds for each event an index into VERDICTS."""
     return {
         int(number): {verdict: int(np.sum(verdicts[node == number] == i)) for i, verdict in enumerate(VERDICTS)}
         for number in np.unique(node)
@@ -287,33 +287,33 @@ def count_verdicts(
 
 
 def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
-    """Return how many counts are missing between a node's messages, in the order of their times.
+    """Return how many running counts are missing between a node's messages, which are sorted by their times.
 
-    After `period` messages the count begins at 0 again (0: it does not). A smaller count is a node that was restarted,
-    unless, counted around, at most GAP (2^14) messages lie between.
+    The count begins again at 0 after `period` messages; 0 means that it never does. A count that falls has gone around
+    if this makes at most GAP (2^14) messages in between. Otherwise the node was restarted.
     """
     if not len(time):
         return 0
     differences = np.diff(sequence[np.lexsort((sequence, time))])
-    # A smaller count has gone through its largest number, or after a restart begins anew: then nothing is missing (1).
+    # A count that fell either went around its period, or the node was restarted; then nothing is missing (1).
     counted_around = np.mod(differences, period) if period else differences
     advances = np.where(differences > 0, differences, np.where(counted_around <= GAP, counted_around, 1))
     return int(np.sum(np.maximum(advances - 1, 0)))
 
 
 def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return for each row how many equal ones, of the same rank, come before it; row i has entry i of each column."""
+    """Return for each row how many equal rows come before it; row i consists of entry i of each column."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
-    first_of_equals = np.searchsorted(ranks[order], ranks[order])  # in this order, the place of the first equal row
+    first_of_equals = np.searchsorted(ranks[order], ranks[order])  # place of the first equal row in this order
     counts = np.empty(len(order), dtype=np.int64)
     counts[order] = np.arange(len(order)) - first_of_equals
     return counts
 
 
 def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return the rank of each row by these columns, the first of which matters most; equal rows have the same rank."""
-    order = np.lexsort(columns[::-1])  # which takes the one that matters most last
+    """Return the rank of each row, sorted by the first column and then by the others; equal rows share a rank."""
+    order = np.lexsort(columns[::-1])  # lexsort takes the most important column last
     differs_from_row_before = np.zeros(len(order), dtype=bool)
     for column in columns:
         differs_from_row_before[1:] |= column[order][1:] != column[order][:-1]
@@ -325,27 +325,27 @@ def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
 def _find_newest_final_row(
     events: EventsByArrival, rank: Int[np.ndarray, " events"], window: float
 ) -> Int[np.ndarray, " events"]:
-    """Return the rank of the newest row that is final when each event comes, -1 for none.
+    """Return for each event the rank of the newest row that is final when it comes, -1 if there is none.
 
-    `rank`: number of each event's row. An event of time t is final for those that come after it, later than t + window.
+    `rank`: number of each event's row. An event of time t is final once another one arrives later than t + window.
     """
     count = len(rank)
     if not np.isfinite(window):
         return np.full(count, -1)
-    # Number of the first event before which each one is final: after its own, and where the watermark is past its time.
+    # Each event is final from this event on: the first after it whose watermark, arrival - window, is past its time.
     watermark = events.arrival - window
     final_from = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
-    newest_final = np.full(count + 1, -1)  # of the events that become final before each one, then of all so far
+    newest_final = np.full(count + 1, -1)  # of the events that become final at each one, and then of all so far
     np.maximum.at(newest_final, final_from, rank)
     return np.maximum.accumulate(newest_final[:count])
 
 
 def node_counts_losses(network: Network, name: str) -> bool:
-    """Return whether the last number that a node receives is how many transmissions were lost before its values."""
+    """Return whether a node also receives a number on losses: how many transmissions were lost before its values."""
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False
-    return node.trigger.side_information(len(node.outputs)) == 1  # how many numbers on losses come with the values
+    return node.trigger.side_information(len(node.outputs)) == 1  # numbers on losses that come after the values
 
 
 def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndarray, " events"], np.ndarray]:
@@ -353,7 +353,7 @@ def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndar
 
     Args:
         time: times of the events, in order, at least one.
-        steps: whether times are steps, each of which is a row, also without an event.
+        steps: whether times are numbers of steps; every step is then a row, even without an event.
         joint: whether all events of one time are one row.
     """
     if steps:
@@ -366,9 +366,9 @@ def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndar
 def place_values_in_rows(
     values: Float[np.ndarray, "events size"], row: Int[np.ndarray, " events"], count: int
 ) -> Float[np.ndarray, "rows size"]:
-    """Return the values of events in their rows, of which there are `count`; NaN where none arrived.
+    """Return a table (count, size) with the values of events in their rows, and NaN where no value arrived.
 
-    Of several events in a row each component has the last value that is not NaN.
+    If a row has several events, each component takes its last value that is not NaN.
     """
     table = np.full((count, values.shape[1]), np.nan)
     for i in range(values.shape[1]):
@@ -378,7 +378,7 @@ def place_values_in_rows(
 
 
 def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
-    """Return each column with NaN replaced by the last value before it, 0 before the first."""
+    """Return each column with every NaN replaced by the last value before it, or by 0 if there is none."""
     own_row = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])  # -1: no value in this row
     last_row = np.maximum.accumulate(own_row, axis=0) if len(values) else own_row
     return np.asarray(np.where(last_row < 0, 0.0, np.take_along_axis(values, np.maximum(last_row, 0), axis=0)))
@@ -387,13 +387,13 @@ def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "
 def make_inputs_leading_to_rows(
     held: Float[np.ndarray, "rows given"], times: np.ndarray, unit: int, place: int
 ) -> Float[np.ndarray, "rows inputs"]:
-    """Return the inputs that lead to each row in continuous time: those of the row before, and the time since it.
+    """Return the inputs that lead to each row in continuous time: the previous row's inputs, and the time since it.
 
     Args:
-        held: inputs as they were set up to each row; before the first they are 0.
+        held: inputs that were set last, at each row; before the first row they are 0.
         times: times of the rows, in whole parts of the unit of time, such as nanoseconds.
         unit: how many of these parts are one unit of time.
-        place: index of dt, the time since the row before, among the inputs.
+        place: index among the inputs of dt, the time since the previous row.
     """
     inputs_of_row_before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
     dt = np.diff(times, prepend=times[:1]) / unit

@@ -58,7 +58,7 @@ class EventTable:
     """
 
     def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
-        """Begin with no event; `step`: seconds of a step, `start`: moment of step 0; `numbers`: times are no dates."""
+        """Begin without events; `step`: seconds of a step; `start`: time of step 0; `numbers`: times are not dates."""
         instance("network", network, Network, "a Network")
         self.network, self.steps, self.numbers, self.start = network, TIME_STEP not in network.inputs, numbers, start
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
@@ -109,9 +109,9 @@ class EventTable:
         return self._plants[plant]
 
     def add(self, reading: Reading, arrival: float) -> None:
-        """Append a reading that arrived at a moment, in nanoseconds since 1970 or in the unit of times.
+        """Append a reading that arrived at `arrival`, in nanoseconds since 1970 or in the unit of times.
 
-        Without a time it is of that moment. A count of -1 says that it has none.
+        A reading without a time gets the time of its arrival. A reading without a running count gets -1.
         """
         columns = self._columns_of_plant(reading.plant)[reading.node]
         time = arrival if reading.time is None else reading.time
@@ -146,7 +146,7 @@ class EventTable:
 
     @property
     def refusals(self) -> dict[str, Counter[Reason]]:
-        """Return by node how many messages were refused for their flag or counter; nodes without any are absent."""
+        """Return by node how many messages were refused for each reason; nodes without refusals are absent."""
         counts = dict[str, Counter[Reason]]()
         for node, columns in (item for columns_by_node in self._plants.values() for item in columns_by_node.items()):
             if columns.refused:
@@ -202,7 +202,7 @@ class EventTable:
         return 0 if self.steps or self.numbers else self._find_first_moment()
 
     def _find_first_moment(self) -> int:
-        """Return the moment of step 0 if it is given, else that of the first event, in the unit of the columns."""
+        """Return the time of step 0 if it is given, else the time of the first event, in the unit of the columns."""
         if self.start is not None:
             return self.start
         times = [min(columns.time) for columns in self.columns.values() if columns.time]
@@ -234,13 +234,13 @@ class EventTable:
         """Yield events in order of arrival; times are seconds from the origin, steps, or numbers as they are."""
         events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
-        # `place`: index among the node's events. Differences are of whole nanoseconds, exact before they are floats.
+        # `place` is the index among the node's events. The times are integers, so that their differences are exact.
         for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
             values = matrices[node][place]
             yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
-        """Return by node with events how long each took to be logged, in seconds or time's unit, in order of time."""
+        """Return for each node with events how long each took to arrive, in seconds or time's unit, sorted by time."""
         lateness, unit = {}, 1 if self.numbers else SECOND
         for name in () if self._times_are_steps else self.network.names:
             time, arrival, _sequence = self.columns[name].arrays()
@@ -249,13 +249,13 @@ class EventTable:
         return lateness
 
     def delays(self, step: float | None = None) -> dict[str, Delays]:
-        """Return by node the law (probabilities) of its delays in steps, with intervals; nodes without any are absent.
+        """Return for each node the probabilities of its delays in steps, with intervals; nodes without delays are absent.
 
         Args:
-            step: seconds of a step; that of the table, else the median time between a node's measurements.
+            step: seconds of a step; by default the table's, or else the median time between a node's measurements.
 
         Raises:
-            ValueError: a step that is not positive.
+            ValueError: the step is not positive.
         """
         laws, unit = {}, 1 if self.numbers else SECOND
         for name, delays in self.lateness().items():
@@ -265,14 +265,14 @@ class EventTable:
                 intervals = np.diff(np.unique(time))
                 counts_steps = self.numbers and self.steps
                 length = float(np.median(intervals)) / unit if len(intervals) and not counts_steps else 1.0
-            if np.any(delays > -length / 2):  # else nothing arrived at or after its step
+            if np.any(delays > -length / 2):  # something arrived at or after its step
                 laws[name] = learn_delays(delays, length)
         return laws
 
     def judge(
         self, window: float = np.inf, ahead: float = AHEAD
     ) -> tuple["dict[str, dict[Verdict, int]]", dict[str, int]]:
-        """Count by node what a timeline makes of the events (used, late, ...), and messages missing by running counts.
+        """Count for each node what a timeline does with events (used, late, ...), and its missing messages.
 
         Args:
             window: how late an event may be, in seconds or steps (default any).
@@ -285,7 +285,7 @@ class EventTable:
         return counts, {name: count for name, count in lost.items() if count is not None}
 
     def count_absent(self, window: float = np.inf, ahead: float = AHEAD) -> dict[str, int]:
-        """Count by node the events that a timeline uses and that have no value, only a time.
+        """Count for each node the events that a timeline uses although they have no value, only a time.
 
         Args:
             window: how late an event may be, in seconds or steps (default any).
@@ -343,9 +343,9 @@ class EventTable:
         return Recording(tables, inputs, time), measured
 
     def _fill_tables(self, events: EventsByArrival, row: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        """Return the values of each node, and of the inputs, in their rows, (rows, values); NaN where none arrived.
+        """Return tables (count, values) for each node and for the inputs, with NaN where no value arrived.
 
-        `row`: number of the row of each event, of `count` rows.
+        `row`: number of each event's row.
         """
         tables = {}
         for node, name, matrix in self._number_value_matrices():

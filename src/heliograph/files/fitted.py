@@ -48,9 +48,10 @@ class NetworkAgain:
 
 
 def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
-    """Return a fit for JSON: fitted values by name, their table, sentences on them, how the search went; NaN is null.
+    """Return a fit as JSON: values by name, their table, sentences about them, and how the search went.
 
-    `ends`: the log-likelihood that each of the search's starts came to; `more`: entries to put before these.
+    NaN becomes null. "ends" holds the log-likelihood that each start of the search reached. `more` holds entries that
+    are put before these.
     """
     return {
         **more,
@@ -66,14 +67,14 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
 
 
 def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, target: Path) -> None:
-    """Write `fitted.json` and `fitted_network.py`, which loads the network with the numbers in the former.
+    """Write `fitted.json`, and `fitted_network.py`, which loads the network with the numbers in `fitted.json`.
 
     Args:
-        content: what `fitted.json` gets.
-        reference: the network, FILE:NAME or MODULE:NAME.
+        content: the content of `fitted.json`.
+        reference: the network, as FILE:NAME or MODULE:NAME.
         measurements: name of the file that was learned from.
-        folder: where both are written.
-        target: what this folder will be renamed to, by which the network's file is found.
+        folder: the folder where both files are written.
+        target: the folder's later name. The path to the network's file is relative to it.
     """
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     path, colon, name = _split_reference(reference)
@@ -124,7 +125,10 @@ def _replace_non_finite(value: object) -> object:
 
 
 def _split_reference(reference: str) -> tuple[Path | None, str, str]:
-    """Return path (None of a module), colon and name of a reference, FILE:NAME or MODULE:NAME; "" where it has none."""
+    """Return the path, the colon and the name of a reference FILE:NAME or MODULE:NAME.
+
+    The path is None for a module. Without a name, colon and name are "".
+    """
     module, colon, name = reference.rpartition(":")
     if not module or not name.isidentifier():
         module, colon, name = reference, "", ""

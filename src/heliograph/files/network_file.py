@@ -85,7 +85,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     # Each call may import more modules of the folder, and may fail in the user's code.
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
-        """Return the network that the user's `function`, which stands in the file `path`, returns, checked."""
+        """Return the network that the user's `function` returns; raise ValueError if it is something else."""
         with _allow_imports_from(path.parent):
             network = _call_user_code(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):
@@ -96,7 +96,10 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
 
 
 def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
-    """Return the network of a module, by its name or because there is only one; `file`: its reference, for errors."""
+    """Return the network called `name` in a module, or its only network if `name` is "".
+
+    `file` is the module's reference, for errors.
+    """
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
         return _read_named_network(module, name, file, path, networks)
@@ -129,7 +132,7 @@ def _read_named_network(
 
 
 def _find_source_file(module: str) -> Path | None:
-    """Return the file of an importable module, so that errors are reported with their line; None if it has no file."""
+    """Return the file of an importable module, or None if it has no file; errors are reported with their line in it."""
     spec = find_spec(module)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {module!r}")
@@ -137,7 +140,7 @@ def _find_source_file(module: str) -> Path | None:
 
 
 def _run_source(path: Path, source: str | bytes) -> ModuleType:
-    """Run a file's source as a module; unlike an import, this writes no cache next to it."""
+    """Run a file's source as a module and return it; unlike an import, this writes no cache beside the file."""
     name = f"heliograph_network_{path.stem}"
     spec = spec_from_file_location(name, path)
     if spec is None:
@@ -153,9 +156,9 @@ def _run_source(path: Path, source: str | bytes) -> ModuleType:
 
 
 def _call_user_code(call: Callable[[], T], name: str, path: Path | None) -> T:
-    """Return what the user's code returns; an error in it becomes one line with its type, message and line.
+    """Return what the user's code returns; an error in it becomes one line with its type, message and line number.
 
-    `name`: of the network, for errors; `path`: the user's file, None of a module whose file is not known.
+    `name` is the network's reference, for errors. `path` is the user's file, None if it is not known.
     """
     try:
         return call()
@@ -165,7 +168,7 @@ def _call_user_code(call: Callable[[], T], name: str, path: Path | None) -> T:
 
 
 def _find_error_line(error: BaseException, path: Path | None) -> str:
-    """Return the line in the user's file where an error was raised: the innermost frame there."""
+    """Return " in line N", the innermost line of the user's file in an error's traceback; "" if there is none."""
     if isinstance(error, SyntaxError):
         return f" in line {error.lineno}"
     if path is None:

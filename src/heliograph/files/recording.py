@@ -79,16 +79,16 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
 def read_recording_rows(
     source: "Path | StoreTable", network: Network, strict: bool, ignore_unknown: bool
 ) -> tuple[Recording, list[str], list[str]]:
-    """Read a recording as `read_recording` does, of which a row that cannot be read is refused alone unless `strict`.
+    """Read a recording as `read_recording` does; unless `strict`, a row that cannot be read is refused alone.
 
-    Where the network counts steps such a row is a step in which nothing arrived and inputs stayed as they were. Unless
-    `strict`, rows of continuous time are put in the order of their times.
+    If the network counts steps, a refused row is a step in which nothing arrived and inputs did not change. Unless
+    `strict`, rows of continuous time are sorted by their times.
 
     Returns:
-        The recording, why rows were refused, and lines on what was put in order.
+        The recording, the reasons why rows were refused, and lines on rows that were sorted.
 
     Raises:
-        ValueError: what `read_recording` refuses of a table as a whole; no row that can be read.
+        ValueError: `read_recording` would refuse the whole table, or no row can be read.
     """
     reader = RowReader(network, str(source), strict, ignore_unknown)
     rows = read_rows(source, reader.only, strict) if isinstance(source, Path) else source.rows(reader.only)
@@ -107,7 +107,7 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
         path: the file, ending in .csv or .parquet.
 
     Raises:
-        ValueError: names that coincide, another format, or a folder that cannot be written.
+        ValueError: columns would have the same name, the format is another one, or the folder cannot be written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     instance("recording", recording, Recording, "a Recording")
@@ -115,7 +115,7 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
     columns = {TIME: recording.time, **dict(zip(network.inputs, recording.inputs.T, strict=True))}
     for node, names in list_received_columns(network).items():
         if node in recording.measurements:
-            # Of the names that `read_recording` takes for a component the first is written.
+            # `read_recording` takes several names for a component; the first one is written.
             columns |= {name[0]: z for name, z in zip(names, recording.measurements[node].T, strict=True)}
     if recording.truth is not None:
         columns |= dict(zip(list_truth_columns(network).values(), recording.truth.T, strict=True))
@@ -125,8 +125,8 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
 def _map_headers(network: Network) -> dict[str, str]:
     """Return {header that a column may have: name of the column}.
 
-    A header is the name, with the unit of its state, input or output ("range (m)") or without, also as `write_table`
-    writes what no cell can hold.
+    A header is the column's name with or without the unit of its state, input or output, as in "range (m)". It may
+    also be in the form in which `write_table` writes names that no cell can hold.
     """
     received = {node: receiver.received_names for node, receiver in network.nodes.items()}
     names = [*network.states, *network.inputs, *(name for components in received.values() for name in components)]
@@ -134,7 +134,7 @@ def _map_headers(network: Network) -> dict[str, str]:
     headers |= {f"truth.{append_unit(name)}": f"truth.{name}" for name in network.states}
     for node, components in received.items():
         headers |= {f"{node}.{append_unit(name)}": f"{node}.{name}" for name in components}
-    # The last of equal headers wins below: a plain name before a header with a unit, and this before one as written.
+    # If headers are equal, the last of these dictionaries prevails: plain names, then names with units, then the rest.
     as_written = {predict_name_read_back(header): name for header, name in headers.items()}
     without_unit = {name: name for name in (TIME, *headers.values())}
     return as_written | headers | without_unit
@@ -155,7 +155,7 @@ class RowReader:
     """
 
     def __init__(self, network: Network, source: str, strict: bool, ignore_unknown: bool):
-        """Begin with no row; where `strict`, the first that cannot be read is an error, else it is refused alone."""
+        """Begin without rows; if `strict`, a row that cannot be read is an error, else it is refused alone."""
         self.network, self.source, self._strict = network, source, strict
         self._headers = _map_headers(network)  # {header that a column may have: its name}
         self.only: Mapping[str, str] | None = self._headers if ignore_unknown else None
@@ -169,7 +169,7 @@ class RowReader:
 
     @property
     def notes(self) -> list[str]:
-        """Return a line on how many rows came after later ones and were put in the order of their times, or none."""
+        """Return a line on how many rows came after later ones and were sorted by time, or [] if there are none."""
         if not self._behind:
             return []
         return [f"{self.source}: rows that came after later ones, used in the order of their times: {self._behind}"]
@@ -192,9 +192,9 @@ class RowReader:
         return self.make_recording(self.put_in_order(cells))
 
     def put_in_order(self, cells: RecordingRows) -> RecordingRows:
-        """Return rows in the order of their times, as far as that can be; where reading is strict, as they are.
+        """Return rows sorted by their times, or as they are if reading is strict.
 
-        `self._behind` counts rows that came after later ones, `self.refused` has why rows were left out.
+        `self._behind` counts rows that came after later ones. `self.refused` gets the reasons why rows were left out.
         """
         if self._strict:
             return cells
@@ -229,12 +229,13 @@ class RowReader:
         return Recording(measurements, u[begin:], time[begin:], truth)
 
     def read_cells(self, rows: TableRows) -> RecordingRows:
-        """Return what stands in the rows that can be read, each by itself: time, inputs, measurements, truth.
+        """Return the times, inputs, measurements and truth of the rows that can be read; each row is checked by itself.
 
-        `self._headers`: {header that a column may have: its name}; `refusals.good`: rows that were not refused.
+        `self._headers` maps a header that a column may have to the column's name. `refusals.good` is the mask of the
+        rows that were not refused.
 
         Raises:
-            ValueError: what `read` refuses, but for times that go backwards.
+            ValueError: the same as of `read`, but not for times that go backwards.
         """
         columns = {self._headers.get(name, name): values for name, values in rows.columns.items()}
         refusals = RowRefusals(self.source, rows.numbers, self._strict)
@@ -266,7 +267,7 @@ def _make_inputs(
 
 
 def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
-    """Warn where most rows have the time of the row before: stamps that were cut or rounded look like this."""
+    """Warn if most rows have the same time as the previous row, as happens to stamps that were cut or rounded."""
     _, counts = np.unique(time, return_counts=True)
     if len(time) > 2 and 2 * len(counts) <= len(time):
         shared = int(counts[counts > 1].sum())
@@ -278,9 +279,9 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
 
 
 def _warn_of_mixed_units(time: np.ndarray, source: str, numbers: np.ndarray) -> None:
-    """Warn where a clock that counts from long ago leaps a hundredfold in one row, as from seconds to milliseconds.
+    """Warn if times leap by a factor from one row to the next, as from seconds to milliseconds.
 
-    `numbers`: of the rows, from 1.
+    `numbers` are the numbers of the rows, from 1.
     """
     if time.dtype.kind not in "fiu":
         return
@@ -296,7 +297,10 @@ def _warn_of_mixed_units(time: np.ndarray, source: str, numbers: np.ndarray) -> 
 
 
 def _warn_of_dates_as_numbers(time: np.ndarray, source: str) -> None:
-    """Warn where all times read as dates without separators: as numbers a day after the 31st is 70 later."""
+    """Warn if all times look like dates without separators, such as 20260131.
+
+    As numbers, such dates do not count time evenly: the day after January 31st is 70 later.
+    """
     if len(time) > 1 and (date := read_compact_date(time)):
         warnings.warn(
             f"{source}, column {TIME!r}: {time[0]:.14g} and all others read as dates without separators; they are "

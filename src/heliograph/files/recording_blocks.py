@@ -68,11 +68,11 @@ class RecordingBlocks:
         return round(self._last_number * self._total / max(self._done, 1))
 
     def __iter__(self) -> Iterator[Recording]:
-        """Yield the recording in blocks of `self._block.rows` rows; ValueError where there is no row that can be read.
+        """Yield the recording in blocks of `self._block.rows` rows.
 
         Raises:
-            RowsNotInBlocksError: only all rows together say in which order they are, or of which kind their times.
-            ValueError: what `read_recording` refuses.
+            RowsNotInBlocksError: the order of the rows, or the kind of their times, depends on all rows together.
+            ValueError: `read_recording` would refuse the table, or no row can be read.
         """
         parts = read_row_blocks(self._path, self._reader.only, self._strict, self._block, self._note_progress)
         for block in cut_recordings(self._yield_recordings(parts), self._block.rows):
@@ -105,7 +105,7 @@ class RecordingBlocks:
         order.check_left_out_rows()
 
     def _note_progress(self, done: int, total: int) -> None:
-        """Keep how much of the file is read, and of how much; tell it to the caller's `progress` if there is one."""
+        """Keep how many bytes of the file are read and how many there are, and call `progress` if there is one."""
         self._done, self._total = done, total
         if self._progress is not None:
             self._progress(done, total)
@@ -117,7 +117,7 @@ class RecordingBlocks:
 
 
 def cut_recordings(parts: Iterable[Recording], rows: int) -> Iterator[Recording]:
-    """Yield a recording, which comes in parts of any lengths, in blocks of `rows` rows; the last may have fewer."""
+    """Yield a recording in blocks of `rows` rows from parts of any lengths; the last block may have fewer rows."""
     held, count = list[Recording](), 0  # what was not yielded yet, and its rows
     for part in parts:
         held.append(part)

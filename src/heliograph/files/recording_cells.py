@@ -23,22 +23,25 @@ class RowRefusals:
     """
 
     def __init__(self, source: str, numbers: np.ndarray, strict: bool):
-        """Begin with all rows good; `numbers`: of the rows in the file; `strict`: the first refusal is an error."""
+        """Begin with all rows good; `numbers` are the rows' numbers in the file.
+
+        If `strict`, the first refusal is raised as an error.
+        """
         self.source, self.numbers, self._strict = source, numbers, strict
         self.good = np.ones(len(numbers), dtype=bool)
         self.refused = list[InputError]()
 
     def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
-        """Refuse the rows of a mask, unless they were refused before: `self.good`, (rows,), marks those that were not.
+        """Refuse the rows of a mask that were not refused before; `self.good`, (rows,), marks the rows still accepted.
 
         Args:
             bad: the mask, (rows,).
             column: name of the column that is wrong.
             expected: what was expected there.
-            came: what stands in a row instead.
+            came: returns what stands in a row instead, by the row's index.
 
         Raises:
-            ValueError: one of them, where reading is strict.
+            ValueError: a row is refused and reading is strict.
         """
         for row in np.flatnonzero(bad & self.good).tolist():
             where = f"{self.source}, row {self.numbers[row]}, column {column!r}"
@@ -101,7 +104,10 @@ def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
         uses.update([*components, *(f"{node}.{name}" for name in components)])
 
     def list_allowed(node: str, name: str) -> tuple[str, ...]:
-        """Return the names that a node's component may have as a column; `uses`: for how many things a name stands."""
+        """Return the names that the column of a node's component may have, the preferred one first.
+
+        `uses` counts for how many components, inputs or other columns a name stands. A name used twice needs the node.
+        """
         full = f"{node}.{name}"
         if uses[name] > 1:
             return (full,)
@@ -111,9 +117,9 @@ def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
 
 
 def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
-    """Raise one line with the closest known name if a column belongs to nothing of the network.
+    """Raise a one-line ValueError with the closest known name if a column is not known to the network.
 
-    `expected`: for each thing of the network the names that its column may have, the preferred one first.
+    `expected` holds for each state, input or component the names that its column may have, the preferred one first.
     """
     known = [name for names in expected for name in names]
     for column in columns:
@@ -125,7 +131,7 @@ def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tu
 
 
 def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
-    """Return the one of these names, all for the same thing, that a column has; raise if none does, or several."""
+    """Return which of these names, all for the same quantity, a column has; raise if no column or several have one."""
     present = [name for name in names if name in columns]
     if len(present) != 1:
         came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
@@ -134,7 +140,7 @@ def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], sour
 
 
 def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the times of the rows, numbers, or dates where the column holds dates; rows without one are refused."""
+    """Return the times of the rows, as numbers or as dates; rows without a time are refused."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
         return _read_column_without_gaps(columns, name, refusals)
@@ -143,9 +149,9 @@ def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefus
 
 
 def _read_column_without_gaps(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the numbers of a column in which every cell has to have one; rows without a finite one are refused.
+    """Return the numbers of a column that may have no gaps; rows without a finite number are refused.
 
-    Integers stay such, since they may be larger than doubles hold exactly.
+    Integers stay integers, since they may be too large for an exact double.
     """
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, refusals.source)
     refusals.refuse(find_missing(values) | ~np.isfinite(values), name, "a finite number", _describe_cell(values))

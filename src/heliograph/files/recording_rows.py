@@ -91,18 +91,19 @@ class RowsWithMissing(NamedTuple):
     arrived: np.ndarray
 
     def fill(self, values: np.ndarray) -> np.ndarray:
-        """Return values of these rows, NaN where one did not arrive; `values`: of the rows that were read.
+        """Return the values of all rows, with NaN for rows that did not arrive; `values` are of rows that were read.
 
-        `self.read_row`: for each row the index of the one read that it is, or that is before it.
+        `self.read_row` holds for each row the index of the last row that was read up to it.
         """
         filled = np.array(values[self.read_row], dtype=np.float64)
         filled[~self.arrived] = np.nan
         return filled
 
     def fill_times(self, time: np.ndarray) -> np.ndarray:
-        """Return the times of these rows, those of rows that did not arrive at equal steps between the others.
+        """Return the times of all rows; rows that did not arrive are spaced evenly between the others.
 
-        `time`: of the rows that were read; `self.read_row`: for each row the index of the one read at or before it.
+        `time` holds the times of the rows that were read. `self.read_row` holds for each row the index of the last row
+        that was read up to it.
         """
         missing = np.flatnonzero(~self.arrived)
         filled = np.array(time[self.read_row])
@@ -117,10 +118,10 @@ class RowsWithMissing(NamedTuple):
 
 
 def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -> RowsWithMissing:
-    """Return the rows with these numbers; where each row is a step also those between them, as the row before each.
+    """Return the rows with these numbers, and, if every row is a step, also the missing rows between them.
 
-    The result says of each row its number, the index of the row read that it is or that is before it, and whether it
-    was read itself. Steps begin with the row of number `first`; without an input dt each row is a step.
+    Without an input dt every row is a step, and steps begin with row number `first`. The result holds for each row its
+    number, the index of the last row that was read up to it, and whether the row itself was read.
     """
     if TIME_STEP in network.inputs or not len(numbers):
         return RowsWithMissing(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))

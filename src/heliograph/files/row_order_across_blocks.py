@@ -35,16 +35,16 @@ class BlockOrderCheck:
     """
 
     def __init__(self, path: Path, network: Network):
-        """Begin with no row; rows are steps where the network has no input dt.
+        """Begin without rows; rows are steps if the network has no input dt.
 
-        `_first` and `last`: the first row that stays of all blocks, and the newest.
+        `_first` and `last` hold the first and the newest row that were kept, of all blocks.
         """
         self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
         self.last: RecordingRows | None = None
         self._first: RecordingRows | None = None
-        self._disordered: RecordingRows | None = None  # two rows of which the second came after a later one
-        self._jump: RecordingRows | None = None  # two rows between which is more than a year
-        self._left_out = list[RecordingRows]()  # of each block those with the least and the greatest time
+        self._disordered: RecordingRows | None = None  # two rows, of which the second has an earlier time
+        self._jump: RecordingRows | None = None  # two rows that are more than a year apart
+        self._left_out = list[RecordingRows]()  # two rows of each block: those with the least and the greatest time
 
     def check_block(self, came: RecordingRows, ordered: RecordingRows) -> None:
         """Check that a block goes on from the rows before it, and note what decides on the order of all rows.
@@ -81,17 +81,17 @@ class BlockOrderCheck:
             self._left_out.append(left_out.select(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
 
     def check_left_out_rows(self) -> None:
-        """Check that all rows that blocks left out have times more than a year before or after all that stay.
+        """Check that all rows that blocks left out are more than a year before or after all kept rows.
 
-        Whether such a row is to be left out only all rows together say, so that blocks may have been wrong.
+        Only all rows together decide whether a row must be left out, so a single block may have been wrong.
 
         Raises:
-            RowsNotInBlocksError: one that is not.
+            RowsNotInBlocksError: a row that was left out is within a year of the kept rows.
         """
         if self._first is None or self.last is None:
             return
         first, last = self._first.time[0], self.last.time[0]
-        # Of each block the two rows left out with the least and the greatest time speak for all that it left out.
+        # It suffices to check two rows of each block: those left out with the least and the greatest time.
         year = _year_in_unit_of(self._first.time)
         for rows in self._left_out:
             for row in range(2):

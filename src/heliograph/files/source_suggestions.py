@@ -35,9 +35,9 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
 
 
 def _suggest_options(topic: TopicStatistics, dated: bool) -> str:
-    """Return the text of a source's options for a topic's time field and running count, as code; "" if it has none.
+    """Return a source's options for a topic's time field and running count, as Python code; "" if there are none.
 
-    `dated`: whether there are dates in any topic.
+    `dated`: whether any topic has dates.
     """
     options = ""
     if topic.time is not None:
@@ -60,9 +60,10 @@ def _write_count_option(topic: TopicStatistics, path: str) -> str:
 
 
 def _comment_on_unit(topic: TopicStatistics, path: str, mark: str = "  #") -> str:
-    """Return the unit of a field as a comment of Python, "" if the file names none; of degrees with the remedy.
+    """Return the unit of a field as a Python comment, or "" if the file names no unit.
 
-    DEGREES are the ways to write that unit; angles in the network are in radians.
+    Angles in the network are in radians. For degrees (DEGREES holds the ways to write them) the comment says how to
+    convert them.
     """
     if path not in topic.measured_in:
         return ""

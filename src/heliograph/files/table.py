@@ -120,12 +120,12 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
         Columns by name, each of shape (rows,).
 
     Raises:
-        ValueError: no such file, an empty one, another format, no rows, duplicated columns, a cell that is no number.
-            Rows count from 1.
+        ValueError: the file is missing or empty, has another format or no rows, has two columns of one name, or a cell
+            is no number. Errors number rows from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     columns = read_rows(file_path("table", path), only=None, strict=True).columns
-    # Of a whole number that is missing a user knows NaN alone.
+    # int64 has no NaN: a column of integers in which one is missing becomes float64, with NaN.
     return {
         name: convert_to_doubles(column) if column.dtype.kind == "i" and np.any(find_missing(column)) else column
         for name, column in columns.items()
@@ -136,7 +136,7 @@ def read_rows(path: Path, only: Container[str] | None, strict: bool) -> TableRow
     """Return the rows of a file, of all columns or of those among `only`.
 
     Raises:
-        ValueError: what `read_table` refuses; where reading is not strict, a row alone is none of that.
+        ValueError: `read_table` would refuse the file; unless `strict`, a bad row alone is no reason.
     """
     rows = join_rows(read_row_blocks(path, only, strict))
     if not len(rows.numbers):

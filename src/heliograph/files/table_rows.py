@@ -25,7 +25,7 @@ class TableRows(NamedTuple):
 def join_rows(parts: Iterable[TableRows]) -> TableRows:
     """Return the rows of several parts of a table, one after the other."""
     parts = list(parts)
-    # Parts without rows do not say of which kind their columns are, and count only where there is nothing else.
+    # A part without rows does not tell the kinds of its columns. It is used only if all parts are empty.
     filled = [part for part in parts if len(part.numbers)] or parts[-1:]
     names = filled[0].columns if filled else ()
     columns = {name: _join_column([part.columns[name] for part in filled]) for name in names}
@@ -34,13 +34,13 @@ def join_rows(parts: Iterable[TableRows]) -> TableRows:
 
 
 def _join_column(parts: list[np.ndarray]) -> np.ndarray:
-    """Return the parts of a column, one after the other, as dates, float64 or int64: what holds all of them.
+    """Return the parts of a column, one after the other, as dates, float64 or int64.
 
-    A part of int64 has numbers too large for doubles. So the column stays int64 where all its numbers are whole, since
-    float64 would round the large ones.
+    A part of int64 has integers that are too large for doubles. If all numbers of the column are integers, it stays
+    int64, since float64 would round the large ones. Else it becomes float64.
     """
     kinds = {part.dtype.kind for part in parts}  # of NumPy: M dates, i integers, f floats
-    if "M" in kinds:  # a part without dates has empty cells alone, as those before the first date
+    if "M" in kinds:  # a part without dates has only empty cells
         parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
     elif kinds == {"i", "f"}:
         convert = _convert_to_whole if all(map(_are_whole_numbers, parts)) else convert_to_doubles
@@ -49,7 +49,7 @@ def _join_column(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _are_whole_numbers(numbers: np.ndarray) -> bool:
-    """Return whether all numbers that are there are whole, and of a size at which doubles hold each."""
+    """Return whether all numbers, without NaN, are integers that are exact as doubles or are int64 already."""
     if numbers.dtype.kind == "i":
         return True
     numbers = numbers[~np.isnan(numbers)]
@@ -75,11 +75,13 @@ def find_missing(numbers: np.ndarray) -> np.ndarray:
 
 
 def convert_to_numbers(column: np.ndarray, missing: np.ndarray | None = None) -> np.ndarray:
-    """Return numbers as float64, or as int64 where that alone tells them apart: NaN or MISSING where one is missing.
+    """Return numbers as float64, or as int64 if integers are too large for exact doubles.
+
+    A missing number becomes NaN in float64, and MISSING in int64.
 
     Args:
         column: numbers of any type.
-        missing: where they mean nothing; None for nowhere.
+        missing: mask of the missing numbers; None if there are none.
     """
     absent = np.zeros(len(column), dtype=bool) if missing is None else missing
     doubles = np.where(absent, np.nan, column.astype(np.float64))
@@ -94,10 +96,10 @@ def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.
     """Return dates as datetime64[ns]; `first` is the number of their first row, for errors.
 
     Raises:
-        ValueError: a date that 64 bits of nanoseconds cannot say, or a part of a nanosecond; one line with its row.
+        ValueError: a date is beyond 64 bits of nanoseconds, or has a fraction of a nanosecond. The error names its row.
     """
     moments = round_to_nanoseconds(column)
-    # Converted back, what nanoseconds do not reach is NaT, and what lost a part of one another date.
+    # Convert back: a date out of reach becomes NaT, and one that lost a fraction becomes another date.
     wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
     if wrong.any():
         row = int(np.argmax(wrong))

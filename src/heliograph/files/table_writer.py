@@ -46,7 +46,7 @@ def _open_csv(path: Path) -> Iterator[Append]:
     with path.open("x", newline="", encoding="utf-8") as file:
 
         def append(columns: Mapping[str, np.ndarray]) -> None:
-            """Append rows to `file`, which gets the names of the columns first while it is empty."""
+            """Append rows to `file`; while it is empty, the names of the columns are written first."""
             if not file.tell():
                 check_distinct(f"columns of {path}", [predict_name_read_back(name) for name in columns])
                 csv.writer(file).writerow(map(quote_for_cell, columns))
@@ -63,7 +63,7 @@ def _open_parquet(path: Path) -> Iterator[Append]:
     writer: pq.ParquetWriter | None = None
 
     def append(columns: Mapping[str, np.ndarray]) -> None:
-        """Append rows; the first ones make the `writer` of the file, with their columns."""
+        """Append rows; the first call makes the file's `writer`, with the columns of these rows."""
         nonlocal writer
         rows = _make_arrow_table(columns)
         if writer is None:
@@ -89,23 +89,24 @@ def _make_arrow_table(columns: Mapping[str, np.ndarray]) -> "pa.Table":
 
 
 def _write_csv_rows(columns: Mapping[str, np.ndarray], file: TextIO) -> None:
-    """Write rows as lines, a block of BLOCK rows at a time, whose cells alone are in memory as texts."""
+    """Write rows as lines, BLOCK rows at a time, so that only one block's cells are in memory as texts."""
     for start in range(0, len(next(iter(columns.values()))), BLOCK):
         cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]  # they need no quotes
         file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))
 
 
 def _format_cells(column: np.ndarray) -> list[str]:
-    """Write each value as Python does, a float with all digits that it takes to read it back.
+    """Return the text of each value as Python writes it; a float has all digits that are needed to read it back.
 
-    Floats are written as JSON, in a tenth of the time and with the same digits, and made what Python writes where the
-    two differ: in exponents of one digit, where only one of them has an exponent at all, of NaN and of infinity.
+    Floats are written by a JSON encoder, which takes a tenth of the time and gives the same digits. The text is
+    corrected where Python writes it differently: exponents of one digit, numbers for which only one of the two uses an
+    exponent, NaN and infinity.
     """
     if column.dtype.kind != "f":
         return list(map(str, _convert_to_plain(column).tolist()))
     values, size = column.tolist(), np.abs(column.astype(np.float64))
     text = msgspec.json.encode(values).decode().replace("]", ",")
-    for digit in "6789":  # of an exponent Python writes two digits
+    for digit in "6789":  # Python writes two digits of an exponent
         text = text.replace(f"e-{digit},", f"e-0{digit},")
     # JSON and Python write these differently: numbers in a range of exponents, large ones, NaN (`~ <`) and infinity.
     differs = ((size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1])) | ~(size < LARGE)
@@ -121,7 +122,7 @@ def predict_name_read_back(name: str) -> str:
 
 
 def _convert_to_plain(column: np.ndarray) -> np.ndarray:
-    """Return dates as texts, and true and false as 1 and 0; other numbers as they are."""
+    """Return dates as texts, flags as 1 and 0, and other numbers as they are."""
     if column.dtype.kind == "M":
         return format_dates(column)
     return column.astype(np.int64) if column.dtype == np.bool_ else column

@@ -88,10 +88,11 @@ class TopicStatistics:
     own_clock: bool = False
 
     def choose_time_field(self) -> None:
-        """Take for the time of the messages the first date that is not the same in all of them, or else the first.
+        """Choose the field that holds the time of the messages.
 
-        Without dates it is the first clock by name that never goes back; its messages were logged when it says. A date
-        has its moments, in nanoseconds since 1970, and by how many seconds messages came later.
+        It is the first date field whose values differ, or else the first date field. Without dates it is the first
+        clock that never goes back. `self.dates` maps a date field to its times, in nanoseconds since 1970, and to how
+        many seconds later messages came.
         """
         if self.time is not None:
             return
@@ -104,9 +105,9 @@ class TopicStatistics:
         self.logged = self.logged or moments
 
     def _choose_clock_field(self) -> None:
-        """Take for the time the first clock that has a number in every message and never goes back, if there is one.
+        """Choose as time the first clock with a number in every message that never goes back, if there is one.
 
-        Not where it is known when messages were logged. UNITS: nanoseconds of each unit.
+        It then also says when messages were logged. If that is known already (`self.logged`), no clock is chosen.
         """
         for path, numbers in self.clocks.items() if not self.logged else ():
             if len(numbers) == self.messages > 1 and numbers[0] < numbers[-1] and np.all(np.diff(numbers) >= 0):
@@ -126,23 +127,23 @@ class TopicStatistics:
         return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_rank_field)
 
     def format_row(self) -> list[str]:
-        """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
+        """Return as texts the type, count, rate, largest gap and lateness (median, 95 % quantile and largest)."""
         self.choose_time_field()
         times = np.sort(np.array(self.logged, dtype=np.int64))
         intervals = np.diff(times) / SECOND
         span = float(intervals.sum())
         rate = f"{len(intervals) / span:.3g} Hz" if span > 0 else "-"
-        count = f"{max(len(times), self.messages)}"  # some may have come at a time that is not known
+        count = f"{max(len(times), self.messages)}"  # some messages have no known time
         gap = f"{intervals.max():.3g} s" if len(intervals) else "-"
         quantiles = np.quantile(np.array(self.late), [0.5, 0.95, 1.0]) if self.late else []
         return [self.kind, count, rate, gap, " ".join(f"{value:.3g}" for value in quantiles) or "-"]
 
 
 def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str, TopicStatistics], str]:
-    """Return the topics of a bag or of the bags in a folder, and where and why reading one ended early, "" if none did.
+    """Return the topics of a bag or of a folder's bags, and a line on where and why reading ended early, else "".
 
     Raises:
-        ValueError: no bag, or one that cannot be opened.
+        ValueError: there is no bag, or one cannot be opened.
     """
     topics, broken = dict[str, TopicStatistics](), ""
     for bag in parts_of(path) or [path]:
@@ -178,9 +179,9 @@ def _inspect_one_bag(path: Path, topics: dict[str, TopicStatistics], progress: P
 
 
 def _describe_type(reader: "AnyReader", kind: str) -> TopicStatistics:
-    """Return a topic of messages of a type of ROS: its fields of numbers, and the stamp of its header, of ROS 2 alone.
+    """Return the statistics of a topic with messages of a ROS type: its numeric fields, and in ROS 2 its stamp.
 
-    In ROS 1 a message does not begin with the stamp, by which it could be read without decoding.
+    In ROS 1 a message does not begin with the header's stamp, so the stamp cannot be read without decoding.
     """
     fields = list(list_fields(reader, kind))
     numbers = [name for name, basic in fields if basic not in NO_NUMBERS and not name.startswith("header.")]
@@ -189,7 +190,7 @@ def _describe_type(reader: "AnyReader", kind: str) -> TopicStatistics:
 
 
 def _inspect_mcap(path: Path, topics: dict[str, TopicStatistics]) -> str:
-    """Add the topics of an MCAP file without ROS, and return where and why reading it ended early."""
+    """Add the topics of an MCAP file without ROS; return where and why reading ended early, "" if it did not."""
     for message in read_mcap_messages(path):
         if isinstance(message, InputError):
             return str(message)
@@ -212,14 +213,14 @@ def note_payload(topics: dict[str, TopicStatistics], name: str, payload: str | b
 def _note_message(
     topics: dict[str, TopicStatistics], name: str, content: object, kind: str, arrival: int | None
 ) -> None:
-    """Count a message under its topic; note its fields of numbers, and its dates with how late it came.
+    """Count a message under its topic; note its numeric fields, and its dates with how late the message came.
 
     Args:
-        topics: by name, to which a new one is added.
-        name: of the message's topic.
-        content: the message, decoded; None where it could not be.
-        kind: type of the message, of a new topic.
-        arrival: in nanoseconds since 1970; None where it is not known.
+        topics: the topics by name; a new one is added.
+        name: name of the message's topic.
+        content: the decoded message; None if it could not be decoded.
+        kind: type of the messages, for a new topic.
+        arrival: in nanoseconds since 1970; None if it is not known.
     """
     topic = topics.setdefault(name, TopicStatistics(kind))
     topic.messages += 1
@@ -234,9 +235,9 @@ def _note_message(
 
 
 def _note_date(topic: TopicStatistics, path: str, value: object, arrival: int | None) -> None:
-    """Note a value as a date of its field, which may be the time of measurement, if it is one: a stamp, text or number.
+    """Note a field's value if it is a date (a stamp, text or number): it may be the time of measurement.
 
-    `arrival`: of its message, in nanoseconds since 1970; None where it is not known.
+    `arrival`: when the message came, in nanoseconds since 1970; None if it is not known.
     """
     is_date = is_stamp(value) or (isinstance(value, str) and looks_like_date(value))
     unit: TimeUnit | None = "s" if is_date else _find_unit_of_date(value)
@@ -258,7 +259,7 @@ def _match_clock_name(path: str) -> re.Match[str] | None:
 
 
 def _read_unit_of_clock_name(path: str) -> Literal["s", "ms", "us", "ns"]:
-    """Return the unit that the name of a clock ends in, as "uptime_ms"; seconds where it has none."""
+    """Return the unit with which a clock's name ends, as in "uptime_ms"; seconds if it has none."""
     match = _match_clock_name(path)
     unit = None if match is None else match["unit"]
     return next((known for known in UNITS if known == unit), "s")
@@ -270,9 +271,9 @@ def _is_clock_from_start(path: str, value: float) -> bool:
 
 
 def _find_unit_of_date(value: object) -> TimeUnit | None:
-    """Return the unit in which a number, counted from 1970, is a date of 2000 to 2044 (YEARS); None of any other value.
+    """Return the unit in which a number since 1970 is a date from 2000 to 2044 (YEARS), or None if there is none.
 
-    UNITS: nanoseconds of each unit.
+    UNITS maps each unit to its nanoseconds.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
@@ -307,10 +308,10 @@ def inspect_file(path: Path) -> tuple[dict[str, TopicStatistics], str]:
 
 
 def inspect_folder(path: Path) -> tuple[dict[str, TopicStatistics], str]:
-    """Return the topics of the files of messages in a folder, and the first reason why a message cannot be read.
+    """Return the topics of a folder's message files, and the first reason why a message cannot be read, or "".
 
     Raises:
-        ValueError: no file of messages in it, or one that cannot be read at all.
+        ValueError: the folder has no message file, or one cannot be read at all.
     """
     topics, broken = dict[str, TopicStatistics](), ""
     for file in list_message_files(path):
@@ -349,9 +350,10 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
 
 
 def _rank_field(path: str) -> int:
-    """Return how little a field looks like a measurement: 0 under a payload, 2 for a device's own state, else 1.
+    """Return a field's rank, which is lower the more it looks like a measurement.
 
-    HOUSEKEEPING matches words of the latter, such as a battery's; PAYLOADS are names of what holds measurements.
+    It is 0 inside a payload (PAYLOADS holds the names of such objects), 2 for the device's own state, such as a
+    battery's (HOUSEKEEPING matches the words), and 1 for any other field.
     """
     words = path.lower().split(".")
     if any(HOUSEKEEPING.fullmatch(word) for word in words):
@@ -362,7 +364,7 @@ def _rank_field(path: str) -> int:
 def _read_stamp(data: bytes) -> int:
     """Return the stamp of the header that a message begins with, in nanoseconds since 1970.
 
-    Four bytes come before it, of which the second says whether the little end comes first.
+    Four bytes come before it. The second of them says whether numbers are little-endian.
     """
     is_little_endian = data[1] & 1
     seconds, nanoseconds = struct.unpack_from("<iI" if is_little_endian else ">iI", data, 4)
@@ -370,9 +372,9 @@ def _read_stamp(data: bytes) -> int:
 
 
 def _yield_leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:
-    """Yield dotted path and value of what is no dictionary or list in decoded JSON, and of stamps.
+    """Yield (dotted path, value) for each leaf of decoded JSON: neither a dictionary nor a list, or a stamp.
 
-    A stamp is a dictionary of seconds and nanoseconds; `depth`: how many dictionaries deep it looks.
+    A stamp is a dictionary of seconds and nanoseconds. Dictionaries are searched `depth` levels deep.
     """
     if isinstance(content, dict) and depth and not is_stamp(content):
         for key, value in content.items():

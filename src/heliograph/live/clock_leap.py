@@ -40,7 +40,7 @@ class ClockLeap(NamedTuple):
     earlier: "ClockLeap | None" = None
 
     def list_with_earlier(self) -> Iterator["ClockLeap"]:
-        """Yield this leap, then those before it that are believed, the newest first."""
+        """Yield this leap and then the earlier believed leaps, the newest first."""
         leap: ClockLeap | None = self
         while leap is not None:
             yield leap
@@ -51,59 +51,55 @@ class ClockLeap(NamedTuple):
         return now - self.since >= self.since - self.now
 
     def as_believed(self) -> "ClockLeap":
-        """Return this leap, believed; one that follows an earlier believed one is joined with that into one leap.
+        """Return this leap as a believed one; if an earlier leap is believed, both are joined into one leap.
 
-        Not with the leap with which the plant begins (`now` is -inf), which has no time before it.
-
-        Believed: rows become final by it, although no other clock confirms it. `back`: time of a message that
-        spoke against it; `since`: the first moment after the newest of leaps that are joined.
+        A believed leap lets rows become final, although no other clock confirms it. The leap with which a plant begins
+        (`now` is -inf) is never joined, since it has no time before it. `back`: time of a message that contradicted the
+        leap, None if there is none. `since`: the first moment after the newest of the joined leaps.
         """
         if self.earlier is None or self.earlier.now == -inf:
             return self._replace(believed=True, back=None)
         return self.earlier._replace(since=self.since, back=None)
 
     def with_back(self, of: "ClockLeap", back: float | None) -> "ClockLeap":
-        """Return this chain of leaps, in which the leap `of` has this `back`.
+        """Return this chain of leaps with `back` set in the leap `of`.
 
-        `back`: time of a message that goes on from before the leap, a first sign that it was none; None without
-        one. `earlier`: the leap before this one in the chain.
+        `back` is the time of a message that goes on from before the leap, which is a first sign against the leap; None
+        if there is none. `earlier` is the previous leap of the chain.
         """
         if self is of:
             return self._replace(back=back)
         return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
 
     def is_taken_back_by(self, clock: str, time: float, now: float) -> bool:
-        """Return whether `clock` takes the leap back by saying `time`, which lies between the leap's two sides.
+        """Return whether `clock` refutes the leap by saying `time`, which lies between the leap's two sides.
 
-        `now`: the newest arrival after it.
-
-        `believed`: rows become final by it; `since`: the first moment after the newest of leaps that are
-        joined; `back`: time of the first message by its own clock that went on from before it.
+        `now` is the newest arrival after the leap. A leap that is not `believed` is always refuted. `since` is the
+        first moment after the leap. `back` is the time of an earlier message by the leap's own clock that went on from
+        before the leap, None if there is none.
         """
         if not self.believed:
             return True
         if now - self.since >= self.since - time:
-            return False  # it is late for no longer than the plant has gone on
+            return False  # the message is late by no more than the plant has gone on since the leap
         if clock != self.clock:
             return True
-        # By its own clock the second message in a row, if it goes on from the first (`back`) closer than to the leap.
+        # The leap's own clock needs two such messages, the second of which goes on from the first (`back`).
         return self.back is not None and self.back < time < self.back + self.time - time
 
 
 def find_contradicted_leap(
     leap: ClockLeap | None, now: float, time: float, most: float
 ) -> tuple[ClockLeap, float] | None:
-    """Return the leap that `time` contradicts by lying before it, and the newest arrival after it; None if none.
+    """Return the leap that `time` contradicts, and the newest arrival after that leap; None if there is no such leap.
 
-    A time contradicts a leap if it is later than all before the leap, but more than `most` before its far side.
-
-    In a leap time goes on by more than `most` at once, from the newest arrival before it (`leap.now`) to its far
-    side (`leap.time`).
+    In a leap, time goes on by more than `most` at once: from the newest arrival before it (`leap.now`) to its far side
+    (`leap.time`). `time` contradicts the leap if leap.now < time < leap.time - most.
 
     Args:
-        leap: the newest of the chain, None if there is none.
+        leap: the newest leap of the chain, None if there is none.
         now: the newest arrival.
-        time: what a clock says.
+        time: the time that a clock says.
         most: the longest gap that is no leap.
     """
     for candidate in leap.list_with_earlier() if leap else ():

@@ -57,7 +57,7 @@ class CheckedEvent(NamedTuple):
 
 
 def check_63_bits(name: str, value: object) -> int:
-    """Return a count as an int; raise ValueError, which calls it `name`, unless it is whole, from 0, of 63 bits."""
+    """Return a count as an int; raise ValueError, which calls it `name`, unless it is an integer with 0 <= n < 2^63."""
     if not is_whole(value) or not 0 <= int(value) < 2**63:
         raise fail(name, WHOLE, show_value(value))
     return int(value)

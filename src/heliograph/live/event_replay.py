@@ -93,10 +93,10 @@ class _LaggedSmoother:
     """
 
     def __init__(self, timeline: Timeline, lag: float):
-        """Keep the timeline, and the lag after which each of its moments is smoothed into `smoothed`."""
+        """Keep the timeline, and the lag after which each moment is smoothed; `smoothed` collects the estimates."""
         self.smoothed: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
         self._timeline, self._lag = timeline, lag
-        self._waiting: list[float] = []  # a heap of moments of which the lag has not passed
+        self._waiting: list[float] = []  # a heap of moments whose lag has not passed
 
     def note_moment(self, moment: float) -> None:
         """Note that something was measured at a moment, which will be smoothed unless its lag has passed already."""
@@ -104,9 +104,9 @@ class _LaggedSmoother:
             heappush(self._waiting, moment)
 
     def smooth_until(self, arrival: float) -> None:
-        """Smooth each moment noted whose lag ends before `arrival`: nothing that comes from then on can change it.
+        """Smooth each noted moment whose lag ends before `arrival`, since later messages can no longer change it.
 
-        `_waiting`: a heap of moments to smooth, the earliest first; `window`: the longest lag that the timeline has.
+        `_waiting` is a heap of the moments to smooth, the earliest first. `window` is the timeline's longest lag.
         """
         timeline, smoothed = self._timeline, self.smoothed
         while self._waiting and self._waiting[0] + self._lag < arrival:
@@ -139,7 +139,7 @@ def _join_records(records: Sequence[Record]) -> Record:
 
 
 def _make_record(network: Network, moments: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
-    """Return the record of several moments: (time, estimates then by node and filter) of each, in order of time."""
+    """Return the record of several moments; each is (time, estimates at this time by node and filter), in order."""
     filters_by_node = moments[0][1] if moments else {}
     estimates = {
         node: {
@@ -153,10 +153,10 @@ def _make_record(network: Network, moments: Sequence[tuple[float, Mapping[str, M
 
 
 def _stack_estimates(estimates: Sequence[Estimate], join: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
-    """Return one filter's estimates at several times as one estimate, whose arrays have an axis for time.
+    """Return one filter's estimates at several times as one estimate whose arrays have a leading axis of times.
 
-    `join` is `np.stack` where each is of one time, `np.concatenate` where each has several times already. All have
-    the same claim and the same states that are attitudes.
+    `join` is `np.stack` if each estimate is of one time, and `np.concatenate` if each has an axis of times already. All
+    have the same claim and the same `attitude` (which states are rotations).
     """
     mean = join([np.asarray(estimate.mean) for estimate in estimates])
     covariance = join([np.asarray(estimate.covariance) for estimate in estimates])

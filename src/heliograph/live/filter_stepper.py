@@ -40,11 +40,11 @@ class NativeFilterStepper:
     def __init__(self, code: Any, numbers: Leaves, state: Leaves):
         """Start from the leaves `state`; `code` is what `compile_native_step` returns, `numbers` the filter's arrays.
 
-        The code reads and writes the same arrays at each call: here they get names.
+        The code reads and writes the same arrays at each call. They get names here.
         """
         self._code = code.with_new_memory(numbers)
-        # Arguments (numbers, state, z, u, k); results (judgement, flagged, state after, estimate, next state). Of both
-        # the state's leaves are n.
+        # Arguments are (numbers, state, z, u, k), and results (judgement, flagged, state after, estimate, next state).
+        # A state has n leaves.
         arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
         self._state, (self._z, self._u, self._k) = arguments[:n], arguments[n:]
         self._judged: Float[np.ndarray, " parts"] = results[0]
@@ -73,9 +73,10 @@ class NativeFilterStepper:
             leaf_of_state[...] = leaf
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite.
+        """Compute step k from z and u; return whether it was accepted.
 
-        The compiled code reads z, u and k from these arrays, and writes whether it objects (`_flagged`).
+        If z or u is implausible or infinite, it is not, and the state stays unchanged. The compiled code reads the
+        arrays `_z`, `_u` and `_k`, and writes `_flagged`: whether it refuses them.
         """
         self._z[...], self._u[...], self._k[...] = z, u, k
         self._code()
@@ -121,9 +122,10 @@ class XlaFilterStepper:
             self._state = [jnp.array(leaf) for leaf in leaves]
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite.
+        """Compute step k from z and u; return whether it was accepted.
 
-        `_run`: the compiled step; `_tree`: structure of the state; `accept` puts the state after in the state's place.
+        If z or u is implausible or infinite, it is not, and the state stays unchanged. `_run` is the compiled step, and
+        `_tree` the state's structure. `accept` makes the new state the current one.
         """
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
@@ -147,13 +149,13 @@ class XlaFilterStepper:
 def _judge_step(
     static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
-    """Step a filter; return its judgement, whether to refuse the step, and leaves of the state and the estimate after.
+    """Step a filter; return its judgement, whether the step is refused, and the leaves of the new state and estimate.
 
-    The weights of a filter that weighs what arrives follow its judgement, in one array.
+    If the filter weighs what arrives, its weights follow the judgement's numbers in the same array.
 
     Args:
         static: the filter without its arrays.
-        numbers: these arrays.
+        numbers: the filter's arrays.
         state: the filter's state before the step.
         z: measurement (received,), NaN where a component did not arrive.
         u: inputs (inputs,).
@@ -161,7 +163,7 @@ def _judge_step(
     """
     filter: AbstractFilter = static.with_arrays(numbers)
     state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
-    # NaN in z did not arrive; infinite measurements and inputs that are no numbers are refused.
+    # NaN in z means that a component did not arrive. Infinite measurements, and NaN or infinite inputs, are refused.
     has_unusable_numbers = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
     is_refused = has_unusable_numbers | (judgement.reason > 0) | (judgement.input > 0)
     judgement_numbers = jnp.stack(judgement)
@@ -182,16 +184,16 @@ def compile_xla_step(static: Static) -> Any:
 
 
 def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
-    """Return a filter's step as native code; None if XLA has to step the filter.
+    """Return a filter's step as native code, or None if XLA has to step the filter.
 
-    Its arguments are (numbers, state, z, u, k), flattened; its results those of `_judge_step`, and the state again,
-    written over the argument: unchanged if the step was flagged.
+    Its arguments are (numbers, state, z, u, k), flattened. Its results are those of `_judge_step`, and the next state,
+    which is written over the argument. The next state is the old one if the step was flagged (refused).
 
     Args:
         static: the filter without its arrays.
-        numbers: these arrays.
-        state: a state of the filter, for its structure and shapes.
-        data: z, u and k, for their shapes.
+        numbers: the filter's arrays.
+        state: a state of the filter; only its structure and shapes count.
+        data: z, u and k; only their shapes count.
     """
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
@@ -217,24 +219,24 @@ def _compile_step(
     state_end = number_count + state_count
 
     def step(*arguments: jax.Array) -> PyTree:
-        """Return judgement, whether to refuse, state after, estimate, and what takes the state's place.
+        """Return the judgement, whether the step is refused, the new state, the estimate, and the next state.
 
-        `arguments`: arrays of the filter, leaves of its state, z, u and k; the first two end at `number_count`
-        and `state_end`. `tree`: the state's structure; `static`: the filter without its arrays.
+        `arguments` are the filter's arrays (up to `number_count`), the leaves of its state (up to `state_end`), z, u
+        and k. `tree` is the state's structure, and `static` the filter without its arrays.
         """
         numbers, before = arguments[:number_count], arguments[number_count:state_end]
         z, u, k = arguments[state_end:]
         judged, flagged, after, estimate = _judge_step(static, numbers, tree.unflatten(before), z, u, k)
-        # The new state has to fit over the old one.
+        # The new state is written over the old one, and must fit.
         if any(new.shape != old.shape or new.dtype != old.dtype for new, old in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
-        # The state that replaces the old one: unchanged if the step was flagged.
+        # The next state is the old one if the step was refused.
         next_state = [jnp.where(flagged, old, new) for new, old in zip(after, before, strict=True)]
         return judged, flagged, after, estimate, next_state
 
     def compile_code() -> Any:
         """Return the code of the step; the next state is written over the arguments of the state."""
-        # {number of a result: number of the argument that it is written over}; results are numbered from the end (-1).
+        # {number of a result: number of the argument that it is written over}; -1 is the last result.
         in_place = {i - state_count: number_count + i for i in range(state_count)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
@@ -250,7 +252,7 @@ class DecidingSender(NamedTuple):
 
 
 def find_deciding_sender(filter: AbstractFilter) -> DecidingSender | None:
-    """Return the sender of which a filter knows what its silence means; None of any other filter."""
+    """Return the sender whose silence a filter can interpret, or None if there is none."""
     premise = filter.premise  # the plant, sensor, channel and trigger that the filter was made for
     if not filter.silence_tells or premise is None or premise.trigger is None:
         return None
@@ -303,10 +305,10 @@ class CompiledFilter:
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a new stepper whose state is the prior.
+        """Return a new stepper whose state is the prior (`_start`).
 
-        By native code (`code`) where there is some for the filter, else by XLA. `_start`: the prior as state; `_static`
-        and `numbers`: the filter without its arrays, and these.
+        It uses native code if there is some for the filter, and else XLA. `_static` is the filter without its arrays,
+        and `numbers` are the arrays.
         """
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:

@@ -18,10 +18,10 @@ class FinalRows:
         self._count = 0  # rows of all parts
 
     def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
-        """Append some rows: their times (row,) and outputs (row, output).
+        """Append rows: their times (row,) and outputs (row, output).
 
-        `_parts`: these two arrays of each call, the oldest first; `_count`: how many rows all parts have together.
-        The oldest parts are dropped as long as the others have `most` rows or more.
+        `_parts` holds these two arrays of each call, the oldest first, and `_count` the number of all rows. The oldest
+        part is dropped while the other parts have at least `most` rows.
         """
         self._parts.append((time, rows))
         self._count += len(time)
@@ -33,7 +33,7 @@ class FinalRows:
 
     def take_all(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
         """Remove all rows; return their times (row,) and outputs (row, output), the oldest first."""
-        no_rows = np.zeros(0), np.zeros((0, self.size))  # first, as no list of arrays to join may be empty
+        no_rows = np.zeros(0), np.zeros((0, self.size))  # np.concatenate needs at least one array
         times, rows = zip(no_rows, *self._parts, strict=True)
         self._parts.clear()
         self._count = 0

@@ -100,10 +100,10 @@ class Fleet:
         return self._joint
 
     def begin_plant(self, name: str, time: float, origin: datetime | None) -> PlantState:
-        """Return a new plant whose only row is the prior, in a slot (row number) of the table.
+        """Return a new plant whose only row, in a slot (row number) of the table, holds the prior.
 
-        Continuous time starts at `time`, where the prior stands; steps start at 0, and the prior is of step -1.
-        `origin`: date from which times are counted, None if they are numbers.
+        In continuous time the prior is at `time`. If time counts steps, they start at 0, and the prior is at step -1.
+        `origin`: the date from which times are counted, None if they are numbers.
         """
         by_steps = self.program.dt is None
         prior_time = -1.0 if by_steps else time
@@ -119,15 +119,15 @@ class Fleet:
         self.pool.free_slots(plant.slots)
 
     def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
-        """Predict each plant to the step beside it, at which nothing came; `silence` of the plant becomes that row.
+        """Predict each plant to the step paired with it, without measurements; this row becomes the plant's `silence`.
 
-        The row is none of the history: `take_event` drops it at the next event that is used. A later silence is
-        predicted from an earlier one, so that no step is computed twice.
+        The row does not belong to the history: `take_event` drops it at the next event that is used. A later silence
+        is predicted from an earlier one, so that no step is computed twice.
         """
         chains = []
         for plant, step in plants:
             before = plant.silence or plant.rows.held[-1]
-            if step <= before.key[0]:  # it is there already
+            if step <= before.key[0]:  # the plant was already predicted so far
                 continue
             slot = plant.silence.slot if plant.silence is not None else self.pool.take_slot()
             plant.silence = HeldRow((step, 0, 0), slot, self.width)
@@ -153,9 +153,9 @@ class Fleet:
     def convert_message(
         self, node: str, sequence: int, time: float, values: list[float | None], arrival: float
     ) -> CheckedEvent:
-        """Return a message as an event; raise ValueError unless its node, number of values and time are possible.
+        """Return a message as an event; raise ValueError if its node, number of values or time is impossible.
 
-        A value that is None did not arrive; `time` and `arrival` are in steps or in the unit of dt.
+        None stands for a value that did not arrive. `time` and `arrival` are in steps, or in the unit of dt.
         """
         index, size = self.sizes.get(node, (0, -1))
         if size < 0:  # no such node
@@ -196,14 +196,14 @@ class Fleet:
         return self._values_before_losses.get(self.sizes[node][0])
 
     def _find_lost_column(self, node: int) -> tuple[str, int] | None:
-        """Return name and column of the number of lost messages that the node's running count says; None if none."""
+        """Return the node's name and the column of its number of lost messages, or None if it has no such number."""
         outputs = self._values_before_losses.get(node)
         if outputs is None or self.count_values(node) != outputs + 1:
             return None
         return self._names[node], self._columns[node].start + outputs
 
     def check_step(self, name: str, time: float) -> None:
-        """Raise ValueError, which calls the time `name`, if it is no step of the network, where time counts steps."""
+        """Raise ValueError, which calls the time `name`, if the network counts steps and the time is none of them."""
         if self.program.dt is None and not (0 <= time <= self.end_step and time == int(time)):
             end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
             raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
@@ -211,8 +211,8 @@ class Fleet:
     def screen_event(self, node: str, event: CheckedEvent, plant: PlantState | None) -> ScreenedEvent:
         """Return an event without the values that its node refuses: beyond its limits, or repeated for too long.
 
-        Readings repeat in the order in which they arrive. The runs that end with this event are returned as well; the
-        plant, None where it has not begun, stays as it is.
+        The runs of equal readings that end with this event, in order of arrival, are returned too. The plant (None if
+        it has not begun) is not changed.
         """
         limits, watch = self._limits.get(node), self.held_watches.get(node)
         if limits is None and watch is None:
@@ -226,7 +226,7 @@ class Fleet:
         return screened
 
     def _screen_by_limits(self, limits: ReadingLimits, node: str, unscreened: ScreenedEvent) -> ScreenedEvent:
-        """Return an event without the values that a node's limits refuse; `repeats` are at first those before it."""
+        """Return an event without the values that a node's limits refuse; its `repeats` are continued by the event."""
         event, values = unscreened.event, np.array(unscreened.event.values)
         screened = limits.screen(values[None], unscreened.repeats)
         if not screened.refused.any():
@@ -277,13 +277,13 @@ class Fleet:
         return verdict
 
     def advance_time(self, plant: PlantState, now: float) -> None:
-        """Advance the time of a plant to `now` by a clock that is right; a leap that contradicts it is withdrawn."""
+        """Advance a plant's time to `now`, which is known to be right; undo a leap in time that contradicts it."""
         leap, longest_gap = plant.leap, self.options.leap
         if leap is not None:
             found = find_contradicted_leap(leap, plant.now, now, longest_gap)
             if found is not None and found[0].now > -inf:  # not the leap with which the plant began
                 plant.undo_leap(found[0], longest_gap, self._names)
-            elif now >= leap.time - longest_gap:  # the right clock has come as far: it confirms the leap
+            elif now >= leap.time - longest_gap:  # the right time has come as far, and confirms the leap
                 plant.leap = None
         plant.now = max(plant.now, now)
 
@@ -293,9 +293,9 @@ class Fleet:
         plant.clock = clock
 
     def finalise_plants(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
-        """Step what is due, and let rows older than the window, or all, become final; return what did of each plant.
+        """Step the plants, and return for each the rows that became final: those before the watermark, or `all_`.
 
-        `touched`: plants that have taken events, or whose time went on. Rows before the watermark become final.
+        `touched` holds plants that took events or whose time went on. The watermark is their time minus the window.
         """
         plants, results = list(touched), []
         self.step(plants)
@@ -308,7 +308,7 @@ class Fleet:
         return results
 
     def step(self, plants: Iterable[PlantState]) -> None:
-        """Step the rows that have changed, and all after them, for all plants at once; write them into the table."""
+        """Step the changed rows of all plants, and all rows after them, at once; write them into the table."""
         chains = list(filter(None, [plant.take_dirty_rows() for plant in plants]))
         rows = [row for chain in chains for row in chain]
         if rows:
@@ -317,14 +317,14 @@ class Fleet:
         self._step_chains(chains)
 
     def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
-        """Step from the first row of each chain into the second, and so on; their numbers stand in the table."""
+        """Step from the first row of each chain to the second, and so on; what came is in the table already."""
         by_steps, endless = self.program.dt is None, self.end_step == np.inf
-        # All chains up to their first long gap at once (their first legs), over these one by one, and so on.
+        # Long gaps cut a chain into legs. Step the first legs of all chains at once, pass their gaps, and so on.
         legs_of_chains = [cut_chain_into_legs(chain, by_steps, endless) for chain in chains]
         while legs_of_chains:
             for steps in group_by_turn(legs[0].steps for legs in legs_of_chains):
                 self.pool.step_slots_in_place(*map(np.array, zip(*steps, strict=True)))
-            legs_of_chains = [legs for legs in legs_of_chains if len(legs) > 1]  # a long gap follows the first leg
+            legs_of_chains = [legs for legs in legs_of_chains if len(legs) > 1]  # those with a gap after the first leg
             for legs in legs_of_chains:
                 _, slot_before_gap, _ = legs[0].steps[-1]
                 self.pool.pass_long_gap(slot_before_gap, to=legs[0].jump)
@@ -378,7 +378,7 @@ class Fleet:
         return statuses
 
     def count_event(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:
-        """Count an event of a node by its verdict, what was screened of it, and the silence before it."""
+        """Count an event of a node by its verdict; count its screened values and the silence before it."""
         link, event, rule = plant.link_counts(node), screened.event, self.watched.get(node)
         if rule is not None and rule.timeout is not None and verdict == "used":
             link.count_timeout(event.time, plant.begun, rule.timeout)
@@ -392,7 +392,7 @@ class Fleet:
 
 
 def _check_options(options: Options) -> Options:
-    """Return the options as numbers of their kinds; raise ValueError where one is out of range."""
+    """Return the options converted to floats and integers; raise ValueError if one is out of range."""
     step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))

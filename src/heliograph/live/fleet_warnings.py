@@ -23,10 +23,10 @@ class RemarkWatch:
         self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
 
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
-        """Yield the name of a plant and a line for each filter that has something new to say.
+        """Yield (name of the plant, line) for each new remark of a filter on its state.
 
-        `remark.times`: how often the filter has had this to say so far; `remarked`: how often a plant has passed it on;
-        `counts`: how often all plants have.
+        `remark.times` says how often the filter has made its remark so far. `plant.remarked` says how often this was
+        passed on, by (node, filter), and `counts` sums this over all plants.
         """
         for plant in plants if self.counts else ():
             newest_row = plant.rows.held[-1]
@@ -60,10 +60,10 @@ class FleetRepeatWatch:
         self._said = set[tuple[str, int]]()  # node and output
 
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
-        """Yield the name of a plant and a line for each output that repeats for too long for the first time.
+        """Yield (name of the plant, line) for each output that has repeated for too long for the first time.
 
-        An output of a node is named once, by the first plant of which it is found. `found`: by output, how many
-        runs of equal readings were too long.
+        An output of a node is named once, by the first plant in which this is found. `link.repeats.found` counts for
+        each output the runs of equal readings that were too long.
         """
         for plant in plants if self._watches else ():
             for node, link in plant.links.items():

@@ -38,10 +38,10 @@ def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.n
 
 
 def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-    """Return the estimates of a row, or of rows, by node and filter, from its outputs (..., outputs).
+    """Return the estimates by node and filter from the outputs (..., outputs) of one or several rows.
 
-    `filter_columns`: for each filter where its mean, covariance and modes' probabilities stand among the outputs. A
-    claim is lowered where the covariance is not sound.
+    `filter_columns` says for each filter where its mean, covariance and modes' probabilities stand among the outputs. A
+    filter whose covariance is not sound gets a weaker claim.
     """
     n, attitude = len(program.network.states), first(program.network.plant).manifold.rotations
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}

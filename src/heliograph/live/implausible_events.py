@@ -58,9 +58,9 @@ class JudgementReader:
     def explain_implausible_inputs(
         self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
     ) -> list[str | None]:
-        """Return for each plant why its inputs are implausible, None where they are not.
+        """Return for each plant why its inputs are implausible, or None if they are not.
 
-        They are judged by the prediction over one step, or one unit of time, that they lead to.
+        Inputs are judged by the prediction that they lead to, over one step or one unit of time.
         """
         if not plants:
             return []
@@ -102,10 +102,10 @@ class JudgementReader:
         return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 
     def _find_flagged(self, taken: Sequence[CandidateEvent]) -> list[int]:
-        """Return the indices of the candidates in whose rows any filter's judgement raises a flag; most raise none.
+        """Return the indices of the candidates in whose rows some filter's judgement raises a flag.
 
-        FLAGS: numbers of a judgement, above 0 where it objects to a measurement, or to inputs. A slot is the
-        number of a row in the table.
+        FLAGS says which numbers of a judgement are flags: they are above 0 if it objects to a measurement or to inputs.
+        A slot is the number of a row in the table.
         """
         pool, slots = self.fleet.pool, np.array([candidate.row.slot for candidate in taken])
         flags = pool.outputs.start + self._all_columns[:, FLAGS].ravel()
@@ -113,12 +113,12 @@ class JudgementReader:
         return flagged
 
     def _explain_event(self, candidate: CandidateEvent) -> str | None:
-        """Return why a candidate is implausible by the judgements of its row; None if it is not, or has no number."""
+        """Return why a candidate is implausible by its row's judgements, or None if it is not or holds no number."""
         event, pool = candidate.event, self.fleet.pool
         outputs = pool.table[candidate.row.slot, pool.outputs]
         if event.is_inputs:
             return self.explain_inputs(outputs)
-        # No number came that could be implausible.
+        # Without any number, nothing can be implausible.
         if _find_largest_number(event) < 0:
             return None
         return Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
@@ -157,10 +157,10 @@ class JudgementReader:
         return rows.held[rows.find_index(candidate.row.key) - 1]
 
     def _estimate_after(self, row: HeldRow, filter: AbstractFilter, columns: FilterColumns) -> Estimate:
-        """Return what a filter estimated after a row, from its columns; before all events its initial estimate.
+        """Return a filter's estimate after a row; for the row before all events this is the initial estimate.
 
-        BEFORE: in place of a node, what stands before all events. `columns`: where mean and covariance begin among the
-        outputs.
+        row.key[1] is the number of a node, or BEFORE for the row before all events. `columns` says where the mean and
+        covariance begin among the row's outputs.
         """
         if row.key[1] == BEFORE:  # no estimate was computed there
             return filter.estimate(filter.init())
@@ -190,15 +190,15 @@ class JudgementReader:
                         del reasons[i]
 
     def _is_plausible_without(self, candidate: CandidateEvent) -> bool:
-        """Return whether the candidate's row is plausible without all that it has of the candidate's node."""
-        # A copy of the row in a slot of its own, with NaN for the node's numbers.
+        """Return whether the candidate's row is plausible without the numbers of the candidate's node."""
+        # Copy the row to a slot of its own, with NaN for the node's numbers.
         event, row = candidate.event, candidate.row
         pool, rows = self.fleet.pool, candidate.plant.rows
         trial = HeldRow(row.key, pool.take_slot(), self.fleet.width)
         trial.numbers = row.numbers.copy()
         columns = rows.columns_by_node[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
-        # Stepped from the row before, judged, and let go.
+        # Step from the previous row to the copy, read its judgement, and free its slot.
         self.fleet.step_row(self._find_row_before(candidate), trial)
         outputs = pool.table[trial.slot, pool.outputs]
         judgements = outputs[self._judgement_columns[event.node_index]]
@@ -235,7 +235,7 @@ class AngleWatch:
     """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):
-        """List the angles that the fleet's filters estimate and its nodes receive; nothing was said of them yet."""
+        """List the angles that the fleet's filters estimate and that its nodes receive."""
         self._pool = fleet.pool
         self._states = _watch_states(fleet)
         self._received = _watch_received(fleet)
@@ -261,7 +261,7 @@ class AngleWatch:
 
 
 def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
-    """Return for each filter with angles among its states what to watch: the variances of its states."""
+    """Return for each filter with angles among its states the columns of its states' variances, to be watched."""
     watched = list[WatchedAngles]()
     for columns in fleet.program.filter_columns:
         filter = find_filter_of_columns(fleet, columns)
@@ -269,7 +269,7 @@ def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
             continue
         angles = WideAngles(filter)
         if angles.states:
-            # Its covariance, (n, n), stands row by row: one entry of the diagonal is n + 1 columns from the next.
+            # The covariance (n, n) stands row by row, so that entries of the diagonal are n + 1 columns apart.
             n = len(filter.states)
             variance_columns = fleet.pool.outputs.start + columns.covariance + np.arange(n) * (n + 1)
             watched.append(WatchedAngles(f"{columns.node}/{columns.filter}", variance_columns, angles))
@@ -297,9 +297,9 @@ def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
 
 
 def _list_received(network: Network, node: str) -> dict[int, str]:
-    """Return {column among the measurements of all nodes: name of the output in it}, of a node or of all (`FUSED`).
+    """Return {column among the measurements of all nodes: name of its output} for a node, or for all if it is FUSED.
 
-    `network.rows`: by node, the columns of what it receives.
+    `network.rows` holds for each node the columns of what it receives.
     """
     if node != Network.FUSED:
         return dict(zip(network.rows[node], network.nodes[node].received_names, strict=True))
@@ -311,9 +311,9 @@ def _list_received(network: Network, node: str) -> dict[int, str]:
 
 
 def find_filter_of_columns(fleet: Fleet, columns: FilterColumns) -> AbstractFilter | None:
-    """Return the filter whose estimate stands in these columns of a row; None if they are those of a fusion rule.
+    """Return the filter whose estimate stands in these columns of a row, or None if it is a fusion rule.
 
-    Under the name FUSED a network has both: central filters, which get all that is received, and fusion rules.
+    The name FUSED stands for both: central filters, which get everything that is received, and fusion rules.
     """
     if columns.node == Network.FUSED:
         filter_or_rule = fleet.network.fused[columns.filter]

@@ -70,13 +70,13 @@ class LinkCounts:
     timeouts: int = 0
 
     def __post_init__(self) -> None:
-        """Take runs of equal readings, and what was refused (one number until version 0.4.0), as they were stored."""
+        """Convert stored fields: runs of equal readings, and refusals, which were one number until version 0.4.0."""
         self.repeats = Repeats.read(self.repeats)
         if isinstance(self.refused, int):
             self.refused = {"limits": self.refused} if self.refused else {}
 
     def count_screened(self, screened: ScreenedEvent, verdict: Verdict) -> None:
-        """Add the values of an event that count as not arrived; a copy, or one of a wrong time, adds none."""
+        """Count the values of an event that were refused; a copy, or an event of a wrong time, does not count."""
         if verdict in ("used", "implausible"):
             for reason, count in screened.refused.items():
                 self.count_refused(reason, count)
@@ -99,11 +99,11 @@ class LinkCounts:
         self.timeouts += time - (self.latest if self.used else begun) > timeout
 
     def count(self, verdict: Verdict, sequence: int, time: float, period: int = 0) -> None:
-        """Count one message. A late, implausible or future message was received too, so it fills a gap.
+        """Count one message; a late, implausible or future message was received too, so it fills a gap.
 
-        `period`: after how many messages the count begins at 0 again; 0 if it does not.
+        `period`: after how many messages the running count begins again at 0; 0 if it never does.
         """
-        # There is a count of the name of each verdict.
+        # Each verdict has a count of the same name.
         setattr(self, verdict, getattr(self, verdict) + 1)
         self._follow_sequence(verdict, sequence, time, period)
 
@@ -155,13 +155,12 @@ class LinkCounts:
             self.lost = max(self.lost - 1, 0)
 
     def _unwrap_count(self, sequence: int, time: float, period: int) -> int:
-        """Return a count that goes on where the node's own begins at 0 again after `period` messages.
+        """Return a running count that goes on although the node's own begins again at 0 after `period` messages.
 
-        It is the nearest one to `newest`, above it for a message measured later and below it for one before; where that
-        is more than GAP away the node was restarted, and its own count is returned.
-
-        `newest`: the greatest count so far, -1 before the first, of a message measured at time `at`. GAP: most messages
-        that may be lost in a row.
+        `newest` is the greatest count so far, -1 before the first message, and `at` the time of its measurement. The
+        result is the nearest count above `newest` for a later measurement, and below it for an earlier one. If that is
+        more than GAP away, the node was restarted, and its own count is returned. GAP is how many messages may be lost
+        in a row.
         """
         if not period or self.newest < 0:
             return sequence
@@ -171,12 +170,10 @@ class LinkCounts:
         return self.newest - behind if behind <= min(GAP, self.newest) else sequence
 
     def count_withdrawn(self, count: int, before: Moments | None) -> None:
-        """Count `count` used messages, whose clock was wrong, as ones from the future instead.
+        """Recount `count` used messages, whose clock was wrong, as messages from the future.
 
-        `before`: `at` and `latest` before the first of these; None where it was the node's first.
-
-        `at`: time of the measurement with the greatest running count; `latest`: time of the newest that was
-        used.
+        `at` is the time of the measurement with the greatest running count, and `latest` that of the newest one used.
+        `before` holds both as they were before these messages, None if they were the node's first.
         """
         self.at, self.latest = before or (0.0, -1.0)
         self.used, self.future = max(self.used - count, 0), self.future + count

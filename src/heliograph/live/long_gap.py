@@ -30,9 +30,10 @@ class FactorPlaces(NamedTuple):
 
 
 def find_factor_places(places: PyTree) -> list[FactorPlaces]:
-    """Return the places of all factors in a row, from the tree of a state whose leaves are their own places.
+    """Return the places in a row of all factors L and D of covariances.
 
-    LOWER, VARIANCES: how the paths of the factors L and D of a covariance end.
+    `places` is a state's tree whose leaves hold their own places in the row. The path of a factor L ends with LOWER,
+    and that of a factor D with VARIANCES.
     """
     places_by_path = {path: leaf.astype(int) for path, leaf in split_by_path(places).items()}
     stems = [path.removesuffix(VARIANCES) for path in places_by_path if path.endswith(VARIANCES)]
@@ -46,7 +47,7 @@ def find_factor_places(places: PyTree) -> list[FactorPlaces]:
 def convert_to_covariances(
     rows: Float[np.ndarray, "row state"], places: Sequence[FactorPlaces]
 ) -> Float[np.ndarray, "row state"]:
-    """Return rows with the entries of L D L' in the places of those of L below its diagonal, and of D."""
+    """Return rows in which entries of P = L D L' replace the factors: below the diagonal L's, and on it D's."""
     rows = rows.copy()
     for lower, variances in places:
         factor, diagonal = unit_lower(rows[:, lower]), rows[:, variances]  # L, and the diagonal of D
@@ -64,7 +65,7 @@ def convert_to_factors(
     for lower, variances in places:
         n = variances.shape[-1]
         covariance = np.zeros((len(rows), *variances.shape, n))
-        below = np.tril_indices(n, -1)  # entries (i, j) below the diagonal, of which (j, i) are equal
+        below = np.tril_indices(n, -1)  # entries (i, j) below the diagonal; (j, i) are equal
         covariance[..., *below] = covariance[..., *below[::-1]] = rows[:, lower]
         covariance[..., np.arange(n), np.arange(n)] = rows[:, variances]
         rows[:, lower], rows[:, variances] = factorise_covariance(covariance)
@@ -148,12 +149,10 @@ def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[Factor
 
 
 def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
-    """Return the state `count` steps after the last of those passed, which are a probe of steps apart.
+    """Return the state `count` steps after the last of the states `passed`, which are PROBED steps apart.
 
-    Numbers that moved over the last quarter of the probes as they did over the quarter before go on at this rate; all
-    others stay.
-
-    PROBED: steps of a probe; STEADY: relative difference between the two changes that counts as none.
+    A number that changed by as much in the last quarter of the states as in the quarter before goes on at this rate. All
+    other numbers stay. STEADY is the relative difference up to which two changes count as equal.
     """
     quarter = len(passed) // 4
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
@@ -177,13 +176,13 @@ def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count
 
 
 def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
-    """Return the mask of a state's numbers that changed by more than rounding; NaN that stays NaN did not.
+    """Return the mask of a state's numbers that changed by more than rounding.
 
-    SETTLED: relative change that is rounding.
+    A relative change up to SETTLED counts as rounding. NaN that stays NaN did not change.
     """
     with np.errstate(invalid="ignore"):
         is_rounding = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
-    is_equal, stays_nan = before == after, np.isnan(before) & np.isnan(after)  # equal: two infinite ones too
+    is_equal, stays_nan = before == after, np.isnan(before) & np.isnan(after)  # is_equal also covers two infinities
     moving: np.ndarray = ~(is_rounding | is_equal | stays_nan)
     return moving
 
@@ -248,8 +247,8 @@ def _measure_affine_map(
 def _iterate_affine_map(A: Float[np.ndarray, "m m"], c: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " m"]:
     """Return d after `count` steps d' = A d + c from d = 0, by squaring the map.
 
-    Before turn i of the loop (A, c) is the map of 2^i steps, as two of d' = A d + c are A (A d + c) + c =
-    A^2 d + (A c + c). It is applied where bit i of `count` is 1.
+    Before turn i of the loop, (A, c) is the map of 2^i steps, which is applied if bit i of `count` is 1. Twice the map
+    d' = A d + c is A (A d + c) + c = A^2 d + (A c + c).
     """
     d = np.zeros_like(c)
     while count:

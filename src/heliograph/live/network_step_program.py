@@ -57,7 +57,7 @@ class NetworkProgram:
         self.network, self.claims, self.dt = network, network.claims(), find_time_input(network)
         if not any(self.claims.values()):
             raise fail("network", "at least one filter to run", "none")
-        # In words how a prediction over a time differs from that over its parts; "" if it does not.
+        # Words on how one prediction over a time differs from several over its parts; "" if it does not.
         self.uneven = "" if self.dt is None else explain_uneven_prediction(first(network.plant), self.dt)
         # Sizes of a row: measurements of all nodes, and inputs other than dt.
         self.received = sum(node.received for node in network.nodes.values())

@@ -109,12 +109,12 @@ class PlantState:
     def undo_contradicted_leap(
         self, clock: str, time: float, longest_gap: float, agreed: bool, names: Sequence[str]
     ) -> None:
-        """Take back a leap that is contradicted by what a clock says.
+        """Undo a leap in time that a clock contradicts, or note its first message against its own leap.
 
         Args:
-            clock: name of the node that says so, or `ARRIVAL`.
-            time: what it says.
-            longest_gap: longest gap in time that is no leap.
+            clock: name of the clock's node, or `ARRIVAL`.
+            time: the time that the clock says.
+            longest_gap: the longest gap in time that is no leap.
             agreed: whether another clock says the same.
             names: names of the nodes in their order, then that of the inputs.
         """
@@ -124,7 +124,7 @@ class PlantState:
         leap, newest = found
         if agreed or leap.is_taken_back_by(clock, time, newest):
             self.undo_leap(leap, longest_gap, names)
-        # A first message of its own clock that goes on from before it: the next may take it back.
+        # The leap's own clock goes on from before it for the first time: its next message may undo the leap.
         elif clock == leap.clock:
             self.leap = self.leap.with_back(leap, time)
 
@@ -155,17 +155,17 @@ class PlantState:
         self.now, self.leap = max(newest, now), leap
 
     def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
-        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed.
+        """Return the leap after an event on its far side at `time` by `clock`, or None if it is confirmed.
 
-        By another clock it is confirmed at once, by its own if the plant has gone on for as long as it leapt
-        (`is_over`). INPUTS: no clock of its own; ARRIVAL: the clock by which arrivals are dated.
+        Another clock confirms it at once. Its own clock confirms it when the plant has gone on for as long as it leapt
+        (`is_over`). INPUTS have no clock of their own, and ARRIVAL is the clock of arrivals.
         """
         if clock != leap.clock:
             return None
         if leap.is_over(self.now):
             return leap.earlier
         others = (link.latest for node, link in self.links.items() if node not in (clock, INPUTS))
-        # A second message by the same clock: believed, unless another node was heard shortly before, which can confirm.
+        # A second message by the same clock is believed, unless a node that was heard shortly before can confirm it.
         if clock != ARRIVAL and any(latest >= max(leap.now - longest_gap, 0.0) for latest in others):
             return leap
         return leap.as_believed()
@@ -202,13 +202,13 @@ class PlantState:
         return True
 
     def _count_withdrawn(self, rows: Sequence[HeldRow], leap: ClockLeap, names: Sequence[str]) -> None:
-        """Count the events of rows that a leap made as withdrawn, by node; `names`: those of nodes, then inputs."""
+        """Count the events of a leap's rows as withdrawn, by node; `names` are those of the nodes, then of the inputs."""
         counts: dict[str, int] = {}
         for row in rows:
             for node, _running_count, _time in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
-            # `moments`: times of the node's counts before the leap.
+            # `leap.moments` holds the times in the node's counts before the leap.
             self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
     def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
@@ -216,9 +216,9 @@ class PlantState:
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
     def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
-        """Return the events of leaps that were taken back since the last call, and the slots of their rows.
+        """Return the events of leaps that were undone since the last call, and the slots of their rows.
 
-        Withdrawn events are those that a wrong clock had made, known by a later message.
+        Such events are withdrawn: a later message showed that their clock was wrong.
         """
         leaps, self.aside = self.aside, []
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
@@ -254,14 +254,14 @@ class PlantState:
     def _write_lost(self, index: int, row: HeldRow, event: CheckedEvent, node: str, column: int) -> None:
         """Write how many messages were lost before an event, by the running count, unless the message says it itself.
 
-        That of the node's next event is written anew too, where there is one already.
+        If the node's next event is there already, its number is corrected too.
 
         Args:
             index: index of the event's row.
-            row: this row.
+            row: the event's row.
             event: the event.
-            node: name of its node.
-            column: column of the number in a row.
+            node: name of the event's node.
+            column: column of the number of lost messages in a row.
         """
         if row.numbers[column] == row.numbers[column]:  # not NaN: the message says it
             return
@@ -274,13 +274,11 @@ class PlantState:
     def undo_changes(self) -> list[int]:
         """Undo the changes since the last finalisation; return the slots that are free again.
 
-        Rows that had been stepped since become dirty.
-
-        `aside`: what each leap that was taken back had removed; `kept`: the row from before a leap; `dirty`: index of
-        the first row to step again; base: the first held row, which is final.
+        `aside` holds for each undone leap the rows that were removed with it. `kept` is the row from before a leap.
+        `dirty` is the index of the first row to step again. The base, the first held row, is final.
         """
         slots, keys = list[int](), [row.key for row, _ in self.changes]
-        # Newest first: what changed after each leap that was taken back, then this itself.
+        # The newest comes first: undo the changes after each undone leap, and then restore the leap's rows.
         for leap in reversed(self.aside):
             slots += self._undo_since(leap.changes)
             self.rows.replace_rows(leap.held)
@@ -295,7 +293,7 @@ class PlantState:
     def _undo_since(self, count: int) -> list[int]:
         """Undo the changes after the first `count`, newest first; return the slots that are free again.
 
-        A change: a row, and its numbers and events before, None if there was no such row.
+        A change is a pair of a row, and its numbers and events before; these are None if the row was new.
         """
         slots = []
         for row, before in reversed(self.changes[count:]):
@@ -315,9 +313,10 @@ class PlantState:
         return link
 
     def take_dirty_rows(self) -> list[HeldRow]:
-        """Return the rows to step again, behind the row from which they start, and call them up to date; [] if none.
+        """Return the row before the first one to step again, and all rows after it; [] if all are up to date.
 
-        `dirty`: index of the first held row to step again, None if all are up to date. The base, index 0, never is.
+        `dirty` is the index of the first held row to step again, None if there is none; it becomes None. It is never 0,
+        the base.
         """
         chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
         self.dirty = None
@@ -326,10 +325,8 @@ class PlantState:
     def finalise_rows(self, watermark: float, longest_gap: float) -> tuple[list[HeldRow], list[int]]:
         """Make rows before the watermark final; return them and the slots that are no longer needed.
 
-        `longest_gap`: longest gap that is no leap; of the rows before a leap the newest is kept.
-
-        Watermark: time up to which rows become final. Base: the newest final row, from which the others are
-        stepped. `forced`: rows that became final early, for lack of room.
+        `longest_gap` is the longest gap that is no leap; the newest row before a leap is kept. The base is the newest
+        final row, from which later rows are stepped. `forced` counts rows that became final early, for lack of room.
         """
         self.changes = []
         base, forced = self.rows.find_base(watermark)
@@ -362,8 +359,8 @@ class PlantState:
     def slots(self) -> list[int]:
         """Return all slots of the plant.
 
-        A slot is the number of a row in the table. `kept`: the row from before a leap; `gone`: rows removed as
-        a leap was taken back.
+        A slot is the number of a row in the table. `kept` is the row from before a leap, None if there is none. `gone`
+        are rows that were removed when a leap was undone.
         """
         kept = [] if self.kept is None else [self.kept.row]
         gone = [row for leap in self.aside for row in leap.gone]

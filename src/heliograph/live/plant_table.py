@@ -25,10 +25,13 @@ class SlotTable:
     """
 
     def __init__(self, program: NetworkProgram, alone: bool = False):
-        """Make a table with FEWEST free slots for rows of a network's program; `alone`: single rows are stepped."""
+        """Make a table with FEWEST free slots for rows of a network's program.
+
+        `alone`: rows are stepped one by one, not those of many plants at once. These slices of a row's columns follow
+        one another: `state` (of the filters), `outputs`, `held` (inputs that hold after the row), `at` (step number),
+        and `numbers` (what came: measurements, inputs, and time as the last).
+        """
         self.program, self.step_rows, self._alone = program, program.step_rows, alone
-        # A row has, one after another: the filters' states, their outputs, the inputs that hold after it, its step
-        # number, and the numbers that came (measurements, inputs, time).
         sizes = self.step_rows.state.size, self.step_rows.outputs.size
         ends = np.cumsum([*sizes, program.given, 1, program.received + program.given + 1])
         self.state, self.outputs, self.held, self.at, self.numbers = (
@@ -48,7 +51,7 @@ class SlotTable:
         return len(self.table) - len(self._free)
 
     def take_slot(self) -> int:
-        """Take a free slot."""
+        """Return a free slot (row number of the table), which is then taken."""
         if not self._free:
             # Double the table; the new slots are free, and the lowest is taken first.
             count = len(self.table)
@@ -63,7 +66,8 @@ class SlotTable:
     def write_prior(self, slot: int, time: float) -> None:
         """Fill a slot with the prior, at `time`, before any measurement.
 
-        A row has the filters' state, its step number (`at`), the `numbers` that came, NaN for none, and last its time.
+        `at` is the column of the step number. `numbers` are the columns of what came, NaN for nothing; the last of
+        them, and of the row, is its time.
         """
         row = self.table[slot]
         row[:] = 0.0
@@ -72,7 +76,7 @@ class SlotTable:
         row[-1] = time
 
     def predict_outputs(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
-        """Predict from the rows in the slots `before`, with inputs and no measurement; return outputs (row, outputs).
+        """Return the outputs (row, outputs) that are predicted from the rows in the slots `before`, without measurements.
 
         The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
         number is at most `last`, the last step for which the network is defined.
@@ -110,21 +114,21 @@ class SlotTable:
         table[after, self.held], table[after, self.at.start] = now_held, k
 
     def _step_parts(self, *parts: np.ndarray) -> np.ndarray:
-        """Return (row, state and outputs) after a step of rows (state, received, inputs, step number), given in parts.
+        """Step rows, and return their new states and outputs in one array (row, state + outputs).
 
-        The result for a single row is overwritten by the next call.
-
-        `_alone`: single rows are stepped, not those of many plants at once; `is_native`: by native code.
+        `parts` are the arrays (row, ...) of the rows' states, measurements, inputs and step numbers. A single row may
+        be stepped by code of its own: then the next call overwrites the result.
         """
         if len(parts[0]) == 1 and (self._alone or self.step_rows.is_native):
             return self._step_single_row(*parts)
         return self.step_rows(np.concatenate(parts, axis=1))
 
     def inputs_between(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
-        """Return the inputs that led from the row in one slot to that in another, and the number of the step there.
+        """Return the inputs that led from the row in slot `before` to that in `after`, and the step number of `after`.
 
-        In continuous time the inputs that held after `before` lead on, with dt the time between both rows; else
-        those that `after` holds.
+        If time counts steps, they are the inputs in the columns `held` of `after`. In continuous time they are those of
+        `before`, since inputs hold from their row on, with dt inserted, the time between both rows. `at` is the column
+        of the step number, and the last of the columns `numbers` holds the time.
         """
         dt, table = self.program.dt, self.table
         step_number = int(table[after, self.at.start])
@@ -142,7 +146,7 @@ class SlotTable:
         nothing = np.full(self.program.received, np.nan)
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
-            """Return states (row, state) after step number k without measurements, under the inputs that hold."""
+            """Return the states (row, state) after step number k, without measurements and with the inputs `held`."""
             same_for_all = np.concatenate([nothing, held, [k]])
             rows = np.broadcast_to(same_for_all, (len(states), len(same_for_all)))
             return self._step_parts(states, rows)[:, : self.step_rows.state.size].copy()
@@ -155,11 +159,10 @@ class SlotTable:
         self.table[slot, self.state], self.table[slot, self.at.start] = state_after, to
 
     def gather_history(self, slots: Sequence[int]) -> PyTree:
-        """Return the rows in these slots, in order, as a smoother takes them.
+        """Return the rows in these slots (row numbers of the table), in order, as a smoother takes them.
 
-        Copies of the last row behind them make their number a power of two, so that few lengths are compiled.
-
-        SHORTEST: the least number. A slot is the number of a row in the table.
+        Copies of the last row are appended until the number is a power of two and at least SHORTEST. The smoother is
+        then compiled for few lengths only.
         """
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())  # the next power of two
         rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]
@@ -206,7 +209,7 @@ def cut_chain_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> 
 
 
 def group_by_turn(walks: Iterable[list[Single]]) -> list[list[Single]]:
-    """Return the first steps of all walks, then all second ones, and so on: each group has one of each at most."""
+    """Return groups: the first steps of all walks, then the second steps of those that have one, and so on."""
     turns: list[list[Single]] = []
     for steps in walks:
         for turn, step in enumerate(steps):

@@ -47,10 +47,10 @@ class SenderStatus(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Return why the sender is dead, in words; "" if it is not.
+        """Return in words why the sender is dead, or "" if it is not.
 
-        `chance`: probability that as many messages as the `missed` heartbeats are all lost; DEAD: below it they
-        are not.
+        `missed` heartbeats did not come, and `chance` is the probability that as many messages are all lost. If it is
+        below DEAD, the sender is dead. It is also dead if it is silent for longer than `timeout` (None: no limit).
         """
         if self.missed > 0 and self.chance < DEAD:
             chance = f"by chance once in {1 / self.chance:,.0f}" if self.chance else "never by chance"
@@ -70,7 +70,7 @@ class LossChain(NamedTuple):
 
     @staticmethod
     def of_channel(channel: Channel) -> "LossChain":
-        """Return the losses of a link: in each mode the probability of the outcomes of which nothing arrives."""
+        """Return the losses of a link: for each mode of the channel the probability that nothing arrives."""
         modes = joint_modes(first(channel))
         loss_probabilities = [
             sum(float(outcome.probability) for outcome in mode.list_outcomes() if not outcome.arrived.any())
@@ -81,7 +81,8 @@ class LossChain(NamedTuple):
     def probability_all_lost(self, apart: int, count: int) -> float:
         """Return the probability that `count` transmissions, `apart` steps from one to the next, are all lost.
 
-        p diag(l) (T^apart diag(l))^(count - 1) 1, with initial law p, loss probabilities l and transition T.
+        It is p diag(l) (T^apart diag(l))^(count - 1) 1 with the initial probabilities p of the channel's modes, the
+        loss probability l of each mode, and the modes' transition matrix T.
         """
         if not count:
             return 1.0
@@ -106,18 +107,17 @@ class SilenceRule(NamedTuple):
 
     @staticmethod
     def of_node(node: Node) -> "SilenceRule | None":
-        """Return the sender of a node; None of one that may be silent for any time."""
+        """Return the rule for the silence of a node's sender, or None if it may be silent for any time."""
         if node.trigger is None:
             return None if node.timeout is None else SilenceRule(trigger=None, losses=None, timeout=node.timeout)
         return SilenceRule(node.trigger, losses=LossChain.of_channel(node.channel), timeout=node.timeout)
 
     def find_status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
-        """Return the status where the newest value is of `last`, the newest final moment `final` and the present `now`.
+        """Return the sender's status, from the times of its newest value (`last`), of the newest final row, and of now.
 
-        Before the first value the sender is silent since `begun`. All are steps where a trigger is, which begin at -1.
-
-        `provisional`: silence since the newest final moment, which a late value may still end; `silent`: that
-        before it.
+        Before its first value (`last` is None) the sender is silent since `begun`. If it has a trigger, all times are
+        steps. `silent` is its silence up to `final`. `provisional` is its silence since then, which a late value may
+        still end.
         """
         silence_begin = begun if last is None else last
         silent, provisional = max(final - silence_begin, 0), max(now - max(final, silence_begin), 0)
@@ -131,13 +131,13 @@ class SilenceRule(NamedTuple):
 
 
 def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
-    """Return how many transmissions, at least, were due in the `silent` final steps up to step `final`.
+    """Return how many transmissions were at least due in the `silent` steps up to step `final`.
 
-    The first value (`last` is None) is due at once. A heartbeat is due `heartbeat` steps after the last transmission;
-    one on an event that was lost too only delays the next, so that at least one falls into each `heartbeat` steps.
+    The first value (`last` is None) is due at once. A heartbeat is due `heartbeat` steps after the last transmission.
+    A lost transmission on an event only delays the next heartbeat, so that each `heartbeat` steps have at least one.
     """
     if isinstance(trigger, Periodic):
-        # Due in the steps phase, phase + period, ...: those up to `final` less those up to the silence's begin.
+        # They are due in the steps phase, phase + period, ...; count those up to `final`, less those before the silence.
         period, phase = int(trigger.period), int(trigger.phase)
         return (final - phase) // period - (final - silent - phase) // period
     first_due = int(last is None and silent > 0 and trigger.needs_reference)
@@ -153,9 +153,9 @@ def find_silence_rules(network: Network) -> dict[str, SilenceRule]:
 
 
 def count_values_before_losses(network: Network, deciding: Mapping[str, AbstractTrigger]) -> dict[int, int]:
-    """Return {index of a node whose losses are known, since its messages are numbered: how many values come first}.
+    """Return {index of a node whose losses are known: how many of its numbers are values, before those on losses}.
 
-    `deciding`: the triggers of senders that decide when to send, by node.
+    Losses are known if messages are numbered. `deciding` holds by node the triggers of senders that decide when to send.
     """
     return {
         network.names.index(name): node.received - trigger.side_information(len(node.outputs))

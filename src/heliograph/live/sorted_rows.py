@@ -27,7 +27,10 @@ class HeldRow:
     __slots__ = "events", "key", "numbers", "slot"
 
     def __init__(self, key: Key, slot: int, size: int):
-        """Make a row without events, of the key (time, place of the node, count): `size` numbers NaN, and its time."""
+        """Make a row without events, with the key (time, index of the node, count).
+
+        Its numbers are `size` NaN and then its time.
+        """
         self.key, self.slot = key, slot
         self.numbers = [nan] * size
         self.numbers.append(key[0])
@@ -102,7 +105,7 @@ class SortedRows:
         """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
-        # Keys are sorted as the rows are, by time first.
+        # Keys have the order of the rows, which is by time first.
         index = bisect_left(self.keys, key)
         exists = self.keys[index] == key
         return index, self.held[index] if exists else None
@@ -116,10 +119,10 @@ class SortedRows:
         del self.keys[index], self.held[index]
 
     def write_event(self, row: HeldRow, event: CheckedEvent) -> None:
-        """Write an event's values into the columns of its node in a row; a NaN leaves the number that is there."""
+        """Write an event's values into its node's columns of a row; NaN keeps the number that is there."""
         columns, values = self.columns_by_node[event.node_index], event.values
-        if row.events:  # of a row without events all numbers are NaN
-            # Only NaN is not equal to itself (np.isnan of a single number takes far longer).
+        if row.events:  # in a row without events all numbers are NaN
+            # Only NaN is not equal to itself; np.isnan of a single number takes far longer.
             present = row.numbers[columns]
             values = [old if new != new else new for old, new in zip(present, values, strict=True)]
         row.numbers[columns] = values
@@ -156,7 +159,7 @@ class SortedRows:
         return number, [(row_after, float(count_after - count - 1) if count < count_after else nan)]
 
     def _find_event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
-        """Return the first of these rows with an event of a node, and the event's running count; None if none has.
+        """Return the first of these rows with an event of `node`, and the event's running count, or None.
 
         An event's name is (node, running count, time measured).
         """
@@ -169,17 +172,17 @@ class SortedRows:
     def find_base(self, watermark: float) -> tuple[int, int]:
         """Return the index of the row that becomes the base, and how many rows become final early, for lack of room.
 
-        Base: the newest row that is final, from which later ones are stepped. Watermark: time before which rows
-        become final; `capacity`: how many rows may be held after the base.
+        The base is the newest final row, from which later rows are stepped. Rows before the watermark become final. At
+        most `capacity` rows may be held after the base.
         """
         by_time = self._find_last_before(watermark)
         base = max(by_time, len(self.held) - 1 - self.capacity)
         return base, base - by_time
 
     def move_base(self, base: int) -> tuple[list[HeldRow], list[HeldRow]]:
-        """Make the row with index `base` the base; return the rows that are final now, and those held no longer.
+        """Make the row with index `base` the base; return the rows that became final, and those that are dropped.
 
-        The base itself is held on, as the first row.
+        The base itself stays, as the first row.
         """
         final_rows, dropped_rows = self.held[1 : base + 1], self.held[:base]
         del self.held[:base], self.keys[:base]

@@ -96,9 +96,9 @@ class Stream:
 
     @property
     def doubt(self) -> str:
-        """Return a sentence where the last BEYOND measurements, or more, were all unexpected; else "".
+        """Return a sentence if the last BEYOND (10) measurements or more were all unexpected, else "".
 
-        BEYOND: 10 in a row, each of a size that a right filter sees with probability RARE.
+        An unexpected measurement is so far off that a right filter sees it with probability RARE.
         """
         if self._beyond < BEYOND:
             return ""
@@ -152,10 +152,10 @@ class Stream:
         return self._make_estimate(nis, int(arrived))
 
     def _convert_sample(self, measurement: ArrayLike, inputs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return a measurement (received,) and inputs (inputs,) as doubles; raise ValueError unless they are such.
+        """Return a measurement (received,) and inputs (inputs,) as doubles, or raise ValueError.
 
-        Arrays of doubles of the right size pass at once; everything else is checked and converted, and a measurement
-        also where there are limits.
+        Arrays of doubles of the right size pass at once. Everything else is checked and converted. A measurement is
+        also checked if there are limits.
         """
         z, u = _as_doubles(measurement, self._compiled.received), _as_doubles(inputs, self._compiled.given)
         if z is None or self.limits is not None:
@@ -167,16 +167,15 @@ class Stream:
     def _make_estimate(self, nis: float, arrived: int) -> JudgedEstimate:
         """Return the estimate after the step just done, and count the components that the filter weighed by 0.
 
-        `nis`: of the step's measurement, NaN where it has none; `arrived`: how many of its numbers arrived.
-
-        `weight`: of each component, 0 where the filter's gate left it out as too far off.
+        `nis` is the measurement's normalised innovation squared, NaN if it has none. `arrived` is how many of its
+        numbers arrived. `weight` has an entry for each component, 0 if the filter's gate left it out as too far off.
         """
         estimate: JudgedEstimate = self._compiled.estimate.unflatten([*self._stepper.estimate, nis, arrived])
-        weight = self._stepper.weight  # of no components if the filter does not weigh them
+        weight = self._stepper.weight  # empty if the filter does not weigh components
         if len(weight):
             estimate = replace(estimate, weight=weight)
             self.refused["gate"] += weight == 0
-        # What limits refuse depends on the state: no claim stronger than "nominal" holds.
+        # What limits refuse depends on the state, so that no claim stronger than "nominal" holds.
         if self.limits is not None and self.limits.bounded:
             estimate = replace(estimate, claim=weakest([estimate.claim, "nominal"]))
         return lower_unsound_claim(estimate) if math.isnan(nis) else estimate
@@ -185,7 +184,7 @@ class Stream:
     def origin(self) -> Origin:
         """Return the state after the last step, from which `hg.forecast` predicts.
 
-        `spacing`: time from one step to the next, NaN where it is an input (dt). Time counts steps from 0.
+        `spacing` is the time between steps, NaN if it is an input (dt). Time counts steps from 0.
         """
         state = self._compiled.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
         time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
@@ -218,9 +217,9 @@ class Stream:
         return [f"step {self.steps - 1}: {words}" for words in said]
 
     def _describe_remark(self) -> list[str]:
-        """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none.
+        """Return a line with the filter's remark on its state if it is new, such as that a gate gave in; else [].
 
-        `remark.times`: how often the filter has had this to say so far; `_remarked`: how often when last asked.
+        `remark.times` says how often the filter has made this remark so far, and `_remarked` how often at the last call.
         """
         remark = self.filter.remark(self._compiled.state.unflatten(self._stepper.state))
         is_new = remark.times > self._remarked
@@ -268,7 +267,7 @@ class Stream:
         stepper.accept()
 
     def _name_faulty_function(self, u: np.ndarray) -> str:
-        """Return, after "; ", the function of the filter's model that gives no number for inputs u; "" if none does."""
+        """Return "; " and the function of the filter's model that gives NaN or infinity for inputs u, or "" if none does."""
         before = self.filter.estimate(self._compiled.state.unflatten(self._stepper.state))
         fault = describe_non_finite_function(self.filter, before, u, self.steps)
         return f"; {fault}" if fault else ""
@@ -276,10 +275,10 @@ class Stream:
     def sender(self) -> SenderStatus:
         """Return the status of a sender that decides when to send: what its silence means by now.
 
-        `_last`: step of the newest measurement that arrived, negative before the first.
+        `_last` is the step of the newest measurement that arrived, negative before the first.
 
         Raises:
-            ValueError: a filter that is none of `event_filter`.
+            ValueError: the filter was not made by `event_filter`.
         """
         sender = find_deciding_sender(self.filter)
         if sender is None:
@@ -340,10 +339,10 @@ class Stream:
     def _restore_counts(self, head: dict[str, Any]) -> None:
         """Set the step number, the newest inputs and all counts to those in the head of a snapshot.
 
-        Earlier versions did not write all of them: what is missing begins anew.
+        Earlier versions did not write all of them. What is missing begins anew.
         """
         self.steps = int(head["steps"])
-        # Until version 0.4.0 limits and codes together.
+        # Versions up to 0.4.0 counted refusals by limits and by codes together.
         counted = head.get("refused") or {"limits": head["dropped"]}
         self.refused |= {reason: np.array(counts, dtype=np.int64) for reason, counts in counted.items()}
         self._repeats = Repeats(*map(tuple, head.get("repeats", ())))
@@ -377,7 +376,7 @@ def _read_state(
         filter_name: the filter's class, for errors.
 
     Raises:
-        ValueError: parts that cannot be read as those of this layout.
+        ValueError: the parts cannot be read as those of this layout.
     """
     # A version before 0.3.0 wrote no paths: its parts are those of its layout.
     paths = head.get("paths", list(describe_old_layout(layout)))
@@ -390,7 +389,7 @@ def _read_state(
 
 
 def _as_doubles(value: object, length: int) -> np.ndarray | None:
-    """Return an array or list as `length` doubles; None for anything else, which needs a slower check."""
+    """Return an array or list of `length` doubles as an array, or None for anything else, which is checked slowly."""
     if type(value) is not np.ndarray and (type(value) is not list or any(part is np.ma.masked for part in value)):
         return None
     try:

@@ -65,7 +65,7 @@ class RepeatWatch:
 
     @staticmethod
     def for_node(node: object) -> "RepeatWatch | None":
-        """Return the watch for what a node receives; None if it refuses what is stuck, or its sender decides."""
+        """Return the watch for a node's readings; None if it refuses stuck values, or if its sender decides when to send."""
         if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
             return None
         refuses = node.limits is not None and node.limits.stuck is not None
@@ -107,9 +107,9 @@ class RepeatWatch:
         )
 
     def describe_stuck_output(self, output: int, name: str, repeats: Repeats) -> str:
-        """Return a sentence: which output is stuck, how rare that is, and the option that refuses it.
+        """Return a sentence that says which output is stuck, how rare that is, and which option refuses it.
 
-        `output`: its index; `name`: what it is called; `repeats`: the runs so far.
+        `output` is the output's index, `name` its name, and `repeats` the runs of equal readings so far.
         """
         length, value = repeats.lengths[output], repeats.newest[output]
         count = self._find_least_count_too_long(
@@ -121,10 +121,10 @@ class RepeatWatch:
         )
 
     def _bound_repeat_probability(self, output: int, step: float) -> float:
-        """Return the largest probability, over the noises, that an output of resolution `step` repeats its reading.
+        """Return a bound of the probability that an output of resolution `step` repeats its reading.
 
-        `noises`: the laws that it may have; `_bounds`: results so far, KEPT_BOUNDS at most, by output and
-        resolution.
+        It is the largest probability over `noises`, the distributions that the noise may have. `_bounds` keeps about
+        KEPT_BOUNDS results, by output and resolution.
         """
         key = output, step
         if key not in self._bounds:
@@ -138,17 +138,17 @@ class RepeatWatch:
         return self._bounds[key]
 
     def _find_least_count_too_long(self, output: int, length: int, step: float, readings: int, equal: int) -> float:
-        """Return the least count of equal readings in a row that is too long for an output; infinite if none is.
+        """Return the least count of equal readings in a row that is too long for an output; infinite if there is none.
 
         Args:
             output: index of the output.
-            length: of the present run.
+            length: length of the present run of equal readings.
             step: least difference of two successive readings so far.
-            readings: how many there were, with the run.
-            equal: how many of these were equal to the one before, with the run.
+            readings: how many readings there were, including the run.
+            equal: how many readings were equal to the previous one, including the run.
         """
-        # (e + 1) / (o + 2) of the pairs outside the run: e = equal - (length - 1), o = readings - length.
+        # Outside the run, e = equal - (length - 1) of o = readings - length pairs are equal. Estimate (e + 1) / (o + 2).
         by_count = (equal - (length - 1) + 1) / (readings - length + 2)
         p = max(self._bound_repeat_probability(output, step), by_count)
-        # The least count c of which p^(c - 1) is below SELDOM, but LEAST at least; none if p is 1 within SURE.
+        # The least count c with p^(c - 1) < SELDOM, but at least LEAST. There is none if p is 1 up to SURE.
         return inf if p >= 1 - SURE else max(LEAST, 1 + ceil(log(SELDOM) / log(p)))

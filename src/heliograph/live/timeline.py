@@ -128,7 +128,7 @@ class Timeline:
 
     @property
     def counts(self) -> dict[str, dict[Verdict, int]]:
-        """Return the number of each verdict by node, and under "inputs"."""
+        """Return for each node, and for "inputs", how many events had each verdict."""
         links = self._plant.links
         return {
             name: {verdict: getattr(links.get(name, LinkCounts()), verdict) for verdict in VERDICTS}
@@ -137,7 +137,7 @@ class Timeline:
 
     @property
     def refused(self) -> dict[str, dict[Reason, int]]:
-        """Return by node how many single values it refused, by reason: "limits", "code", "stuck"."""
+        """Return for each node how many single values it refused for each reason: "limits", "code" or "stuck"."""
         links = self._plant.links
         refused = {name: links.get(name, LinkCounts()).refused for name in self.network.names}
         return {name: {reason: counts.get(reason, 0) for reason in SCREENED} for name, counts in refused.items()}
@@ -200,7 +200,7 @@ class Timeline:
         return verdict
 
     def _explain_implausible(self, event: CheckedEvent, row: HeldRow) -> str | None:
-        """Step what an event changed; return why it is implausible, None if it is not.
+        """Step the rows that an event changed; return why the event is implausible, or None if it is not.
 
         Inputs are also judged over one unit of time after them.
         """
@@ -230,7 +230,7 @@ class Timeline:
         return make_forecast_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
-        """Return the slot (table row) of the state at `now`, predicted where nothing came then, and its time."""
+        """Return the slot (table row) of the state at `now` and its time; the state is predicted if nothing came then."""
         newest, by_steps = self._plant.rows.held[-1], self._program.dt is None
         newest_time, newest_node, _ = newest.key  # the node is BEFORE in the row before all events
         now = np.floor(min(self.now, self._fleet.end_step)) if by_steps else self.now
@@ -240,10 +240,10 @@ class Timeline:
         return self._spare, float(now)
 
     def senders(self) -> dict[str, SenderStatus]:
-        """Return what silence means by now, of each node with a sender that decides when to send, or with a timeout.
+        """Return by node what silence means by now, for senders that decide when to send or have a timeout.
 
         Raises:
-            ValueError: no such node.
+            ValueError: there is no such node.
         """
         if not self._fleet.watched:
             raise fail("senders", "a node with a trigger or a timeout", list(self.network.names))
@@ -292,7 +292,7 @@ class Timeline:
         return describe_network(self._fleet)
 
     def _pack_state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
-        """Return the whole state: options, the plant, and what is final."""
+        """Return the whole state as a head and arrays: options, the plant, and the final rows."""
         time, outputs = self._finals.take_all()
         self._finals.add(time, outputs)
         plant = np.frombuffer(pack_plant(self._plant, self._fleet), np.uint8)
@@ -358,7 +358,7 @@ class Timeline:
 
     @classmethod
     def _resume_from(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
-        """Return a timeline of the network that goes on from a saved state: head and arrays of its snapshot."""
+        """Return a timeline of the network that goes on from a saved state, given as a snapshot's head and arrays."""
         window, ahead, capacity = head["options"]
         with warnings.catch_warnings():  # the warning was given when the timeline was made
             warnings.simplefilter("ignore")
@@ -373,7 +373,7 @@ class Timeline:
     def _convert_event(
         self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None
     ) -> CheckedEvent:
-        """Return a pushed event as checked numbers; without an arrival it arrives when measured, or now if later."""
+        """Return a pushed event as checked numbers; by default it arrives when measured, or now if that is later."""
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
@@ -386,7 +386,7 @@ class Timeline:
         return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), moment, numbers, arrived)
 
     def _finalise(self) -> None:
-        """Make rows that are older than the window final, and read the outputs of those that have data."""
+        """Make rows that are older than the window final, and keep the outputs of those that have data."""
         results = self._fleet.finalise_plants([self._plant])
         with_data = [row for row in results[0].final if row.has_data()]
         if with_data:

@@ -61,11 +61,11 @@ class Arrivals:
 
     @cached_property
     def rate(self) -> SendingRate | None:
-        """Return the rate of a sender whose clock is not that of the rows; None where a pattern of rows does as well.
+        """Return the rate of a sender whose clock is not that of the rows, or None if there is no need of a rate.
 
-        A pattern is due in the same few of each so many rows; `arrived`: whether a message came in each row. None too
-        where the sender's period is declared, and where rows are there because messages are. Of rate and pattern the
-        one that says that fewer messages were due explains more.
+        There is none if the sender's period is declared, if rows are there because of messages, or if a pattern of rows
+        explains the arrivals as well. In a pattern, messages are due in the same few of each so many rows. The rate or
+        pattern that makes fewer messages due explains more. `arrived` says for each row whether a message came.
         """
         if self.declared_period is not None or self.of_messages:
             return None
@@ -73,8 +73,8 @@ class Arrivals:
         pattern = None if rate is None else find_pattern(self.arrived)
         if rate is None or pattern is None:
             return rate
-        # In N rows N / period messages are due by the rate: the pattern's D due rows are more than one more than that
-        # where D > N / period + 1, or period * D > N + period.
+        # By the rate, N / period messages are due in N rows. The pattern's number D of due rows is worse if it is more
+        # than one above this: D > N / period + 1, or period * D > N + period.
         is_pattern_worse = rate.period * pattern.rows.sum() > len(self.arrived) + rate.period
         return rate if is_pattern_worse else None
 
@@ -138,7 +138,7 @@ class Arrivals:
 
     @property
     def due_in(self) -> str:
-        """Return in words the rows or times in which it is due: each slot (a row, or a period), or a pattern's."""
+        """Return in words the rows or times in which a message is due: each slot (a row or a period), or a pattern."""
         if self.slots is None:
             return "not known"
         some = None if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
@@ -182,10 +182,10 @@ class Arrivals:
         return np.nan if self.due is None else min(float(self.arrived.sum()) / self.due, 1.0)
 
     def contradicts(self, level: float) -> bool:
-        """Return whether, tested at a level, the share that arrived is not the stated one, by more than a hundredth.
+        """Return whether the share that arrived contradicts the stated share p, by a test at `level`.
 
-        Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a) with the correlation a
-        of each with the next.
+        The shares must also differ by more than a hundredth (LEAST_SHARE). Arrivals in bursts count as fewer
+        independent ones: N (1 - a) / (1 + a), with the correlation a of each arrival with the next.
         """
         p = self.stated_share  # probability of arrival that the network states; due_slots: whether each message came
         if p is None or self.due_slots is None or not 0 < p < 1:
@@ -197,7 +197,7 @@ class Arrivals:
 
     @property
     def longest_gap(self) -> int | None:
-        """Return the most messages in a row that were due and did not arrive; None where nobody knows what was due."""
+        """Return the largest number of due messages in a row that did not arrive, or None if it is not known what was due."""
         if self.due_slots is None:
             return None
         # As if a message had come before the first and after the last.
@@ -206,10 +206,10 @@ class Arrivals:
 
 
 def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
-    """Return whether rows are there because messages are: something arrived at each time, mostly of one node alone.
+    """Return whether each row is there because of a message: something arrived at each time, mostly from one node.
 
     Args:
-        arrived: by node, whether anything of it arrived at each time.
+        arrived: for each node whether anything of it arrived at each time.
     """
     nodes_at_time = np.sum(list(arrived.values()), axis=0)
     return len(arrived) > 1 and bool(np.all(nodes_at_time > 0) and np.median(nodes_at_time) <= 1)
@@ -282,14 +282,15 @@ class _DeclaredSending(NamedTuple):
 
 
 def _read_declared_sending(receiver: Any) -> _DeclaredSending:
-    """Return what the network says of a node's messages: period, whether they may be lost, and shares that arrive.
+    """Return what the network says of a node's messages: their period, whether they may be lost, and which shares arrive.
 
-    The period is in steps, None where it says none; shares are by received number, None where they are not constant.
+    The period is in steps, None if none is declared. There is a share for each received number, None if they are not
+    constant.
     """
     if not isinstance(receiver, Node):
         return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=None)
     shares = _find_arrival_probabilities(receiver)
-    # A node with a periodic sender is never complete: there only the channel says whether what is sent may be lost.
+    # A node with a periodic sender is never complete. Then only the channel says whether messages may be lost.
     if isinstance(receiver.trigger, Periodic):
         may_be_lost = first(receiver.channel).erases
         return _DeclaredSending(period=int(receiver.trigger.period), may_be_lost=may_be_lost, shares=shares)
@@ -297,9 +298,9 @@ def _read_declared_sending(receiver: Any) -> _DeclaredSending:
 
 
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
-    """Return the probability of arrival of each received number; None of a link whose losses remember or change.
+    """Return the probability of arrival of each received number, or None if it is not constant.
 
-    None too of a link that loses nothing, and where the sender decides when to send.
+    It is also None if the link loses nothing, or if the sender decides when to send.
     """
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

@@ -208,9 +208,9 @@ def _find_response(
 
 
 def _compute_inverse_square_roots(s: Float[np.ndarray, "time m m"], arrived: Float[np.ndarray, "time m"]) -> np.ndarray:
-    """Return S^(-1/2) of each row (time, m, m) over the components that arrived; zero for the others.
+    """Return S^(-1/2) of each row, (time, m, m), over the components that arrived, and zero for the others.
 
-    Zero also where S is not finite; a direction in which S has no positive eigenvalue counts nothing.
+    A row whose S is not finite is zero. A direction with an eigenvalue of S that is not positive gets zero.
     """
     both_arrived = np.asarray(arrived[:, :, None] & arrived[:, None, :])  # components i and j of a row
     # Ones on the diagonal stand for what did not arrive, or is not finite, so that all rows are inverted at once.

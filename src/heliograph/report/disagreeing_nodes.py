@@ -54,8 +54,8 @@ def find_constant_error_between_nodes(
 
 
 def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilter | None:
-    """Return a filter of what all these nodes receive; None behind a link for which no such filter is made."""
-    # What was lost is NaN in the data: the links need to say only how what arrives is changed.
+    """Return a filter of what all these nodes receive, or None if no such filter can be made for their links."""
+    # Lost numbers are NaN in the data, so the links only need to say how numbers that arrive are changed.
     links = [node.channel.condition_on_arrival() for node in nodes.values() if not isinstance(node.channel, OverTime)]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
     is_linear = isinstance(network.plant, LinearPlant) and isinstance(sensor, LinearSensor)
@@ -69,8 +69,8 @@ def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilt
 def _can_be_joined(node: Node) -> bool:
     """Return whether a filter of several nodes can take this one in.
 
-    Its sensor and link do not change over time, messages come whenever they are due, as they were measured (without an
-    encoder), and a filter of its own claims a covariance. No such filter may weigh values by how likely they are.
+    Its sensor and link must not change over time. Messages must come whenever they are due, and without an encoder. A
+    filter of the node must claim a covariance, and no such filter may weigh values by how likely they are.
     """
     is_constant = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
     sends_when_due = node.trigger is None or isinstance(node.trigger, Periodic)

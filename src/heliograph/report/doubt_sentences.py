@@ -14,9 +14,9 @@ def _format_outputs_and_sizes(outputs: Sequence[str], sizes: Sequence[float]) ->
 
 
 def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval.
+    """Return the sentence on a filter whose NIS (squared innovations over their variance) is above its interval.
 
-    `sizes`: for each of `outputs` how many times larger the squares are than their claim.
+    `sizes` says for each of `outputs` how many times larger the squares are than claimed.
     """
     of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
@@ -28,7 +28,7 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
 def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
     """Return the sentence on innovations that are correlated in time; `test` has their correlation at each lag.
 
-    `test.predictable`: share of their variance that those before predict.
+    `test.predictable` is the share of their variance that earlier innovations predict.
     """
     return (
         f"{name} could know more: its innovations are correlated with those before ({test.correlation[0]:.2f} with the "
@@ -40,9 +40,10 @@ def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
 
 
 def say_constant_error(name: str, error: ConstantError) -> str:
-    """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it.
+    """Return the sentence on an output's constant error, which explains all doubts of a filter or most of them.
 
-    `error.explained`: share of what the filter's squared innovations are too large by.
+    If it does not explain all (`nothing_else`), `error.explained` is the share of the excess of the filter's squared
+    innovations that it explains.
     """
     if not error.nothing_else:
         share = f"{min(error.explained, 0.99):.0%} of what its squared innovations are too large by"
@@ -62,7 +63,7 @@ def say_node_differs(error: ConstantError) -> str:
 
 
 def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """Return the sentence on a NIS below its interval; a filter that follows its sensor's slow error has one too."""
+    """Return the sentence on a NIS below its interval, as it is also if a filter follows its sensor's slow error."""
     of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
@@ -72,9 +73,9 @@ def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
 
 
 def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
-    """Return what to do about an output that repeats a value: that it was refused, or how to have it refused.
+    """Return words on an output that repeats a value: that it was refused, or how to have it refused.
 
-    `held.stuck`: for how many readings it may repeat one before the option of that name refuses it.
+    `held.stuck` is how often a value may repeat before the option `stuck` refuses it.
     """
     if refused:
         return "what repeated for longer was refused"
@@ -85,9 +86,9 @@ def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
 
 
 def say_declared_variances_are_off(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
-    """Return the sentences on variances that messages declare, of several links after the names of their outputs.
+    """Return the sentences on variances that messages declare; with several links, their outputs are named.
 
-    `unit`: of the plant's time.
+    `unit` is that of the plant's time.
     """
     several = len(judgements) > 1
     return [

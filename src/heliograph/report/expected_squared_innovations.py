@@ -13,10 +13,11 @@ from heliograph.simulation.results.whiteness import MemoryTest
 def compute_expected_squares(
     filter: AbstractFilter, data: Float[np.ndarray, "steps m"], inputs: Float[np.ndarray, "steps inputs"]
 ) -> Float[np.ndarray, "steps m"]:
-    """Return the mean square of each innovation given its recording, over its variance over all runs: 1 for most.
+    """Return the variance of each innovation given its recording, divided by its variance over all runs.
 
-    Behind random gains the two differ, as the state of this run differs from its mean over all runs: `given_record` is
-    there another filter, with covariances given its data, and elsewhere the filter itself.
+    The ratio is 1 for most filters. Behind random gains it is not, since the state of this run differs from its mean
+    over all runs. There `given_record` returns another filter, whose covariances are given the data. Elsewhere it
+    returns the filter itself.
     """
     conditioned = filter.given_record()
     if conditioned is filter:
@@ -32,19 +33,19 @@ def compute_expected_squares(
 def compute_ratio_of_squares(
     squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]
 ) -> tuple[float, float]:
-    """Return the ratio of the squares' mean to that expected of them, 1 where a claim holds, and its standard error.
+    """Return the ratio of the mean square to the expected mean square, and its standard error; 1 means the claim holds.
 
     Args:
-        squares: of innovations in units of their claim, NaN where none is.
-        expected: their means, as `compute_expected_squares` returns them; 1 for most filters.
+        squares: squared innovations in units of their claim, NaN where there is none.
+        expected: expected means of the squares, as `compute_expected_squares` returns them; 1 for most filters.
     """
     is_known = ~np.isnan(squares) & ~np.isnan(expected)
     if not is_known.any() or not expected[is_known].any():
         return np.nan, np.nan
     mean_expected = float(expected[is_known].mean())
     ratio = float(squares[is_known].mean()) / mean_expected
-    # Of a ratio of means, to first order: the standard error of the mean of (square - ratio expected), over that of
-    # expected.
+    # To first order, the error of this ratio of means is the error of mean(square - ratio * expected), divided by
+    # mean(expected).
     _, residual_error = average_correlated(np.where(is_known, squares - ratio * expected, np.nan))
     return ratio, residual_error / mean_expected
 
@@ -52,14 +53,15 @@ def compute_ratio_of_squares(
 def scale_size_to_expected(
     test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
 ) -> MemoryTest:
-    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1.
+    """Return the test with the innovations' size relative to the `expected` mean squares in this recording.
 
-    `white`: innovations in units of their claimed deviations, NaN where none came; `expected`: their mean squares.
+    `white` holds innovations in units of their claimed deviations, NaN where none came. If all `expected` are 1, the
+    test is returned as it is.
     """
     if np.all(expected == 1):
         return test
     came = ~np.isnan(white)
-    count = np.maximum(came.sum(axis=1), 1)  # in each row, over which both are averaged
+    count = np.maximum(came.sum(axis=1), 1)  # how many numbers each row averages over
     mean_squares = np.where(came, white**2, 0.0).sum(axis=1) / count
     mean_expected = np.where(came, expected, 0.0).sum(axis=1) / count
     mean_squares = np.where(came.any(axis=1), mean_squares, np.nan)

@@ -70,14 +70,14 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
         dots_per_inch: how fine it is (default 150).
 
     Raises:
-        ValueError: what is no figure, or no whole number of dots.
+        ValueError: `figure` is no figure, or `dots_per_inch` no positive integer.
     """
     instance("figure", figure, Figure, "a figure of matplotlib")
     dots_per_inch = check_count("dots per inch", dots_per_inch, 1)
     buffer, old_dpi = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     figure.dpi = dots_per_inch
-    canvas: Any = FigureCanvasAgg(figure)  # it has no types; it draws once, where savefig lays out and draws twice
+    canvas: Any = FigureCanvasAgg(figure)  # it draws once, where savefig lays out and draws twice
     canvas.print_png(buffer)
     figure.dpi = old_dpi
     return buffer.getvalue()
@@ -85,21 +85,21 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
 
 @matplotlib.rc_context(STYLE)
 def svg(figure: Figure) -> bytes:
-    """Return the bytes of a figure as an SVG file: the same bytes for the same figure.
+    """Return the bytes of a figure as an SVG file; the same figure gives the same bytes.
 
-    Text is drawn as outlines, dense lines as pixels.
+    Text is drawn as outlines, and dense lines as pixels.
 
     Args:
         figure: a figure of matplotlib.
 
     Raises:
-        ValueError: what is no figure.
+        ValueError: `figure` is no figure.
     """
     instance("figure", figure, Figure, "a figure of matplotlib")
     buffer, old_dpi = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     _rasterise_dense(figure)
-    figure.dpi = RASTER  # of lines and bands that are pixels
+    figure.dpi = RASTER  # resolution of lines and bands that are pixels
     canvas: Any = FigureCanvasSVG(figure)
     canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     figure.dpi = old_dpi
@@ -107,7 +107,7 @@ def svg(figure: Figure) -> bytes:
 
 
 def _rasterise_dense(figure: Figure) -> None:
-    """Have lines and bands of more points than DENSE drawn as pixels, so that no length of data makes a file long."""
+    """Let lines and bands of more than DENSE points be drawn as pixels, so that long data do not make a file long."""
     for line in figure.findobj(Line2D):
         assert isinstance(line, Line2D)
         line.set_rasterized(len(np.atleast_1d(line.get_xdata())) > DENSE)

@@ -58,9 +58,9 @@ def draw_forecasts(
 
 
 def make_forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
-    """Return a text on what is forecast, then a table for each filter.
+    """Return a text on what is forecast, and then a table for each filter.
 
-    A table has mean and interval of each state and output, at horizons spread over all.
+    A table has the mean and interval of each state and output at some horizons.
     """
     any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
     sentence_on_inputs = {
@@ -94,7 +94,7 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
 
 
 def _format_mean_and_interval(mean: float, low: float, high: float, deviation: float) -> str:
-    """Return mean and interval in words, to two digits of the standard deviation; the mean alone if that is NaN."""
+    """Return mean and interval as text, to two digits of the deviation; only the mean if the deviation is NaN."""
     if np.isnan(deviation):
         return f"{mean:.4g}"
     return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"

@@ -25,9 +25,10 @@ LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "con
 
 
 def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
-    """Return {name of a figure of innovations: its filters}: one figure of all, or of more than FEW filters one a node.
+    """Return {name of a figure of innovations: its filters}.
 
-    At most MOST nodes are drawn. `filter.white`: innovations in units of their claim, None of a filter without a test.
+    Up to FEW filters share one figure. More filters get a figure for each node, of MOST nodes at most. `filter.white`
+    are innovations in units of their claim, None for a filter without a test.
     """
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
@@ -58,9 +59,9 @@ def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
 
 
 def _choose_colours(count: int, names: Sequence[str]) -> tuple[list[str], list[str | None]]:
-    """Return colour and label of each of `count` outputs with these names.
+    """Return the colours and the labels of `count` outputs with these names.
 
-    Of more outputs than there are colours, such as a centre's, all have one colour and only the first has a label.
+    If there are more outputs than colours, all have one colour, and only the first has a label.
     """
     if count > len(COLOURS):
         return [BLUE] * count, [f"{count} outputs", *[None] * (count - 1)]
@@ -68,7 +69,7 @@ def _choose_colours(count: int, names: Sequence[str]) -> tuple[list[str], list[s
 
 
 def _name_components(health: Health) -> dict[str, list[str]]:
-    """Return the names of the measurement's components by node; of a central filter those of all nodes."""
+    """Return the names of each node's measured components; those of the centre (FUSED) are the names of all nodes."""
     names: dict[str, list[str]] = {}
     for link in health.links:
         names.setdefault(link.node, []).append(link.component)
@@ -145,7 +146,7 @@ def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
 
 
 def _make_outputs_table(health: Health) -> list[Table]:
-    """Return the table of each output's bias and size, and of how many values weighing filters doubted; [] if empty."""
+    """Return the table of outputs: bias, size, and how many values weighing filters doubted; [] if there is no output."""
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit, less that of the law of its noise. **Size**: mean square of the "
@@ -196,10 +197,10 @@ def _make_declared_table(health: Health) -> list[Table]:
 
 
 def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
-    """Return the cells of each class of messages that declare about the same variance: range, values, size, scale.
+    """Return a row of cells for each class of messages that declare about the same variance.
 
-    Size: mean squared innovation over its variance, with its interval; scale: the best factor of the declared variances
-    with its interval, "–" where it has none.
+    The cells are the range of variances, the number of values, the size (mean squared innovation over its variance, with
+    its interval), and the scale (the best factor of the declared variances, with its interval; "–" without one).
     """
     rows = []
     for one in judgement.classes:
@@ -212,21 +213,21 @@ def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
 
 
 def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureChoice]:
-    """Return the pictures, by node, one below the other; of more than FEW a single choice among them."""
+    """Return the nodes' pictures one below the other, or if they are more than FEW, a single choice among them."""
     if len(pictures) <= FEW:
         return [*pictures.values()]
     return [PictureChoice("Node", list(map(visible, pictures)), list(pictures.values()))]
 
 
 def name_undrawn_figures(names: Sequence[str], where: str) -> list[Text]:
-    """Return a text that names what no figure shows for lack of room, and says `where` its numbers are; [] of none."""
+    """Return a text that names what is not drawn for lack of room, and `where` its numbers are; [] without names."""
     if not names:
         return []
     return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]
 
 
 def label_time_axis(record: Record, axes: Axes) -> None:
-    """Write the name of time at the axis, with its unit if the record has one; times that are dates are in UTC."""
+    """Label the axis of time with its name and its unit, if the record has one; dates are in UTC."""
     if record.time.dtype.kind == "M":
         axes.set_xlabel("time (UTC)")
     else:

@@ -13,9 +13,9 @@ PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
 
 
 def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
-    """Return by name a figure of the modes' probabilities at each node with a filter that weighs modes.
+    """Return {name: figure} of the modes' probabilities, for each node with a filter that weighs modes.
 
-    Its name is "modes_" (PREFIX), `kind` and the node's number.
+    The name consists of "modes_" (PREFIX), `kind` and the node's index.
     """
     figures = {}
     for i, node in enumerate(nodes):

@@ -19,9 +19,9 @@ SIGMAS = 2.0
 
 
 def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:
-    """Return the indices of two states that are a position in a plane, by their names; None where there are none.
+    """Return the indices of two states whose names say that they are a position in a plane, or None.
 
-    PAIRS are such names, as ("x", "y"); a unit in brackets behind a name does not count.
+    PAIRS holds such names, for example ("x", "y"). A unit in brackets after a name is ignored.
     """
     names = [state.split("(")[0].strip().lower() for state in states]
     for first, second in PAIRS:
@@ -59,7 +59,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
 
 
 def _draw_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.ndarray, colour: str) -> None:
-    """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 of centre m and covariance P; nothing if P is not one."""
+    """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 with centre m and covariance P, or nothing for a wrong P."""
     if not (np.isfinite(covariance).all() and np.isfinite(center).all()):
         return
     eigenvalues, vectors = np.linalg.eigh(covariance)

@@ -21,7 +21,7 @@ class Advance(Protocol):
 
 @contextmanager
 def _show_bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
-    """Show a bar on stderr with the current stage and `more` columns, in this context; nothing without a terminal."""
+    """Within the `with` block, show a bar on stderr with the stage and `more` columns; nothing without a terminal."""
     console = rich.console.Console(stderr=True)
     columns = rich.progress.TextColumn("{task.description}", markup=False), rich.progress.BarColumn(), *more
     with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -36,7 +36,7 @@ def progress(stages: int) -> Iterator[Advance]:
         stage, begun = "", 0
 
         def advance(what: str, done: int = 0, total: int = 0) -> None:
-            """Show a stage `what` on `bar`, and how much of it is done; `begun`: how many stages have begun."""
+            """Show on `bar` the stage `what` and how much of it is done; `begun` counts the stages that have begun."""
             nonlocal stage, begun
             if what != stage:
                 stage, begun = what, begun + 1
@@ -56,18 +56,18 @@ class Countdown:
     """
 
     def __init__(self, workers: int = 1, clock: Callable[[], float] = time.monotonic):
-        """Begin before any piece of work; `workers`: how many do pieces side by side; `clock`: seconds."""
+        """Begin before any piece of work; `workers` do pieces side by side, and `clock` returns seconds."""
         self.workers, self.clock = workers, clock
-        self.pieces = 0  # done since the first note
-        self.first: int | None = None  # how much was done before
-        # How much was done, and when: once each worker has done a piece, and at the last note.
+        self.pieces = 0  # how many pieces were done since the first note
+        self.first: int | None = None  # how much was done at the first note
+        # Pairs (how much was done, when): once each worker had done a piece, and at the last note.
         self.warm: tuple[int, float] | None = None
         self.last = (0, 0.0)
 
     def note(self, done: int) -> None:
-        """Record how much is done now; called once at the begin, then after each piece of work.
+        """Record how much is done now; this is called once at the beginning, and then after each piece of work.
 
-        `warm` is kept once each worker has done a piece: the first ones take longer, and are no measure of the others.
+        `warm` is set once each worker has done a piece, since first pieces take longer than others.
         """
         self.last = done, self.clock()
         if self.first is None:
@@ -80,7 +80,7 @@ class Countdown:
     def left(self, total: int) -> float | None:
         """Return the remaining seconds to `total`; None until every worker could do a second piece.
 
-        `warm` and `last`: how much was done, and when, once each worker had done one, and at the last note.
+        `warm` and `last` are pairs (how much was done, when): after each worker's first piece, and at the last note.
         """
         if self.warm is None or self.pieces < 2 * self.workers:
             return None
@@ -119,7 +119,7 @@ def show_countdown(countdown: Countdown) -> Iterator[Callable[[str, int, int], N
         task = bar.add_task("starting", total=1, left="")
 
         def show(what: str, done: int, total: int) -> None:
-            """Show the bar, or print a line if the last was LINE_EVERY (60 s) ago; `countdown` has the time left."""
+            """Update the bar; without a terminal, print a line every LINE_EVERY (60) seconds."""
             nonlocal last_line
             left = "" if countdown.first is None else format_remaining(countdown.left(total))
             bar.update(task, description=what, completed=done, total=total, left=left)

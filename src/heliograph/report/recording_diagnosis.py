@@ -150,12 +150,12 @@ class Health:
     def doubted(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts.
 
-        None of those that use an output which is stuck: their innovations tell of that alone.
+        Filters that use a stuck output are left out: their innovations tell nothing else.
         """
         stuck = {node for node, _ in self.describe_stuck_outputs()}
 
         def is_doubted(health: FilterHealth) -> bool:
-            """Return whether one of these filters is trusted, uses nothing that is stuck, and has doubts."""
+            """Return whether a filter is trusted, uses no stuck output, and has doubts."""
             uses_stuck = health.node in stuck or (bool(stuck) and health.node == Network.FUSED)
             return health.trusted and not uses_stuck and any(self._describe_doubts(health))
 
@@ -213,9 +213,9 @@ class Health:
                 yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
     def explains_all_innovations(self, health: FilterHealth, error: ConstantError) -> bool:
-        """Return whether innovations without the effect of a constant error are as large as claimed, without memory.
+        """Return whether innovations without a constant error are as large as claimed and have no memory.
 
-        `error.squares`: these squared, over their variances, NaN where none came; `error.white`: they, over deviations.
+        `error.white` are these innovations over their deviations, and `error.squares` the squares, NaN where none came.
         """
         level = self._level_of_one_test() / error.squares.shape[1]
         for squares_of_output in error.squares.T:
@@ -226,12 +226,12 @@ class Health:
         return test is None or not self._has_memory(health, test)
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
-        """Return whether innovations predict those after them, by the last one or by several, and more than by chance.
+        """Return whether innovations predict later ones (by the last one or by several) more than by chance.
 
-        Of N numbers that know nothing of one another each lag seems to predict 1 / N of the variance.
+        Among N independent numbers, each lag seems to predict 1 / N of the variance.
         """
-        # A filter's gains suit the mean over all runs: in a run whose mean square innovation, relative to that over all
-        # runs (`expected`), is further from 1 than TYPICAL they are too large or too small.
+        # A filter's gains suit the mean over all runs. In a run whose mean square innovation, relative to all runs
+        # (`expected`), is further from 1 than TYPICAL, the gains are too large or too small.
         if abs(np.log(health.expected)) > np.log(TYPICAL):
             return False
         by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
@@ -239,7 +239,7 @@ class Health:
         return probability < self._level_of_one_test() and test.predictable - by_chance >= LEAST_SHARE
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
-        """Yield which outputs a filter that weighs left out most, in the words of `heliograph.run`."""
+        """Yield sentences on the outputs that a weighing filter left out most, in the words of `heliograph.run`."""
         for output in self.outputs:
             if output.weighs and (output.node, output.filter) == (health.node, health.filter):
                 yield from output.judged.summary.describe_left_out(
@@ -248,11 +248,11 @@ class Health:
 
 
 def judge_size(size: float, error: float, numbers: int, level: float) -> int:
-    """Return 1 (too large) or -1 where a mean square is off its claim, 1, by its interval and by a tenth; else 0.
+    """Return 1 (too large) or -1 (too small) if a mean square differs from its claim, 1, significantly; else 0.
 
-    The logarithm of a mean square is nearly Gaussian, with its relative error; one that came out small has a small
-    error too. An error that a few numbers tell is itself known to some 1 / sqrt(2 N), so that it counts no less than
-    sqrt(2 / N), which is that of N independent Gaussian numbers.
+    It must be off by its interval and by a tenth. The logarithm of a mean square is nearly Gaussian, and its error is
+    the relative error. N numbers tell this error badly, so it counts as at least sqrt(2 / N), the error for N
+    independent Gaussian numbers.
     """
     if not (size > 0 and error > 0):
         return 0
@@ -336,7 +336,7 @@ def _examine_filter(
 
 
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
-    """Return the sentence that times seem to be in another unit, by the first doubtful filter; "" if they do not."""
+    """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or ""."""
     tested = [judged for judged in health.doubted() if judged.test is not None]
     if not tested:
         return ""
@@ -354,7 +354,7 @@ def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) 
 def _find_constant_error(
     network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray
 ) -> ConstantError | None:
-    """Return the constant error of one output that explains all or MOST of what is doubtful in a filter; else None."""
+    """Return the constant error of an output that explains all or MOST of a filter's doubts, or None."""
     if judged.test is None:
         return None
     tested = _find_judged_filter(network, health.record, judged)
@@ -371,7 +371,7 @@ def _name_time_unit(record: Record) -> str:
 
 
 def _check_record(network: Network, record: Record) -> None:
-    """Raise ValueError at a record of other filters than the network's, or of several runs."""
+    """Raise ValueError if a record lacks filters of the network, or is of several runs."""
     instance("network", network, Network, "a Network")
     instance("record", record, Record, "a Record")
     filters = {node: set(network.nodes[node].filters) for node in network.names}
@@ -383,16 +383,16 @@ def _check_record(network: Network, record: Record) -> None:
 
 
 def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
-    """Return the innovations less the mean of each output.
+    """Return the innovations minus the mean of each output.
 
-    Where outliers lie to one side, those that a filter keeps have a mean: it would look like memory, and is no bias.
+    If outliers lie to one side, the innovations that a filter keeps have a mean. It would look like memory.
     """
     count = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
     return np.asarray(white - np.nansum(white, axis=0) / count)
 
 
 def _test_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
-    """Return the test of innovations' correlation from message to message; None of too few (LAGS: 10), or all zeros."""
+    """Return the test of innovations' correlation between messages, or None for too few (LAGS, 10) or all zeros."""
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):

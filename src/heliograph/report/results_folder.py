@@ -74,13 +74,13 @@ def write_results(
 
 
 def write_into_folder(results: ResultsContent, folder: Path) -> None:
-    """Write figures, report, data and summary into a folder that is there."""
-    # The SVG pictures come first: drawing them lays the figures out, for the PNG files too.
+    """Write figures, report, data and summary into an existing folder."""
+    # The SVG pictures come first: drawing them lays the figures out, and the PNG files use this layout.
     from heliograph.report.figures import png, svg
 
     pictures = {name: svg(figure) for name, figure in results.figures.items()}
     for name, figure in results.figures.items():
-        figure.set_layout_engine("none")  # it is laid out
+        figure.set_layout_engine("none")  # it is laid out already
         (folder / f"{name}.png").write_bytes(png(figure))
         (folder / f"{name}.svg").write_bytes(pictures[name])
     (folder / "report.html").write_text(results.page(pictures).html(), encoding="utf-8")

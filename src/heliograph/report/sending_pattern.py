@@ -21,17 +21,17 @@ class SendingPattern(NamedTuple):
 
 
 def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
-    """Return the pattern of rows in which a message is due, if losses at random would hardly leave it; else None.
+    """Return the pattern of rows in which a message is due, or None if random losses could have left it.
 
-    What is due in `due` of each `length` rows leaves the other rows empty for ever. Of the messages that are due some
-    may be lost: what arrives in the due rows is looked at again, so that the pattern is the finest that can be told.
-    `rows`: mask of the due rows; `finer`: mask, of a pattern's length, of those among them that are due after all.
+    If messages are due in `due` of each `length` rows, the other rows are always empty. Some due messages may be lost.
+    So the due rows are searched again for a pattern until there is none: the result is the finest pattern. `rows` is
+    the mask of the due rows. `finer` is the mask of a pattern among the due rows.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
     finer = _find_least_probable_rows(arrived[rows])
     while finer is not None:
-        # Of the due rows, `due` in each `length`, only those of `finer` are due: the two patterns together return after
-        # `turns` of the first, as soon as their turns * due rows are a multiple of len(finer).
+        # Only the rows of `finer` among the due rows are due. Both patterns together repeat after `turns` turns of the
+        # first: turns * due must be a multiple of len(finer).
         turns = len(finer) // np.gcd(due, len(finer))
         due, length = int(finer.sum()) * due * turns // len(finer), length * turns
         rows[rows] = np.resize(finer, int(rows.sum()))
@@ -73,9 +73,10 @@ class BurstLossLaw(NamedTuple):
 
     @staticmethod
     def fit_to_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "BurstLossLaw":
-        """Return the law of the greatest likelihood: shares of arrivals after an arrival, and of losses that end.
+        """Return the law of greatest likelihood: shares of arrivals that follow one, and of losses that end a burst.
 
-        An interval of 1 is an arrival in the row after one; of k > 1 it has k - 1 losses, the last of which ends them.
+        An interval of 1 is an arrival in the row after an arrival. An interval of k > 1 has k - 1 losses, and the last
+        of them ends the burst.
         """
         losses = intervals[intervals > 1] - 1
         return BurstLossLaw(
@@ -84,14 +85,14 @@ class BurstLossLaw(NamedTuple):
         )
 
     def log_chance_within(self, due: Bool[np.ndarray, " rows"], count: int) -> float:
-        """Return a bound of the log probability that `count` arrivals after a first one are all in rows that are due.
+        """Return a bound of the log probability that `count` arrivals after a first one are all in due rows.
 
-        With z > 0 for each arrival, backwards over the rows from the end, where all are 1:
-        stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)), where
-        later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1); for each z the chance is at most
-        stay(first) / z^count (Chernoff). The best z is about the share of the rows that are not due, inverted.
+        For any z > 0 the probability is at most stay(first) / z^count (Chernoff's bound), where
+        stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)) and
+        later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1). Both are 1 at the end, and are computed
+        backward over the rows r. Several z are tried.
         """
-        # z = share^-exponent, where a share of 1 / n at least keeps z finite.
+        # z = share^-exponent with the share of due rows, which is at least 1 / n, so that z is finite.
         share = max(float(np.mean(due)), 1 / len(due))
         return min(self._log_mean_of_powers(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
 
@@ -114,19 +115,19 @@ class BurstLossLaw(NamedTuple):
 
 
 def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, count: int) -> float:
-    """Return an upper bound of the log probability that losses in bursts let nothing arrive outside of these places.
+    """Return an upper bound of the log probability that losses in bursts let nothing arrive outside these places.
 
-    The row of an arrival, modulo the pattern's length, moves as a Markov chain. The probability that N moves all end in
-    `places` is at most the largest row sum of M^N, where M has the probabilities of moves between these places alone.
+    The row of an arrival, modulo the pattern's length, is a Markov chain. The probability that N moves all end in
+    `places` is at most the largest row sum of M^N, where M holds the probabilities of moves between these places.
 
     Args:
         places: which rows of the pattern are due.
-        law: of the intervals between arrivals.
+        law: the distribution of the intervals between arrivals.
         count: N, how many intervals were seen.
     """
     length = len(places)
-    # P(interval = 1) = follows, P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ...; modulo the
-    # length the intervals k, k + length, k + 2 length, ... are one move: a geometric series of (1 - ends)^length.
+    # P(interval = 1) = follows, and P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ... The
+    # intervals k, k + length, ... are the same move, whose probability is a geometric series of (1 - ends)^length.
     interval = np.arange(2, length + 2)
     move_probabilities: Float[np.ndarray, " length"] = np.zeros(length)
     series = 1 / (1 - (1 - law.ends) ** length)
@@ -138,9 +139,9 @@ def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, co
 
 
 def _compute_log_row_sum(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:
-    """Return the logarithm of the largest row sum of M^exponent, by repeated squares, scaled so that none underflows.
+    """Return the logarithm of the largest row sum of M^exponent, by repeated squaring, scaled against underflow.
 
-    `sums`: row sums of the powers taken so far over exp(logarithm); `matrix`: M^(2^k) over exp(scale).
+    `sums` exp(logarithm) are the row sums of the powers taken so far, and `matrix` exp(scale) is M^(2^k).
     """
     sums, logarithm, scale = np.ones(len(matrix)), 0.0, 0.0
     while exponent:

@@ -39,12 +39,11 @@ class _PeriodicRows(NamedTuple):
 
 
 def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
-    """Return the rate of a sender whose clock is not that of the rows, if losses would hardly leave it; else None.
+    """Return the rate of a sender whose clock is not that of the rows, or None if losses could have left the arrivals.
 
-    A sender that is due each T rows, T no whole number, comes in the rows r where frac(r / T - phase) < 1 / T, and all
-    others are empty for ever (frac is the part after the point). If it is hardly slower than the rows the empty ones
-    are rare, and have a rate themselves: one of each 1 / (1 - 1 / T) rows, and no such slot without its empty row.
-    `slots`: of each arrival its number among those that were due.
+    A sender that is due each T rows, where T is no integer, comes in the rows r with frac(r / T - phase) < 1 / T. frac
+    is the fractional part. All other rows are empty. If T is hardly above 1, empty rows are rare and have a rate
+    themselves: one in each 1 / (1 - 1 / T) rows, in every such slot. `slots` numbers each arrival among those due.
     """
     rate = _find_slowest_rate(arrived)
     if rate is not None:
@@ -111,9 +110,9 @@ def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
 
 
 def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
-    """Return middle and length of the largest part of a period, as a circle of length 1, in which no arrival falls.
+    """Return the middle and the length of the largest part of a period in which no arrival falls.
 
-    `frequency`: periods a row; `rows`: of the arrivals.
+    The period is a circle of length 1. `frequency` is in periods per row, and `rows` holds the rows of the arrivals.
     """
     phases = np.sort(np.mod(frequency * rows, 1))
     gaps = np.diff(phases, append=phases[0] + 1)  # the last one goes around the circle, to the first phase

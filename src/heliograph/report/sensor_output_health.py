@@ -71,9 +71,9 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
 
 
 def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]) -> dict[str, float]:
-    """Return the standard error of each RMSE by state, that of the mean square over twice the RMSE; NaN without one.
+    """Return the standard error of each state's RMSE: that of the mean square divided by twice the RMSE.
 
-    `rmse`: of the filter `name` at `node`, by state.
+    It is NaN for an RMSE of 0. `rmse` holds by state the RMSE of the filter `name` at `node`.
     """
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
@@ -155,14 +155,14 @@ def yield_filters_with_measurements(network: Network, record: Record) -> Iterato
 
 
 def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
-    """Return by node the names of the filters that the network relies on: fused ones, else that of the strongest claim.
+    """Return by node the names of the filters that the network relies on.
 
-    The first of several such. Others, such as one that takes the mean of a random gain for it, are there to be compared
-    with.
+    They are those that a fusion joins, or else the first filter with the strongest claim. Other filters are there for
+    comparison.
     """
     # Names of the filters whose estimates a fusion joins, in a centre or among neighbours.
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
-    # STRENGTH orders claims, from "none" to "exact".
+    # STRENGTH ranks claims from "none" to "exact".
     relied_on = {}
     for node, receiver in network.nodes.items():
         strengths = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}
@@ -172,8 +172,8 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
 
 
 def weighs(filter: AbstractFilter) -> bool:
-    """Return whether a filter weighs the components of what arrives by how likely they are, as one against outliers."""
-    # Only the shape of a correction is looked at, nothing is computed: without weighing its weight is None.
+    """Return whether a filter weighs received components by how likely they are, as a filter against outliers does."""
+    # Only the shape of a correction is found, and nothing is computed. Its weight is None if the filter does not weigh.
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
         innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
@@ -284,19 +284,21 @@ class RecentInnovations:
     """
 
     def __init__(self, rows: int, names: Mapping[tuple[str, str], Sequence[str]]):
-        """Begin with no row; `rows`: how many newest ones are kept; `names`: of outputs, by node and filter."""
+        """Begin without rows; the newest `rows` rows are kept. `names` holds outputs' names by (node, filter)."""
         self.names = names
         self._rows: dict[tuple[str, str], deque[np.ndarray]] = defaultdict(lambda: deque(maxlen=rows))
-        self.left_out = Counter[tuple[str, str]]()  # by node and filter: numbers of weight 0, of all rows so far
+        self.left_out = Counter[tuple[str, str]]()  # by (node, filter): how many numbers of all rows had weight 0
 
     def add(self, node: str, name: str, outputs: Mapping[str, Sequence[float | None]]) -> None:
-        """Add a row: innovations `value`, their `variance` and the `weight` of each number, None where none arrived."""
+        """Add a row: the innovation "value", "variance" and "weight" of each number, None if it did not arrive."""
         row = [outputs[field] for field in ("value", "variance", "weight")]
         self._rows[node, name].append(np.array(row, dtype=float))
-        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])  # None, not arrived, is not 0
+        self.left_out[node, name] += sum(
+            weight == 0 for weight in outputs["weight"]
+        )  # None (not arrived) does not count
 
     def summarise_outputs(self) -> list[OutputHealth]:
-        """Return what the newest rows of each filter say of each of its outputs."""
+        """Return what the newest rows of each filter say about each of its outputs."""
         results = []
         for (node, name), rows in self._rows.items():
             innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))  # rows hold (value, variance, weight) each
@@ -311,8 +313,8 @@ class RecentInnovations:
 
 
 def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
-    """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
-    # Without inputs (the empty array): the record has these filters' innovations, so that none is run again.
+    """Return what the innovations of all weighing filters say about each output of a recording."""
+    # Inputs are not needed (an empty array), since the record holds these filters' innovations.
     outputs: list[OutputHealth] = []
     no_inputs = np.zeros(0)
     for filter in yield_filters_with_measurements(network, record):
@@ -339,7 +341,7 @@ def summarise_output(health: OutputHealth) -> dict[str, Json]:
 
 
 def make_output_row(health: OutputHealth) -> dict[str, Json]:
-    """Return the numbers of one output with its names, and in words."""
+    """Return one output's names, its numbers, and a text on them."""
     judged = health.judged
     words = str(judged.summary) + ("; to blame" if judged.to_blame else "")
     named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": judged.output, "words": words}

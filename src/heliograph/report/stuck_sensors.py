@@ -132,20 +132,20 @@ def find_stuck_value(
 
 
 def _bound_repetition_probability(readings: Float[np.ndarray, " n"], variance: float, law: NoiseLaw) -> float:
-    """Return a bound p of the probability that noise makes a reading equal to the one before it.
+    """Return a bound p of the probability that noise makes a reading equal to the previous one.
 
-    Of readings of resolution q, the least difference of two, the innovation has variance S, of which q^2 / 12 may be
-    that of rounding: p = erf(q / sqrt(8 (S - q^2 / 12))), the probability of the q about the most probable value. Of
-    noise of several branches j, with variance r_j each and r of the whole, p is the mean over them, each with
+    The readings' resolution q is the least difference of two readings. The innovation has variance S, of which q^2 / 12
+    may be due to rounding. p = erf(q / sqrt(8 (S - q^2 / 12))) is the probability of the interval q around the most
+    probable value. If the noise has several branches j with variances r_j, and r in all, p is the mean over them with
     S - r + r_j in place of S.
 
     Args:
-        readings: not all equal.
-        variance: S.
-        law: shares and variances of the branches.
+        readings: the readings, not all equal.
+        variance: S, the variance of the innovation.
+        law: the shares and variances of the noise's branches.
     """
     resolution = float(np.min(np.diff(np.unique(readings))))
-    # Of each branch S - r + r_j - q^2 / 12; where that is not positive, rounding alone explains S, and p is 1.
+    # S - r + r_j - q^2 / 12 for each branch. If it is not positive, rounding alone explains S, and p is 1.
     unrounded = max(variance - law.total, 0.0) + law.variance - resolution**2 / 12
     with np.errstate(divide="ignore", invalid="ignore"):
         probabilities = np.where(unrounded > 0, erf(resolution / np.sqrt(8 * np.abs(unrounded))), 1.0)
@@ -153,13 +153,13 @@ def _bound_repetition_probability(readings: Float[np.ndarray, " n"], variance: f
 
 
 def _compute_shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
-    """Return shares among the readings outside of a run: those with its value, and those equal to the one before.
+    """Return two shares of the readings outside a run: of those with its value, and of those equal to the previous one.
 
-    The run of `length` begins at reading `start`.
+    The run has `length` readings and begins at reading `start`.
     """
     outside = np.ones(len(readings), dtype=bool)
     outside[start : start + length] = False
-    # Of each pair of successive readings that are both outside: whether they are equal.
+    # Whether both readings of a pair of successive readings outside the run are equal.
     equal = (readings[1:] == readings[:-1])[outside[1:] & outside[:-1]]
     share_with_value = float(np.mean(readings[outside] == readings[start]))
     share_of_repeats = float(np.mean(equal)) if len(equal) else 0.0

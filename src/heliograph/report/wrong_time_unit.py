@@ -53,7 +53,7 @@ def describe_wrong_time_unit(
 def _is_as_claimed(innovations: ArrayLike, covariances: ArrayLike) -> bool:
     """Return whether the mean square of innovations (time, m) over their variances is about 1.
 
-    About: between 1 / AS_CLAIMED and AS_CLAIMED, 1.25. Numbers that did not arrive are not finite and do not count.
+    "About 1" means between 1 / AS_CLAIMED and AS_CLAIMED (1.25). Numbers that did not arrive are NaN and do not count.
     """
     variance = np.diagonal(np.asarray(covariances), axis1=1, axis2=2)
     with np.errstate(divide="ignore", invalid="ignore"):

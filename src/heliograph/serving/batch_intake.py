@@ -72,15 +72,17 @@ class BatchIntake:
     """Gives the messages of a batch to their plants; `plants` are those in memory, by name."""
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
-        """Prepare to give messages to plants; `plants`, by name, are those in memory, which are changed."""
+        """Prepare to give messages to plants; `plants` holds those in memory by name, and is changed."""
         self.fleet, self.plants, self._judges = fleet, plants, JudgementReader(fleet)
-        # Why something is refused, by the number of its message and whether it is the message's inputs.
+        # Reasons of refused events: {(number of the message, whether the event is its inputs): reason}.
         self._refused: dict[tuple[int, bool], str] = {}
-        # Of the present round: plants as they were, by name, and the events that they used, to be judged.
+        # In the present round: plants by name as they were before, and the events they used, which are to be judged.
         self._before: dict[str, PlantBeforeBatch] = {}
         self._taken: list[CandidateEvent] = []
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
-        self.replaced: list[tuple[PlantState, list[WithdrawnEvent]]] = []  # these as they were, with their events
+        self.replaced: list[
+            tuple[PlantState, list[WithdrawnEvent]]
+        ] = []  # plants that were replaced, with their events
 
     def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[MessageOutcome]:
         """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
@@ -109,10 +111,10 @@ class BatchIntake:
         return outcomes
 
     def _refuse_implausible(self) -> set[str]:
-        """Step the plants that took events, and undo what was implausible; return the names of these plants.
+        """Step the plants that took events, restore those with implausible events, and return the restored names.
 
-        Each implausible event is noted in `_refused` with its reason, and its plant is as before the batch again: the
-        other events of the plant are to be taken anew.
+        Each implausible event is noted in `_refused` with its reason. Its plant is again as before the batch, so that
+        the plant's other events must be taken anew.
         """
         plants_by_name = {candidate.plant.name: candidate.plant for candidate in self._taken}
         self.fleet.step(plants_by_name.values())
@@ -128,22 +130,22 @@ class BatchIntake:
     def _take_message(self, number: int, message: Read, wall: datetime) -> MessageOutcome:
         """Give a message to its plant, as far as it was read; return its outcome.
 
-        `number`: that of the message in the batch; `wall`: the time by this machine's clock.
+        `number`: the message's number in the batch. `wall`: the time on this machine's clock.
         """
-        if isinstance(message, str):  # why it could not be read at all
+        if isinstance(message, str):  # the reason why it could not be read at all
             return MessageOutcome(why=message)
         if isinstance(message, UnreadMessage):
             return MessageOutcome(self._count_unread(message), why=message.why)
         try:
             return self._use_message(number, message, wall)
-        except InputError as error:  # of another kind than its plant expects
+        except InputError as error:  # its plant expects another kind of message
             return MessageOutcome(self._count_unread(UnreadMessage(message, str(error))), why=str(error))
 
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
-        """Return {(number of a message, True): why its inputs lead to no valid prediction}, as `_refused` has it.
+        """Return {(number of a message, True): reason} for inputs that lead to no valid prediction, as in `_refused`.
 
-        They are predicted with from the state before the batch. A message has inputs beside its values, or is of
-        inputs alone.
+        The prediction starts from the plant's state before the batch. A message has inputs beside its values, or it has
+        only inputs (its node is INPUTS).
         """
         numbers, plants, inputs = list[int](), list[PlantState | None](), []
         for i, message in enumerate(messages):
@@ -198,7 +200,7 @@ class BatchIntake:
     ) -> list[str]:
         """Give the inputs beside a measurement to its plant, if there are any; return a note if they are refused.
 
-        `why_refused`: the reason, if they are implausible; None else. `timed`: the message's events with their times.
+        `why_refused`: the reason if the inputs are implausible, else None. `timed`: the message's events with times.
         """
         if timed.inputs is None:
             return []
@@ -246,9 +248,9 @@ class BatchIntake:
         return plant
 
     def _note_plant_before_batch(self, plant: PlantState, begun: float) -> PlantState:
-        """Return the plant, and note once in a batch what it was before, for `_restore_plant`; a new one is added.
+        """Return the plant after noting, once in a batch, its state before the batch for `_restore_plant`.
 
-        `begun`: time of the first event of a new plant.
+        A new plant is added. `begun` is the time of its first event.
         """
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
@@ -318,7 +320,7 @@ class BatchIntake:
         Args:
             number: number of its message in the batch.
             plant: the plant.
-            message: its message, by whose node's clock it is dated.
+            message: its message; the clock of the message's node dates the event.
             event: the event, a measurement or inputs.
             wall: time by the clock on the wall, None if it is not known.
         """
@@ -339,10 +341,10 @@ class BatchIntake:
             self.fleet.end_plant(self.plants.pop(name))
 
     def _choose_origin(self, message: AnyMessage) -> datetime | None:
-        """Return the date from which a plant's times are counted, by its first message; None where they are numbers.
+        """Return the date from which a new plant's times are counted, or None if its times are numbers.
 
-        In continuous time it is midnight, UTC, before; else the message's own time, as the date of step 0, where a step
-        has a length.
+        In continuous time it is the midnight (UTC) before the plant's first message. If the network counts steps of a
+        known length, it is the time of the first message, which becomes step 0.
         """
         if not isinstance(message.time, datetime):
             return None
@@ -352,7 +354,7 @@ class BatchIntake:
 
 
 def find_plant_name(message: Read) -> str | None:
-    """Return the name of the plant of a message; None of one that names none."""
-    if isinstance(message, str):  # why it could not be read at all
+    """Return the name of a message's plant, or None if the message could not be read at all."""
+    if isinstance(message, str):  # the reason why it could not be read
         return None
     return message.read.plant if isinstance(message, UnreadMessage) else message.plant

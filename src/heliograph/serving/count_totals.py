@@ -60,14 +60,14 @@ class CountTotals:
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 
     def add_plant(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
-        """Add what has changed in a plant's counts (`links`, by node) since they were added last, to `by_node`."""
+        """Add to `by_node` the changes of a plant's counts (`links`, by node) since they were last added."""
         for node, link in links.items():
             counts = tuple(list_counts_of_link(link).values())
             counts_before = self._seen.get((plant, node), (0,) * len(FIELDS))
             if counts != counts_before:
                 self._seen[plant, node] = counts
                 total = self.by_node.setdefault(node, Counter(dict.fromkeys(FIELDS, 0)))
-                # A count that fell is of a plant that began anew; only lost messages may become fewer by themselves.
+                # Lost messages may become fewer. Any other count falls only if the plant began anew.
                 for name, new, old in zip(FIELDS, counts, counts_before, strict=True):
                     total[name] += new - old if name == "lost" else max(new - old, 0)
 

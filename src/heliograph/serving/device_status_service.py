@@ -19,7 +19,7 @@ class DeviceStatusService:
     """
 
     def __init__(self, service: BatchService, words: DeviceStatuses, store: StoreProtocol):
-        """Hold the service, the words of its devices and their store; words that the store has are put back."""
+        """Hold the service, the words of its devices (online or offline) and the store, and restore stored words."""
         self._service, self._words, self._store = service, words, store
         self._unkept = dict[str, int]()  # words that the store does not have yet, as numbers by topic
         words.restore(store.words())
@@ -43,8 +43,8 @@ class DeviceStatusService:
         return self._service.finish(ended)
 
     def _keep_words(self) -> None:
-        """Store the words of devices (last messages on whether they are online) that came since the last call."""
-        # Words stay unkept until the store has them: it may be away, and raise.
+        """Store the words of devices (their last messages on whether they are online) since the last call."""
+        # If the store cannot be reached, it raises, and the words stay in `_unkept`.
         self._unkept |= self._words.pop_changed_words()
         if self._unkept:
             self._store.keep_words(self._unkept)

@@ -50,14 +50,14 @@ class EstimateWriter:
         self._template, self._order, self._whole = self._make_template(program.step_rows.outputs.size)
 
     def _make_template(self, size: int) -> tuple[bytes, list[int], list[int]]:
-        """Return a line of a row with `size` outputs, with %b or %d for each number, and what fills it.
+        """Return a template of the line of a row with `size` outputs, and two lists that say what fills it.
 
-        That is the outputs' columns in the order in which the line has them, and which of its places take whole
-        numbers. The line is written from a row that has FIRST + its column number in each column: so the number that
-        stands at a place (found by COLUMN) tells its column, and without a point that it is written as a whole one.
+        The template has %b for each real number and %d for each integer. The lists hold the column of each place in
+        the line, and the places of integers. To find them, a line is written from a row with FIRST + its column number
+        in each column. A number in this line (found by COLUMN) tells its column; without a point it is an integer.
         """
         column_numbers = FIRST + np.arange(float(size))
-        column_numbers[self._reasons] = 0.0  # nothing is refused
+        column_numbers[self._reasons] = 0.0  # 0 means that nothing is refused
         line = encode_line(self._write_estimates(column_numbers.tolist()))
         places = COLUMN.findall(line)  # (digits, ".0" or nothing)
         template = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", line.replace(b"%", b"%%"))
@@ -99,7 +99,7 @@ class EstimateWriter:
     def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
         """Return all filters' estimates after a row, by node and filter, from the row's numbers `outputs`.
 
-        `_nodes`: by node, where each of its filters has its numbers among these.
+        `_nodes` maps a node to the columns of its filters among these numbers.
         """
         return {
             node: {columns.filter: self._tabulate_estimate(columns, outputs) for columns in places}
@@ -107,14 +107,14 @@ class EstimateWriter:
         }
 
     def _tabulate_estimate(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
-        """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON.
+        """Return one filter's estimate, its claim and its innovation, as a table for JSON.
 
-        `columns` are the filter's among `outputs`, the numbers of a row. The claim says what the covariance is worth:
-        "exact", "upper" (a bound), "none" and so on.
+        `columns` are the filter's columns among `outputs`, the numbers of a row. The claim says what the covariance is
+        worth: "exact", "upper" (a bound), "none" and so on.
         """
         n, begin = self._n, columns.covariance
         mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row
-        # What is no number, or has a negative variance, is no estimate that claims something.
+        # An estimate with NaN, infinity or a negative variance claims nothing.
         claim, variances = columns.claim, covariance[:: n + 1]
         if claim != "none" and (not all(map(isfinite, (*mean, *covariance))) or min(variances) < 0):
             claim = "none"

@@ -172,12 +172,12 @@ def read_message(payload: bytes) -> Message:
 
 
 def _refuse_doubled_fields(payload: bytes, read: AnyMessage) -> None:
-    """Raise ValueError where a line has a field twice, of which decoders use the last.
+    """Raise ValueError if a line has a field twice; decoders would use the last one.
 
-    Each field's name and each text has two quotes: a line that has just the quotes of what was read has no field twice.
-    Only others are decoded again, which takes longer.
+    Each field's name and each text has two quotes. If a line has no more quotes than what was read, no field is there
+    twice. Any other line is decoded again, which takes longer.
     """
-    # Fields that are always there: node, sequence, time; texts: node, and what else is one.
+    # The fields node, sequence and time are always there. Texts are the node's name and others that are there.
     fields = 3 + (read.plant != "") + (read.values != []) + (read.inputs is not None) + (read.arrival is not None)
     texts = 1 + (read.plant != "") + isinstance(read.time, datetime) + isinstance(read.arrival, datetime)
     if payload.count(b'"') == 2 * (fields + texts):
@@ -189,7 +189,7 @@ def _refuse_doubled_fields(payload: bytes, read: AnyMessage) -> None:
 
 
 def _describe_payload(payload: bytes) -> str:
-    """Return in words what a payload is that is no JSON object."""
+    """Return in words what a payload is, if it is not a JSON object."""
     try:
         return f"{show_value(json.loads(payload))}, which is no object"
     except RecursionError:
@@ -202,9 +202,9 @@ def _describe_payload(payload: bytes) -> str:
 
 
 def convert_time_to_seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
-    """Return a time as a number: of a date the seconds since `origin`, exact to the microsecond before rounding.
+    """Return a time as a number; a date becomes seconds since `origin`, exact to the microsecond before rounding.
 
-    A plant's times are all dates, if it has an origin, or all numbers: ValueError at the other kind.
+    If a plant has an origin, all its times must be dates, else all must be numbers; ValueError otherwise.
     """
     remedy = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):

@@ -26,10 +26,10 @@ class NeighbourMessenger:
     """
 
     def __init__(self, fleet: Fleet, moment: Moment):
-        """Find the filter of the node that the network is, whose messages are made; `moment`: a row's time."""
+        """Find the node's filter if the network is a single node; `moment` returns a row's time as in messages."""
         self.fleet, self._moment = fleet, moment
         nodes = {name: filter for name, filter in fleet.network.fused.items() if isinstance(filter, NodeFilter)}
-        # The filter of the node that this network is; "" and None where it is no single node, which sends nothing.
+        # Name and filter of the node; "" and None if the network is no single node, which sends nothing.
         self._name = next(iter(nodes), "")
         self._node = nodes.get(self._name)
 
@@ -39,9 +39,9 @@ class NeighbourMessenger:
         return self._node is not None
 
     def make_messages(self, plants: Iterable[PlantState]) -> list[Output]:
-        """Return the messages to neighbours that are due by the events taken since rows last became final.
+        """Return the messages to neighbours that are due after the events since rows last became final.
 
-        None of a network that is no single node.
+        There are none if the network is not a single node.
         """
         if self._node is None:
             return []
@@ -74,16 +74,16 @@ class NeighbourMessenger:
         return due
 
     def _has_measurement(self, events: Iterable[tuple[int, int, float]]) -> bool:
-        """Return whether events include the node's measurement, or any message where the node has no sensor.
+        """Return whether events include the node's measurement, or for a node without a sensor any message.
 
-        An event's key is (number of the node, count, time).
-        The node itself is number 0 of its network; its neighbours, whose messages come to it, follow.
+        An event is (number of the sender, count, time). The node itself has number 0, and its neighbours have the
+        numbers after it.
         """
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
     def _make_row_messages(self, plant: PlantState, row: HeldRow) -> list[Output]:
-        """Return a row's message to each neighbour: the node's estimate and covariance before it, its measurement."""
+        """Return a row's message to each neighbour: the estimate and covariance before the row, and its measurement."""
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])

@@ -81,7 +81,7 @@ class ObservedService:
         return self.service.unpublished()
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Let the service take a batch, and record its outputs; without messages, no statistics of a batch."""
+        """Let the service take a batch, and record its outputs; an empty batch is not in the batches' statistics."""
         with self.watch.taking_batch():
             outputs = self.service.take(payloads)
             self.watch.note(outputs, self.service.last if payloads else None)

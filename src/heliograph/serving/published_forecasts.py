@@ -43,10 +43,10 @@ class ForecastPublisher:
     """
 
     def __init__(self, fleet: Fleet, horizons: Spans, thresholds: Thresholds = ()):
-        """Check thresholds and horizons against the network; raise ValueError where they do not fit it."""
+        """Check thresholds and horizons against the network; raise ValueError if they do not fit."""
         check_threshold_names(fleet.network, thresholds)
         self._thresholds = thresholds
-        # Time is continuous, or counts steps. Horizons are in its unit.
+        # `self.horizons` are in the unit of time: steps, or seconds if time is continuous.
         self._fleet, self._continuous = fleet, fleet.program.dt is not None
         if isinstance(horizons, int):
             if self._continuous:
@@ -106,12 +106,12 @@ class ForecastPublisher:
         return results
 
     def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], number: int) -> list[Ahead]:
-        """Return the forecasts from the row with this number among those in `bodies`, by horizon; `now`: its time.
+        """Return the forecasts from row `number` of `bodies`, one for each horizon; `now` is the row's time.
 
-        Each: its time, how far ahead it is in seconds (or in the unit of times that are numbers), and by node and
-        filter what is published.
+        A forecast is (its time, how far ahead it is, {node: {filter: what is published}}). How far is in seconds, or in
+        the unit of times that are numbers.
         """
-        unit = 1.0 if self._continuous else self._fleet.options.step or 1.0  # seconds of a step, where steps have dates
+        unit = 1.0 if self._continuous else self._fleet.options.step or 1.0  # seconds of a step, if they are known
         results: list[Ahead] = []
         for i, distance in enumerate(self.horizons):
             by_filter: dict[str, dict[str, object]] = {
@@ -152,7 +152,7 @@ class ForecastPublisher:
     ) -> dict[str, list[dict[str, float]]]:
         """Return {threshold: probabilities that it is crossed, by horizon}, for the states and outputs of a filter.
 
-        {} for a filter that claims no covariance. `place`: its node and name.
+        It is {} if the filter claims no covariance. `place` is the filter's node and name.
         """
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
@@ -182,9 +182,9 @@ def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
 
 
 def _add_outputs(bodies: Bodies, names: Sequence[str], mean: np.ndarray, deviation: np.ndarray) -> None:
-    """Add the outputs' means and deviations, each (row, horizon, output), to `bodies`; a NaN deviation as null.
+    """Add the outputs' means and deviations, each (row, horizon, output), to `bodies`; NaN becomes null.
 
-    `bodies`: by row and horizon, what is published of a filter's forecast.
+    `bodies` holds by row and horizon what is published of a filter's forecast.
     """
     for bodies_of_row, *numbers_of_row in zip(bodies, mean.tolist(), deviation.tolist(), strict=True):
         for body, means, deviations in zip(bodies_of_row, *numbers_of_row, strict=True):

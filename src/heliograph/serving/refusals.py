@@ -17,9 +17,9 @@ WHY: dict[Verdict, str] = {
 
 
 def make_refusal_of_message(message: Read, why: str, detail: str) -> Entry:
-    """Return the refusal of a message, to be published, with what names it as far as it was read.
+    """Return the refusal of a message, to be published, with its node, sequence and time if these were read.
 
-    `why`: the kind of reason; `detail`: it in words.
+    `why` is the kind of reason, and `detail` the reason in words.
     """
     if isinstance(message, str):  # nothing was read
         return make_refusal_entry(None, {}, why, detail)

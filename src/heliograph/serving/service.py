@@ -114,7 +114,7 @@ class Service:
         return outputs
 
     def resume(self) -> None:
-        """Load the stored plants, up to ROWS rows, where a silent sender says something: its silence goes on."""
+        """Load stored plants, up to ROWS rows, if silence of a sender has a meaning: it goes on while nothing runs."""
         if (self.fleet.deciding and self.fleet.options.step is not None) or self.fleet.shortest_timeout < inf:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
@@ -123,7 +123,7 @@ class Service:
             self._silence.resume(self.plants)
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
-        """Return provisional estimates by now of plants of which a sender has timed out; nothing is committed."""
+        """Return provisional estimates of the plants in which a sender has timed out by now; nothing is committed."""
         late = self._silence.find_plants_overdue(self.plants.values(), now)
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
@@ -156,7 +156,7 @@ class Service:
             return []
 
     def _make_step_messages(self, now: datetime) -> list[Message]:
-        """Return a message for each plant of which another step has begun: null inputs, which stay as they were."""
+        """Return a message for each plant in which a new step has begun; its null inputs mean that inputs stay."""
         unchanged: list[float | None] = [None] * self.fleet.program.given
         return [
             Message.model_construct(
@@ -190,9 +190,9 @@ class Service:
         return outputs
 
     def dead_senders(self) -> dict[str, int]:
-        """Count, for each node of which silence says something, the plants in memory of which its sender is dead.
+        """Return for each node whose silence has a meaning in how many plants in memory its sender is dead.
 
-        Dead is one that was silent for longer than its rule, or its timeout, allows.
+        A sender is dead if it was silent for longer than its rule or its timeout allows.
         """
         dead = dict.fromkeys(self.fleet.watched, 0)
         for nodes in self.dead_by_plant().values():
@@ -219,7 +219,7 @@ class Service:
         self._published = max(numbers, default=self._published)
 
     def finish(self, ended: bool) -> list[Output]:
-        """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
+        """Commit everything; if messages have `ended` and there is no store, all rows become final."""
         ending_plants = list(self.plants.values()) if ended and not self.store.keeps else []
         finalised = self.fleet.finalise_plants(ending_plants, all_=True)
         entries = self._write_finals(finalised)
@@ -254,11 +254,11 @@ class Service:
         return outputs + sent + provisional, committed
 
     def _warn_of_doubts(self, plants: Sequence[PlantState]) -> None:
-        """Warn, by `_doubt`, of what is new: angles known too little, readings that repeat, remarks of filters."""
+        """Warn by `_doubt`, if it is given, of new doubts: vague angles, repeated readings, and filters' remarks."""
         if self._doubt is not None:
             for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
                 self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
-        for name, line in self._remarks.find_new(plants):  # which counts them too
+        for name, line in self._remarks.find_new(plants):  # also counts them, so it is always called
             if self._doubt is not None:
                 self._doubt(f"warning: plant {name!r}, {line}")
 
@@ -291,9 +291,9 @@ class Service:
         return entries, malformed, known
 
     def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
-        """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
+        """Return an entry for a message that was refused, and one for each part of a message that was left out.
 
-        `outcome` has a verdict other than "used" (None: unread), or notes on parts of the message.
+        `outcome` has a verdict other than "used" (None: unread), or notes on parts. Warn of the first implausible one.
         """
         entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
         if outcome.verdict is not None and outcome.verdict != "used":
@@ -303,7 +303,7 @@ class Service:
         return entries
 
     def _warn_of_implausible(self, message: AnyMessage, why: str) -> None:
-        """Report the first implausible message by `_say`, once."""
+        """Report the first implausible message by `_say`; later ones are not reported."""
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""
             what = f"message {message.sequence} of {message.node!r} {plant}is implausible"
@@ -344,7 +344,7 @@ class Service:
         self._silence.forget_plant(name)
 
     def _load_plants(self, names: Iterable[str]) -> None:
-        """Load the plants of these names that are not in memory from the store; note in `_damage` the damaged ones."""
+        """Load the plants of these names that are not in memory from the store; `_damage` notes the damaged ones."""
         self._damage = {}
         for name, stored in self.store.load([name for name in names if name not in self.plants]).items():
             if stored.damage:
@@ -352,16 +352,16 @@ class Service:
                 continue
             plant = self.plants[name] = unpack_plant(name, stored.body, self.fleet)
             plant.version = stored.version
-            self._remarks.note_said(plant)  # what was said of it before is not said again
+            self._remarks.note_said(plant)  # remarks that were said before are not said again
 
     def _write_finals(self, finalised: Iterable[FinalisedPlant]) -> list[Entry]:
-        """Return entries to publish with final estimates: of rows now too old to change, if they have measurements."""
+        """Return entries with final estimates: those of rows that can no longer change and have measurements."""
         rows = [(each.plant, row) for each in finalised for row in each.final if row.has_data()]
         bodies = self._write_estimates(b"final", rows)
         return [Entry(plant.name, "final", body) for (plant, _), body in zip(rows, bodies, strict=True)]
 
     def _write_withdrawn(self, plant: PlantState, events: Iterable[WithdrawnEvent]) -> Iterator[Entry]:
-        """Yield a refusal of each event of a plant that was used before its clock turned out wrong (LEAPT)."""
+        """Yield a refusal for each event that a plant used before the event's clock turned out wrong (LEAPT)."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             identity = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
@@ -387,7 +387,7 @@ class Service:
         return outputs
 
     def _write_estimates(self, kind: bytes, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[bytes]:
-        """Return the estimates after these rows as lines of JSON, one each; `kind` is "final" or "provisional"."""
+        """Return the estimate after each row as a line of JSON; `kind` is "final" or "provisional"."""
         moments = [(plant.name, row.key[0] if plant.origin is None else self._time_in_messages(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
         return self._writer.write_lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))

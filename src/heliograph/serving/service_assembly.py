@@ -154,9 +154,9 @@ async def _serve_exactly(parts: dict[int, _ServedPart], leases: PartLeases, serv
 
 
 def _drop_ended(parts: dict[int, _ServedPart]) -> None:
-    """Remove the parts of the plants whose service ended by itself; raise what it failed with.
+    """Remove the parts of the plants whose service ended by itself; raise the error by which it failed.
 
-    Where another process took the part over, that is only logged. `parts`: by number, those that are served here.
+    If another process took the part over, this is only logged. `parts` holds by number the parts that are served here.
     """
     for number, part in list(parts.items()):
         if part.work.done():
@@ -195,7 +195,7 @@ async def _compile_steps(network: Network) -> NetworkProgram | None:
 
 
 def _log_to_stderr() -> None:
-    """Log what happens to connections on the standard error, unless the program has said where its log goes."""
+    """Log what happens to connections to standard error, unless the program has configured its log."""
     if not LOG.handlers and not logging.getLogger().handlers:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("heliograph: %(message)s"))
@@ -258,9 +258,10 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
 
 
 def _choose_patience(fleet: Fleet) -> float | None:
-    """Return after how many seconds without a message its silence is used; None where silence says nothing.
+    """Return the seconds without a message after which silence is evaluated, or None if silence has no meaning.
 
-    That is after a step, where steps have a length; else SHORTEST, where nodes have a timeout (inf: none has).
+    It is the length of a step if that is known, but at least SHORTEST. Else it is SHORTEST if some node has a timeout
+    (`shortest_timeout` is inf if none has).
     """
     if fleet.options.step is not None:
         return max(fleet.options.step, SHORTEST)
@@ -268,9 +269,9 @@ def _choose_patience(fleet: Fleet) -> float | None:
 
 
 def _open_transport(settings: ServiceSettings, reader: Translator | None) -> Transport:
-    """Return what brings messages and takes outputs, of all plants: a broker, or standard input and output.
+    """Return the transport of all plants' messages and outputs: a broker, or standard input and output.
 
-    With single states published beside it if asked for. `reader`: of messages in other forms than our own.
+    If `settings.states` is given, single states are published too. `reader` reads messages that sources map.
     """
     if settings.broker is None:
         return _add_states(settings, _open_pipe(settings, reader))
@@ -278,7 +279,7 @@ def _open_transport(settings: ServiceSettings, reader: Translator | None) -> Tra
 
 
 def _add_states(settings: ServiceSettings, transport: Transport) -> Transport:
-    """Return the transport with each state published by itself beside it, on MQTT, where that is asked for."""
+    """Return a transport that also publishes each state by itself, on MQTT, if `settings.states` asks for it."""
     if settings.states is None:
         return transport
     from heliograph.serving.brokers.state_topics import StatePublishing

@@ -156,7 +156,7 @@ async def _await_unless_stopped(stop: asyncio.Event, waiting: Coroutine[object, 
 
 @contextmanager
 def set_stop_on_signals(stop: asyncio.Event) -> Iterator[None]:
-    """Set `stop` on SIGTERM and SIGINT, for the duration of a block; then the handlers before are back."""
+    """Within the `with` block, set `stop` on SIGTERM and SIGINT; then restore the earlier handlers."""
     loop, numbers = asyncio.get_running_loop(), (signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(number) for number in numbers]
     for number in numbers:

@@ -93,7 +93,7 @@ class ServiceSettings:
             self._check_sharing()
 
     def _check_sharing(self) -> None:
-        """Raise ValueError if something asked for does not go with --parts: processes that share the plants."""
+        """Raise ValueError if a setting does not go with --parts, by which processes share the plants."""
         if self.states is not None:
             raise fail("--states", "one process, whose end says offline (no --parts)", "--parts")
         if self.store is None or self.broker is None:
@@ -103,10 +103,10 @@ class ServiceSettings:
 
 
 def choose_store_location(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
-    """Return the path or URL of the store: `given`, else a file in this folder named after the network and its node.
+    """Return the path or URL of the store: `given`, or else a file named after the network and its node.
 
-    None, for "none" (NOTHING), keeps no state. Processes that share the plants in `parts` have no such default: they
-    must all name the store.
+    The answer None keeps no state. It is that of "none" (NOTHING), and of processes that share the plants in `parts`
+    and name no store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
@@ -143,15 +143,15 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
 
 
 def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float | None]:
-    """Return the sources of a node's own messages, by topic (None: it has none), and the seconds of a step.
+    """Return the sources of a node's own messages by topic (None if it has none), and the seconds of a step.
 
-    A source says how a topic's messages are read; what is no mapping of them, as None, is left to others to judge. The
-    step is that of all nodes, as any source says it; else as the settings have it.
+    A source says how a topic's messages are read. Sources that are not a mapping are returned unchecked. All nodes have
+    the same step: that of any source, or else that of the settings.
     """
     sources, step = settings.sources, settings.options.step
     if not isinstance(sources, Mapping):
         return sources, step
-    # One source stands for a list of one.
+    # A topic may have a single source instead of a list.
     by_topic = {topic: list(items) if isinstance(items, Sequence) else [items] for topic, items in sources.items()}
     step = next((source.step for items in by_topic.values() for source in items if isinstance(source, Source)), step)
     measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
@@ -162,10 +162,10 @@ def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float
 
 
 def _is_for_node(source: object, node: str, measures: bool) -> bool:
-    """Return whether a source is for a node: its own, of the inputs, or of a node that the message names.
+    """Return whether a source is for a node: the source names the node, the inputs, or leaves the name to messages.
 
-    The last, whose `node` is no text but says where in a message the name is, if the node measures something
-    (`measures`). What is no Source is refused later.
+    In the last case `source.node` is no text, but says where the name stands in a message. It is then for the node if
+    the node measures something (`measures`). Anything that is no Source is kept, and refused later.
     """
     if not isinstance(source, Source) or source.node in (node, INPUTS):
         return True
@@ -179,10 +179,9 @@ def _address_below(address: Address, node: str) -> Address:
 
 
 def name_of_network(network: str) -> str:
-    """Return a name for files of a network, which is given as `my_network.py` or module `a.my_network`: my_network.
+    """Return a name for a network's files: "my_network" for `my_network.py` and for the module `a.my_network`.
 
-    With `:name` behind, which chooses one of several networks there, "-name" follows. A colon before what is no name,
-    as in a path, is part of the file.
+    `:name` at the end chooses one of several networks, and adds "-name". Any other colon is part of a path.
     """
     file, _, name = network.rpartition(":")
     if not file or not name.isidentifier():

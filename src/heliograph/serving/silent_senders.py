@@ -45,10 +45,10 @@ class SilenceWatch:
     def __init__(self, fleet: Fleet, every: float | None):
         """Begin with nothing published; `every`: seconds after which an estimate is published again; None for never."""
         self.fleet, self.every = fleet, every
-        self._begun, self._looked = monotonic(), -inf  # when this started, and when timeouts were looked for last, s
-        self._published: dict[str, PublishedEstimate] = {}  # by plant, the newest
-        self._resumed = set[str]()  # plants of before this start, of which messages may wait somewhere
-        # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance, which is row by row.
+        self._begun, self._looked = monotonic(), -inf  # seconds of the start, and of the last look for timeouts
+        self._published: dict[str, PublishedEstimate] = {}  # the newest of each plant
+        self._resumed = set[str]()  # plants from before this start; their messages may still wait at a broker
+        # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance (n, n), row by row.
         n, all_columns = len(fleet.network.states), fleet.program.filter_columns
         self._means = np.array([[each.mean + i for i in range(n)] for each in all_columns], dtype=int)
         self._variances = np.array(
@@ -60,16 +60,16 @@ class SilenceWatch:
         self._resumed.update(names)
 
     def find_plants_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
-        """Return the plants of which another step has begun by now without a message, with its number.
+        """Return pairs of a plant in which a new step has begun without a message, and the step's number.
 
-        Only where steps have a length, and senders decide when to send: their silence then says something.
+        There are none unless steps have a length and senders decide when to send: only then silence has a meaning.
         """
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
         for plant, origin in self._iterate_dated_plants(plants):
             present_step = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
-            # The clock also confirms or contradicts a leap in time that no other clock has confirmed so far.
+            # A step of this clock also confirms or contradicts a leap in time that no other clock has confirmed.
             leap = plant.leap
             has_open_leap = leap is not None and leap.now > -inf and not leap.believed
             has_new_step = present_step > plant.rows.held[-1].key[0]
@@ -78,9 +78,10 @@ class SilenceWatch:
         return due
 
     def find_plants_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
-        """Return the plants of which a sender is silent for longer than its timeout, and was not when last published.
+        """Return pairs of a plant in which a sender has newly timed out, and the present moment.
 
-        With the present moment by the clock, from the plant's origin: its step, or seconds where time is continuous.
+        A sender has newly timed out if it was not dead in the plant's last published estimate. The moment counts from
+        the plant's origin, in steps or, if time is continuous, in seconds.
         """
         if self.fleet.shortest_timeout == inf:
             return []
@@ -95,19 +96,19 @@ class SilenceWatch:
         return overdue
 
     def looks_between_batches(self, lag: float) -> bool:
-        """Return whether to look for timeouts after a batch: once in SHORTEST, a second, if messages are in time.
+        """Return whether to look for timeouts after a batch: at most once in SHORTEST, and if messages are in time.
 
-        `lag`: age of the batch's oldest message, s. Where messages wait for longer than a timeout (steps, or s), a
-        sender only seems silent. Without any timeout (inf) there is nothing to look for.
+        `lag`: age of the batch's oldest message in seconds. If messages wait longer than a timeout, a sender only seems
+        silent. Without any timeout (inf) there is nothing to look for.
         """
         timeout = self.fleet.shortest_timeout * (self.fleet.options.step or 1.0)  # seconds
         are_messages_in_time = lag < timeout < inf
         return are_messages_in_time and monotonic() > self._looked + SHORTEST
 
     def _iterate_dated_plants(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
-        """Yield the plants whose times are dates, with their origins; not those of which messages may wait.
+        """Yield (plant, origin) for plants whose times are dates, unless their messages may still wait at a broker.
 
-        These are the plants of before this start (`_resumed`), for GRACE seconds or until a message came.
+        Messages may wait for plants from before this start (`_resumed`), for GRACE seconds or until a message comes.
         """
         if self._resumed and monotonic() > self._begun + GRACE:
             self._resumed.clear()
@@ -116,7 +117,7 @@ class SilenceWatch:
                 yield plant, plant.origin
 
     def note_published(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
-        """Note that the estimates after these rows were published, to compare with later ones: outputs, dead, time."""
+        """Note the published estimates after these rows (outputs, dead senders, time), to compare with later ones."""
         if self.fleet.watched:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
@@ -161,9 +162,9 @@ class SilenceWatch:
 
 
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
-    """Return the nodes whose sender is dead, silent for longer than its rule or timeout allows, by plant with one.
+    """Return {plant: nodes whose sender is dead}: it has been silent longer than its rule or timeout allows.
 
-    None where silence says nothing of any node (`watched`).
+    Plants without dead senders are left out. If silence has no meaning for any node (`watched`), the answer is {}.
     """
     dead = {
         name: [node for node, status in fleet.find_sender_status(plant).items() if status.dead]

@@ -39,13 +39,13 @@ Thresholds = TypeAliasType("Thresholds", tuple[Threshold, ...])
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Return the threshold that is typed as a name, a sign and a number: a state's level, and on which side to be.
+    """Return a threshold from a name, a sign and a number: the level of a state or output, and the side to be on.
 
     Args:
         text: a name, a sign and a number, as level>30 or flow<600.
 
     Raises:
-        ValueError: what is no name, sign and number.
+        ValueError: the text is not a name, a sign and a number.
     """
     match = TYPED.fullmatch(text) if isinstance(text, str) else None
     try:
@@ -59,7 +59,7 @@ def check_threshold_names(network: Network, thresholds: Thresholds) -> None:
     """Raise ValueError unless each threshold is of a state of the network or of an output of its sensors.
 
     Raises:
-        ValueError: a threshold of anything else, or any of a plant of modes, whose paths cannot be drawn.
+        ValueError: a threshold is of anything else, or the plant has modes, so that its paths cannot be drawn.
     """
     if thresholds and isinstance(first(network.plant), ModalPlant):
         raise fail("--threshold", "a plant of one law of motion, whose paths can be drawn", "a markov_plant")

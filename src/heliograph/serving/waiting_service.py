@@ -60,9 +60,9 @@ class WaitingService:
         return retry_while_away(lambda: self._take_and_recall(payloads), self._stop)
 
     def _take_and_recall(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Take a batch; return its outputs, behind those that a commit before it left, if it failed.
+        """Take a batch; return its outputs, and before them those that a failed commit left unpublished.
 
-        A store that goes away in a commit may have made it: what it then has was not published.
+        A store that goes away during a commit may have completed it. Its outputs were then not published.
         """
         unpublished = self.service.unpublished() if self._failed else []
         try:

@@ -148,7 +148,7 @@ def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
 def _rescale_parts(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
     """Return the filters of a sequential filter's parts in other units.
 
-    Factors of the parts' outputs, and of their measurements, follow one another in `units`.
+    In `units`, the factors of the parts' outputs follow one another, and so do those of their measurements.
     """
     rescaled, output_begin, received_begin = [], 0, 0
     for single in filter.filters:
@@ -197,9 +197,9 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
 
 
 def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarray, AbstractNoise | np.ndarray]:
-    """Return center and law (or covariance) of the initial state S x_0, S = diag(s).
+    """Return the center and the law (or the covariance) of the initial state S x_0 with S = diag(s).
 
-    A law is that of the deviation from a center, which is the mean less the deviation's own mean.
+    A law is that of the deviation from the center. The center is the mean minus the deviation's own mean.
     """
     if plant.deviation is None:
         return s * plant.initial_mean, np.outer(s, s) * plant.initial_covariance
@@ -210,9 +210,9 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 def _rescale_matrix(
     matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one.
+    """Return the matrix with the elements out_i A_ij / into_j; it is a function of the inputs if A is one.
 
-    `inputs`: factors of the inputs, by which they are divided before the function of them is called.
+    `inputs` are the factors by which the inputs are divided before this function is called.
     """
     factor = out[:, None] / into
     if isinstance(matrix, MatrixOfInputs):
@@ -229,7 +229,7 @@ def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
 def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
     """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R.
 
-    S and R are diagonal, of the factors of states and outputs in `units`; V: covariance of the noise.
+    S and R are the diagonal matrices of the factors of states and outputs in `units`. V is the noise's covariance.
     """
     s, r = units.states, units.outputs
     noise = _rescale_noise(sensor.noise, r)
@@ -247,9 +247,8 @@ def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrd
 def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
 
-    It is z = Q G R^-1 y + Q n then; R and Q are diagonal, of the factors in `units`.
-
-    `factor`: of the second moment of each pair of entries of (G, n), the product of the two entries' factors.
+    In these units it is z = Q G R^-1 y + Q n, where R and Q are diagonal matrices of the factors in `units`. `factor`
+    holds for each pair of entries of (G, n) the product of the entries' factors, which scales their second moment.
     """
     q, (_, factor) = units.received, _list_channel_factors(units)
 
@@ -282,7 +281,7 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
 def _rescale_combinations(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
     """Return the combinations of a filter's atoms with state and measurements in other units.
 
-    A combination: one value of each discrete gain, with its probability `weight` and the channel that it makes.
+    A combination takes one value of each discrete gain. It has the probability `weight` and a channel.
     """
     values = stack_over_time(components)
     q = units.received
@@ -298,10 +297,10 @@ def _rescale_combinations(components: AtomCombinations | OverTime, units: Units)
 
 
 def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> UnconditionalMean | None:
-    """Return the mean before data with state and measurements in other units.
+    """Return the mean before data (None if there is none) with state and measurements in other units.
 
-    With x in units S and z in units Q: the start is S E[x_0], the transition S A S^-1, the drift S b, and the
-    matrix with which the mean is received Q M S^-1.
+    With the diagonal factors S of states and Q of measurements, the start is S E[x_0], the transition S A S^-1, the
+    drift S b, and the matrix by which the mean is received Q M S^-1.
     """
     if centre is None:
         return None

@@ -62,8 +62,8 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
 def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -> float:
     """Compare the mean of the products of two successive draws' entries with the moments.
 
-    A draw is M = (G, n) of z = G y + n. By the modes, E[M_1 x M_2] = sum_ij p_i T_ij E[M | i] x E[M | j] with the
-    initial probabilities p and the transitions T, where x pairs every entry with every other.
+    A draw is M = (G, n) of z = G y + n. For the modes i and j, E[M_1 x M_2] = sum_ij p_i T_ij E[M | i] x E[M | j] with
+    initial probabilities p and transition matrix T, where x is the outer product.
 
     Args:
         modes: the channel's modes.
@@ -73,7 +73,7 @@ def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -
     Returns:
         The largest difference between samples and moments, in standard errors.
     """
-    # Without the last row of each mean, that of the constant 1.
+    # Drop the last row of each mean, which belongs to the constant 1.
     means = np.array([mode_map.moments(1).mean[:-1] for mode_map in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
     products = np.einsum("sab,scd->sabcd", now, later)
@@ -118,13 +118,12 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
     """
 
     def draw_two(words: jax.Array) -> PyTree:
-        """Return the state at the start, then state and draw after one draw and after a second, then `sample`'s draw.
+        """Return (start state, state and draw after a first draw, state and draw after a second, `sample`'s draw).
 
-        `sample` draws by the key of the first draw; () of a map that remembers, which has no such function.
-
-        `channel`: the map that is tested; `words`: the data of a random key.
+        `channel.sample` draws with the key of the first draw. A channel that remembers has no `sample`, and the entry
+        is (). `words` is the data of a random key.
         """
-        # A draw may split its key: keys of one split are no parts of each other, as fold_in(key, 1) is of split(key).
+        # A draw may split its key, so the keys come from one split: none of them can come again from another.
         at_start, at_first, at_second = jax.random.split(jax.random.wrap_key_data(words), 3)
         start = channel.init(at_start)
         after_first, h_1 = channel.draw(start, at_first)
@@ -151,7 +150,7 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
 
 
 def _evaluate_monomials(z: np.ndarray, order: int) -> np.ndarray:
-    """Return the monomials of an order of (z, 1), of each row of z (samples, outputs), as (samples, monomials)."""
+    """Return the monomials of this order in (z, 1) for each row of z (samples, outputs), as (samples, monomials)."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = list_exponents(len(columns), order)
@@ -161,10 +160,10 @@ def _evaluate_monomials(z: np.ndarray, order: int) -> np.ndarray:
 def _compare_means(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
     """Compare means over samples (samples, numbers) with expected ones (numbers,); return the largest difference.
 
-    It is in standard errors of the mean. A number that does not vary has to agree to rounding.
+    The difference is in standard errors of the mean. A number that does not vary must agree up to rounding.
 
     Raises:
-        AssertionError: a difference that is more than chance.
+        AssertionError: a difference is larger than chance allows.
     """
     standard_error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)
@@ -172,7 +171,7 @@ def _compare_means(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray
     is_constant = standard_error <= 1e-12 * scale  # the number does not vary: moments must agree to rounding
     assert np.all(difference[is_constant] <= 1e-9 * scale[is_constant]), f"{what}: a known moment differs"
     ratios = difference[~is_constant] / standard_error[~is_constant]
-    # Two-sided, with the probability of a false alarm shared by all numbers.
+    # The test is two-sided, and all numbers share the probability of a false alarm.
     limit = float(scipy.stats.norm.isf(FALSE_ALARM / 2 / max(len(ratios), 1)))
     largest = float(ratios.max(initial=0.0))
     assert largest <= limit, f"{what}: a moment differs from the samples by {largest:.1f} standard errors"

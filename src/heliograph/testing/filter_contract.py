@@ -165,12 +165,12 @@ def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
 
 
 def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFilter, k: int) -> None:
-    """Check that an innovation has NaN just where nothing arrived, and a likelihood that fits."""
+    """Check that an innovation is NaN exactly where nothing arrived, and that its likelihood agrees with that."""
     m, missing, likelihood = len(z), np.isnan(z), float(innovation.log_likelihood)
     value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
     assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"
     assert np.array_equal(np.isnan(value), missing), f"step {k}: expected an innovation of NaN where z is, only there"
-    # Silence tells something where a sender decides when to send.
+    # If a sender decides when to send, silence has a likelihood too.
     if np.all(missing) and filter.silence_tells:
         assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood of silence, got {likelihood:g}"
     elif np.all(missing):
@@ -182,9 +182,9 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
 
 
 def _check_same(what: str, estimate: Estimate, expected: Estimate) -> None:
-    """Raise AssertionError unless estimates are equal to rounding.
+    """Raise AssertionError unless two estimates are equal up to rounding.
 
-    ROUNDING: the relative difference that is allowed. `what`: the operation, for the error's words.
+    ROUNDING is the allowed relative difference. `what` names the operation in the error.
     """
     for name in ("mean", "covariance"):
         a, b = np.asarray(getattr(estimate, name)), np.asarray(getattr(expected, name))

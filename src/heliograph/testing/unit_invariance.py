@@ -75,7 +75,7 @@ def check_scaling(
 
 
 def _list_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes, all of which must measure the plant themselves."""
+    """Return the nodes by name; raise ValueError if some node does not measure the plant itself."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(nodes) < len(network.nodes):
         raise fail("network to rescale", "nodes that receive the plant themselves", "a network of relays")
@@ -159,10 +159,11 @@ def _compare_runs(
 
 
 def _count_possible_rows(network: Network, node: str, name: str, z: dict[str, np.ndarray], u: np.ndarray) -> int:
-    """Return how many rows come before the first that a filter of this estimate holds for impossible.
+    """Return how many rows come before the first row that a filter of this estimate finds impossible.
 
-    A log-likelihood of -inf: the row contradicts what is certain by the filter's model, as where one that trusts the
-    mean gain receives a noise-free output over two links. How far it follows which of them is left to rounding.
+    An impossible row has a log-likelihood of -inf: it contradicts what the filter's model holds for certain. This
+    happens if a filter that trusts the mean gain receives a noise-free output over two links. After such a row the
+    estimate depends on rounding.
     """
     fusion = network.fused[name] if node == Network.FUSED else network.nodes[node].filters[name]
     if isinstance(fusion, AbstractFilter):
@@ -172,12 +173,12 @@ def _count_possible_rows(network: Network, node: str, name: str, z: dict[str, np
         nodes = network.nodes_with(fusion.filter)
         filters = [(network.nodes[single].filters[fusion.filter], z[single]) for single in nodes]
     is_impossible = [np.isneginf(filter.run(rows, u).log_likelihoods) for filter, rows in filters]
-    # The index of the first impossible row; a True behind all rows stands for none.
+    # The index of the first impossible row. The True after all rows counts if there is none.
     return int(np.argmax(np.append(np.any(is_impossible, axis=0), True)))
 
 
 def _check_differences(name: str, differences: np.ndarray) -> float:
-    """Return the largest of the differences by step, as shares of what is allowed; raise AssertionError above 1."""
+    """Return the largest of the steps' differences, as a share of what is allowed; raise AssertionError above 1."""
     largest = float(np.max(differences, initial=0.0))
     assert largest <= 1, f"{name}: expected the same estimate in other units, off at step {int(np.argmax(differences))}"
     return largest
@@ -207,12 +208,12 @@ def _find_difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
 def _rescale_node(name: str, node: Node, units: Units) -> Node:
     """Return the node in other units, after checking that its channel's moments change as they must."""
     channel = first(node.channel)
-    # Of a channel without memory: the map of each set of losses.
+    # The maps of a channel without memory, one for each set of losses.
     maps = [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]
     for affine in maps:
         in_units = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
         difference = _measure_difference(rescale_channel(second_order(affine), units), second_order(in_units))
-        # DIGITS: the largest relative difference that is allowed.
+        # DIGITS is the largest allowed relative difference.
         assert difference <= DIGITS, f"{name}: expected the channel's moments in other units, off by {difference:.3g}"
     filters = {filter_name: rescale_filter(filter, units) for filter_name, filter in node.filters.items()}
     return Node(rescale_sensor(node.sensor, units), _change_units_of_channel(node.channel, units), filters)
@@ -226,9 +227,9 @@ def _change_units_of_channel(channel: Channel, units: Units) -> Channel:
 
 
 def _measure_difference(a: SecondOrder, b: SecondOrder) -> float:
-    """Return the largest difference of two descriptions' second moments E[M_ia M_jb], relative to each entry's scale.
+    """Return the largest difference of two descriptions' second moments E[M_ia M_jb], relative to their scales.
 
-    The scale of an entry of M = (G, n) is the root of its mean square, that of a product the product of its two.
+    The scale of an entry of M = (G, n) is the root of its mean square. That of a product is the product of two scales.
     """
     moments_of_a, moments_of_b = _find_largest_moments(a), _find_largest_moments(b)
     spread, _, power, _ = moments_of_a
@@ -248,7 +249,7 @@ def _find_largest_moments(described: SecondOrder) -> list[np.ndarray]:
 
 
 def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
-    """Return a central filter in other units, or a fusion as it is: its rule has no units."""
+    """Return a central filter in other units; a fusion stays as it is, since its rule has no units."""
     if isinstance(fusion, AbstractFilter):
         return rescale_filter(fusion, units)
     if fusion.quantizer is not None:
@@ -257,7 +258,7 @@ def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) ->
 
 
 def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
-    """Return whether a trace is minimised on the way to this estimate."""
+    """Return whether this estimate depends on a search that minimises a trace."""
     if node != Network.FUSED:
         return _has_search(network.nodes[node].filters[name])
     fusion = network.fused[name]
@@ -269,7 +270,7 @@ def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
 
 
 def _has_search(filter: AbstractFilter) -> bool:
-    """Return whether a filter minimises a trace by a search: other units change its answers by its tolerance."""
+    """Return whether a filter minimises a trace by a search, whose result depends on units within its tolerance."""
     match filter:
         case GaussianFilter() | LinearFilter():
             return bool(first(filter.channel).uncertain)

@@ -29,27 +29,27 @@ class SharedSlots:
     """Layout of numbers that all runs share, which one function computes and the other reads; all turns of a loop's."""
 
     def __init__(self, size: int):
-        """Begin the layout at byte `size` of the memory that is shared."""
-        self.size = size  # bytes that are taken
+        """Begin the layout at byte `size` of the shared memory: the bytes before it are taken already."""
+        self.size = size  # bytes that are taken so far
         self.places: dict[Node, int] = {}  # the first byte of each number
         self.base = ""  # name of the pointer to the memory, in LLVM's text
 
     def offset_of(self, node: Node) -> int:
-        """Return the offset of a shared number in bytes, assigned at its first use: 8 for each turn of its loops."""
+        """Return the offset of a shared number in bytes, assigned at its first use; each turn of its loops takes 8."""
         if node not in self.places:
             self.places[node] = self.size
             self.size += 8 * node.block.count_turns()
         return self.places[node]
 
     def load(self, writer: "FunctionWriter", node: Node) -> str:
-        """Write the load of a shared number, a flag from its byte; return the name of the scalar."""
+        """Write the load of a shared number, and return the name of the scalar; a flag is stored as a byte."""
         address = self._write_address(writer, node)
         if node.type == "bool":
             return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
         return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
 
     def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
-        """Write the store of a shared number, by its `name`, for the function of blocks to load; a flag as a byte."""
+        """Write the store of a shared number, named `name`, for the function of blocks to load; a flag is a byte."""
         kind = vector_type(node.type)
         address = self._write_address(writer, node)
         if node.type == "bool":
@@ -129,13 +129,13 @@ class FunctionWriter:
         self.start_basic_block(f"next{self.count}")
 
     def _note_name(self, node: Node, name: str) -> None:
-        """Note the LLVM name of a node's value; in the function of what runs share, store it if the other loads it."""
+        """Note the LLVM name of a node's value; if the function of blocks loads it, a `single` function stores it."""
         self.scopes[-1][node] = name
         if self.single and node in self.slots.places:
             self.slots.store(self, node, name)
 
     def _write_node(self, node: Node) -> str:
-        """Write the operation of a node, a sum with a product as one fused operation; return the name of its result."""
+        """Write a node's operation, fused with a product of `self.products` if it adds one; return its name."""
         if node.op == "load":
             return self._write_load(node)
         product = find_fused_product(node, self.products)
@@ -148,7 +148,7 @@ class FunctionWriter:
         return write_operation(node, [self.write_operand(a) for a in node.args], self.add)
 
     def write_operand(self, node: Node) -> str:
-        """Return the LLVM name of a node as a vector: noted in a scope, a constant, or a shared number in all lanes."""
+        """Return the LLVM name of a node's vector: noted in a scope, a constant, or a shared number in all lanes."""
         for scope in reversed(self.scopes):
             if node in scope:
                 return scope[node]
@@ -182,7 +182,7 @@ class FunctionWriter:
         return node.op in ("constant", "counter") or node not in self.mine or self.single
 
     def write_broadcast(self, name: str, type: Type) -> str:
-        """Return the name of a vector with a scalar in all lanes; `single`: vectors have one."""
+        """Return the name of a vector that has a scalar in all lanes; in `single` functions a vector has one lane."""
         kind = vector_type(type)
         first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
         if self.single:
@@ -207,7 +207,7 @@ class FunctionWriter:
         return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
 
     def _write_base(self, owner: Buffer) -> str:
-        """Return the address of a buffer's memory; in this turn of its loops, if it has a copy for each (`turning`)."""
+        """Return the address of a buffer's memory; a buffer in `turning` has a copy for each turn of its loops."""
         if owner not in self.turning:
             return self.bases[owner]
         key = ("base", owner)
@@ -218,7 +218,7 @@ class FunctionWriter:
         return base
 
     def write_address_of_turn(self, start: str, block: Block, bytes_: int) -> str:
-        """Return the address from `start` on for this turn of the loops around a block, so many bytes for each turn."""
+        """Return the address of this turn's `bytes_` in memory from `start` on, for the loops around `block`."""
         index = ""
         for loop in block.list_loops():
             assert loop.counter is not None
@@ -240,7 +240,7 @@ class FunctionWriter:
         return self.add(f"load {vector_type(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
 
     def _write_scalar_load(self, node: Node) -> str:
-        """Write the load of a number that all lanes share; return its name, a scalar's, and note that it is read."""
+        """Write the load of a number that all lanes share; return the scalar's name. `self.read` notes its buffer."""
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
         address = self._locate(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
@@ -270,12 +270,12 @@ class FunctionWriter:
         return self.add(f"bitcast %i{bits} {loaded} to {vector_type(node.type)}") if node.type in REAL else loaded
 
     def _write_store(self, store: Store) -> None:
-        """Write the store of a number; a sum over runs is added to what is there, but in lanes beyond the last run."""
+        """Write the store of a number; in a buffer of `sums` it is added, in double, by lanes that have a run."""
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         is_sum = store.buffer in self.sums
         entry = f"[{self.sums[store.buffer]} x i64]" if is_sum else f"%i{bits}"
         address = self._locate(store.buffer, store.offset, store.strides, store.indices, entry)
-        if is_sum:  # of doubles
+        if is_sum:
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
             sum_before = self.add(f"load {kind}, ptr {address}, align 8")
@@ -326,7 +326,7 @@ class FunctionWriter:
             self._note_name(loop.results[k], final)
 
     def _name_parameters(self, loop: Loop, name: str, counter: str, carried: list[int]) -> None:
-        """Note the LLVM names of a loop's counter and of its `carried` numbers, by their places, within a turn."""
+        """Note the names, within a turn, of a loop's counter and of its parameters at the places `carried`."""
         if loop.counter is not None:
             self.scopes[-1]["scalar", loop.counter] = counter
         for k in carried:
@@ -335,7 +335,7 @@ class FunctionWriter:
             self._note_name(loop.counter, self.write_operand(loop.counter))
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
-        """Write a counted loop's body, and behind it the jump to the next turn; return the names of what that gets."""
+        """Write a counted loop's body and the jump to its next turn; return the names of what that turn is carried."""
         self.write_block(loop.body)
         following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")

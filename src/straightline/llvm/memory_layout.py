@@ -49,7 +49,10 @@ class ProgramParts(NamedTuple):
 
     @property
     def outputs_summed_in_memory(self) -> list[Buffer]:
-        """Return the outputs that are summed over runs, but those that all runs share: these are multiplied later."""
+        """Return the outputs that are summed over runs in memory.
+
+        An output that all runs share (not in `spread`) is not among them: its sum is its number times the runs.
+        """
         if self.summed is None:
             return []
         pairs = zip(self.outputs, self.summed.outputs, strict=True)
@@ -94,12 +97,12 @@ def split_shared_from_differing(
 
 
 def choose_vector_width(items: Iterable[Any]) -> int:
-    """Return how many runs a vector has, one in each lane: WIDEST, or twice as many if most operations have 32 bits.
+    """Return how many runs a vector has, one a lane: WIDEST, or 2 WIDEST if most operations are on 32-bit numbers.
 
-    An elementary function, or a hash (threefry), is as long as LONG others and counts as so many.
+    An elementary function, and a hash (threefry), takes as long as LONG other operations and counts as LONG.
 
-    A step of a particle filter that hashes two words and makes four normal numbers of floats of them, among 112
-    operations on doubles, takes 12 ns a particle with 16 runs and 19 with 8; among 281 it takes 15 and 31.
+    Measured for a particle filter's step that draws four normal floats from two hashed words: beside 112 operations on
+    doubles it takes 12 ns a particle with 16 runs and 19 ns with 8; beside 281 it takes 15 ns and 31 ns.
     """
     operations_of_bits = Counter[int]()
     for x in items:
@@ -123,10 +126,11 @@ class MemoryLayout(NamedTuple):
 
 
 def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
-    """Place what differs between runs in the memory of a thread, and what the program fills for all in shared memory.
+    """Return where buffers lie, as offsets in bytes.
 
-    `mine` are the items of the function of blocks, which computes what differs. What it reads of shared memory that is
-    filled anew in each turn of a loop has a place for each turn. Places are offsets in bytes.
+    Buffers that differ between runs lie in a thread's own memory (scratch). Buffers that the program fills for all
+    runs lie in shared memory. `mine` holds the items of the function of blocks, which computes what differs between
+    runs. If it reads a shared buffer that each turn of a loop fills anew, the buffer has a copy for each turn.
     """
     owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
     sums = set(parts.outputs_summed_in_memory)
@@ -135,16 +139,17 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     differing = [b for b in owners if b in parts.spread and b not in sums and b not in used_in_place]
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
     turning = {b for b in common if b.block.list_loops()}  # filled anew in each turn of a loop
-    turning &= _find_read_buffers(mine) if turning else turning
+    turning &= _find_read_buffers(mine) if turning else turning  # and read by the function of blocks
     scratch, in_scratch = _place_buffers(differing, parts.width)
     shared, in_shared = _place_buffers(common, width=1, turning=turning)
     return MemoryLayout(scratch=scratch, in_scratch=in_scratch, shared=shared, in_shared=in_shared, turning=turning)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
-    """Raise Unsupported unless `outputs`, the sums over runs, are only stored to, and real.
+    """Raise Unsupported unless all `outputs`, which are summed over runs, are real and only stored to.
 
-    What is read again, or lies in another array, needs a run's own number, which a sum has not.
+    An output that the program reads again, or that is part of another array, needs each run's own number. A sum does
+    not have it.
     """
     read = _find_read_buffers(items) if outputs else set()
     if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
@@ -160,9 +165,9 @@ def _find_read_buffers(items: Iterable[Any]) -> set[Buffer]:
 def _place_buffers(
     buffers: Iterable[Buffer], width: int, turning: Collection[Buffer] = ()
 ) -> tuple[int, dict[Buffer, int]]:
-    """Place buffers of `width` runs one after another; return the end and each one's offset, in bytes.
+    """Place buffers of `width` runs one after another; return the end and the offset of each buffer, in bytes.
 
-    Those in `turning` have a copy for each turn of the loops around them.
+    A buffer in `turning` has a copy for each turn of the loops around it.
     """
     start, places = 0, dict[Buffer, int]()
     for buffer in buffers:

@@ -103,10 +103,10 @@ class ModuleText(NamedTuple):
 
 
 def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
-    """Return a buffer for each result, none used twice: an array that the program fills is used where it is.
+    """Return a buffer for each result, no buffer twice.
 
-    What is not in memory is stored, number by number; so are the results with the numbers `last`, since they may
-    overwrite arguments and must be stored after all others.
+    A result that the program fills in memory stays where it is. A result of nodes is stored number by number. So are
+    the results whose numbers are in `last`: they may overwrite arguments, and must be stored after all others.
     """
     lowering = Lowering()
     lowering.graph = program.graph
@@ -121,7 +121,7 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
 
 
 def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
-    """Return an array as it is if it is all of a buffer that the program fills and no result has taken; else a copy."""
+    """Return an array as it is if it is all of a scratch buffer that no other result has taken; else a copy of it."""
     buffer = value.buffer
     is_contiguous = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
     is_free = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
@@ -132,7 +132,7 @@ def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: l
 
 
 def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return an array of nodes or in memory, constants too, stored entry by entry in new memory."""
+    """Return a copy of an array, of nodes or in memory, that is stored entry by entry in a new buffer."""
     nodes: list[Node] = lowering.nodes(value).ravel().tolist()
     type: Type = value.type if isinstance(value, StridedArray) else nodes[0].type
     buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
@@ -203,7 +203,7 @@ def write_module(
 
 
 def _count_operations(items: Iterable[Any]) -> Counter[str]:
-    """Count the operations by name, constants aside; raise Unsupported if they are more than LONGEST."""
+    """Return how often each operation occurs, without constants; raise Unsupported if all are more than LONGEST."""
     counts = Counter([x.op for x in items if isinstance(x, Node)])
     del counts["constant"]
     if counts.total() > LONGEST:
@@ -285,7 +285,7 @@ def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: M
 def _write_mover_call(
     writer: FunctionWriter, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]
 ) -> MoverOptions:
-    """Write the call that moves a block of runs' rows of a buffer into lanes ("take") or back; return what it calls."""
+    """Write a call that moves a buffer's rows, one a run, into lanes ("take") or back; return the mover it calls."""
     few = buffer.size if buffer.size < FEW else 0
     called = MoverOptions(bits=BITS[buffer.type], inwards=kind == "take", squared=buffer.type in SQUARED, few=few)
     pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
@@ -296,9 +296,9 @@ def _write_mover_call(
 def _request_rows_ahead(
     writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
-    """Let the longest loop, if any, prefetch memory: of inputs that the next block takes, and of outputs it will give.
+    """Let the longest loop, if there is one, prefetch the next block's inputs (`taken`) and its own outputs (`given`).
 
-    `names` are the pointers to the buffers' memory in LLVM's text; `taken` are the inputs, `given` the outputs.
+    `names` maps a buffer to the name of the pointer to its memory in LLVM's text.
     """
     writer.asking_loop = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
     if writer.asking_loop is not None:
@@ -308,7 +308,7 @@ def _request_rows_ahead(
 def _locate_rows(
     writer: FunctionWriter, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
 ) -> list[PrefetchedRows]:
-    """Return the rows that a loop prefetches: the next block's inputs (`taken`), and this block's outputs (`given`)."""
+    """Return the rows that a loop prefetches: the next block's inputs (`taken`) and this block's outputs (`given`)."""
     first_of_next, results = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
     for buffer in (*taken, *given):
         bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
@@ -360,9 +360,9 @@ def _add_to_sums(
 
 
 def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource | None:
-    """Return the function that computes what all runs share; None if neither blocks nor a caller need any of it.
+    """Return the function that computes what all runs share, or None if nothing needs it.
 
-    `blocks` is the writer of the function of blocks, which has been written: it knows what that one reads.
+    `blocks`: the writer of the function of blocks, which loads the numbers `slots.places` and the buffers `read`.
     """
     shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
     roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
@@ -377,7 +377,7 @@ def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: 
 
 
 def _write_run_function(body: str, writer: FunctionWriter) -> str:
-    """Return the text of the function `run` around its body; if the writer `flushes`, subnormals are zeros in it."""
+    """Return the text of the function `run` with this body; if the writer `flushes`, it takes subnormals as zeros."""
     before = after = ""
     if writer.flushes:
         before, after = "  %control = call i32 @hg_flush()\n", "  call void @hg_restore(i32 %control)\n"
@@ -385,7 +385,7 @@ def _write_run_function(body: str, writer: FunctionWriter) -> str:
 
 
 def _write_pointers(writer: FunctionWriter, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
-    """Write the loads of the buffers' addresses, and last that of shared memory; return the names by buffer."""
+    """Write the loads of the addresses in `%pointers`, the last that of shared memory; return their names by buffer."""
     names: dict[Buffer, str] = {}
     for number, buffer in enumerate([*pointers, None]):
         address = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")

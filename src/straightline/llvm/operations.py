@@ -35,7 +35,7 @@ def vector_type(type: Type) -> str:
 
 
 def write_literal(value: float | int | bool, type: Type) -> str:
-    """Return the LLVM text of a constant; a real one, also a float, by the bits of it as a double."""
+    """Return the LLVM text of a constant; LLVM writes a real one, even a float, by its bits as a double."""
     if type in REAL:
         return "0x" + struct.pack(">d", float(value)).hex().upper()
     if type == "bool":
@@ -91,7 +91,7 @@ def name_called_function(node: Node) -> str:
 def _write_comparison(op: str, type: Type) -> str:
     """Return LLVM's instruction for a comparison of numbers of this type.
 
-    Of NaN all are false, but for `ne`, which is true ("une": unordered or not equal; o...: ordered).
+    With NaN, `ne` is true ("une": unordered or not equal). All other comparisons are then false ("o": ordered).
     """
     if type in REAL:
         return "fcmp une" if op == "ne" else f"fcmp o{op}"
@@ -181,15 +181,16 @@ def _write_division(node: Node, names: list[str], text: str, emit: Emit) -> str:
 
 
 def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    """Write a shift of integers; return the name of its result. By all bits or more, 0 is left, or the sign.
+    """Write a shift of integers, and return the name of its result.
 
-    `names` are those of the number and of the shift, `text` is the vector's type; `emit` appends an operation.
+    A shift by all bits or more leaves 0, or copies of the sign if it is arithmetic. LLVM does not define such a shift.
+    `names`: of the number and of the shift. `text`: the vector's type. `emit` appends an operation.
     """
     type, (a, b), shift = node.args[0].type, names, node.args[1]
     instruction = {"shift_left": "shl", "shift_right": "lshr"}.get(node.op, "ashr")
     if shift.op == "constant" and 0 <= shift.value < BITS[type]:
         return emit(f"{instruction} {text} {a}, {b}")
-    # By at most all bits but one, which leaves the sign; other shifts by more are zero.
+    # An arithmetic shift by all bits but one leaves only copies of the sign; others by too many bits become 0 below.
     clamped_shift = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")
     shifted = emit(f"{instruction} {text} {a}, {clamped_shift}")
     if instruction == "ashr":
@@ -219,10 +220,10 @@ def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
 
 
 def write_fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
-    """Write a b + c, c - a b or a b - c, rounded once, from the names of a, b, c; return the name of the result.
+    """Write a b + c, c - a b or a b - c, rounded once, and return the name of the result.
 
-    `product`: the argument a b of the node, whose place tells the sign: as the second one of a difference it is
-    subtracted, as the first one c is.
+    `names` are those of a, b and c. `product` is the node of a b. A difference whose second argument is the product
+    is c - a b; one whose first argument is the product is a b - c.
     """
     reals = vector_type(node.type)
     a, b, c = names

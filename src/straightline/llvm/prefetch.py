@@ -35,10 +35,10 @@ def find_longest_loop(items: Iterable[Any]) -> Loop | None:
 
 
 def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
-    """Return how many cache lines a loop prefetches in each turn, so that all turns do so for the rows of `width` runs.
+    """Return how many cache lines a loop prefetches each turn, so that all turns fetch the rows of `width` runs.
 
-    0 where these take longer than its operations (a line as long as PATIENCE of them): a loop that does little but move
-    numbers hides nothing beside them. `bytes` are those of a row, one run's numbers.
+    `bytes` is the size of a row, one run's numbers. A prefetched line takes as long as PATIENCE operations. Return 0
+    if the lines would take longer than the turn's operations, which could then not hide them.
     """
     lines = divide_rounded_up(bytes * width, (loop.length or 1) * LINE)
     operations = sum(isinstance(x, Node) and x.op != "load" for x in loop.body.items)
@@ -51,11 +51,11 @@ def write_prefetch_requests(
     """Return the lines of LLVM IR by which one turn of a loop prefetches its share of the memory of some rows.
 
     Args:
-        rows: the rows.
-        turns: of the loop.
-        counter: name of the number of this turn.
-        lanes: text of the number of rows.
-        add: appends an operation, and names its result.
+        rows: where the rows lie, their size in bytes, and how many lines a turn prefetches.
+        turns: how many turns the loop has.
+        counter: name of the number of this turn, from 0.
+        lanes: LLVM's text of the number of rows.
+        add: appends an operation, and returns the name of its result.
     """
     # This turn's share begins at byte counter * bytes * lanes / turns.
     product = add(f"mul i64 {counter}, {rows.bytes}")
@@ -63,5 +63,5 @@ def write_prefetch_requests(
     first_byte = add(f"udiv i64 {product}, {turns}")
     start = add(f"getelementptr i8, ptr {rows.start}, i64 {first_byte}")
     lines = [add(f"getelementptr i8, ptr {start}, i64 {LINE * k}") for k in range(rows.lines)]
-    # To be read or written; of moderate locality (2), and in the cache of data (1).
+    # The arguments after the address: 0 to read or 1 to write, moderate locality (2), the data cache (1).
     return [f"call void @llvm.prefetch.p0(ptr {line}, i32 {int(rows.writes)}, i32 2, i32 1)" for line in lines]

@@ -29,7 +29,10 @@ class TextLines:
         return f"%x{self.count}"
 
     def write_loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
-        """Write a loop: for (i = begin; i + step <= end; i += step) body(i), i a name; `name` begins its labels."""
+        """Write the loop for (i = begin; i + step <= end; i += step) body(i).
+
+        `body` gets the LLVM name of i. `name` begins the loop's labels.
+        """
         before, head, inside, after = f"{name}.before", f"{name}.head", f"{name}.inside", f"{name}.after"
         self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{head}", f"{head}:"]
         self.lines.append(f"  %{name}.i = phi i64 [{begin}, %{before}], [%{name}.next, %{inside}]")
@@ -83,9 +86,10 @@ def write_mover(move: MoverOptions, width: int) -> str:
 
 
 def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
-    """Write the address of the first entry of each lane's run; return their names. Lanes beyond it have the last run's.
+    """Write the address of the first number of each lane's run, and return the names of the addresses.
 
-    Runs lie one after another, `%size` numbers of so many bits each; lane 0 has run `%first`.
+    Runs lie one after another, each of `%size` numbers of `bits` bits. Lane 0 has run `%first`. A lane beyond the last
+    run gets the address of the last run.
     """
     rows = []
     for lane in lanes:
@@ -130,12 +134,11 @@ def _write_address(bits: int, start: str, number: int) -> str:
 
 
 def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
-    """Write the choice of numbers out of registers; return the name of the register that has them, lane by lane.
+    """Write the choice of a number for each lane out of several registers; return the name of the chosen vector.
 
-    Each lane keeps what was chosen for it so far, or takes its number from the next register: by one shuffle of the
-    two for each register, whose mask counts the second one's numbers from `side` on.
-
-    places: for each lane which register has its number, and in which lane there.
+    `places` holds for each lane the pair (register, lane there) of its number. One shuffle is written for each
+    register: a lane takes its number from that register, or keeps what was chosen before. A shuffle's mask numbers the
+    lanes of its second vector from `side` on.
     """
     chosen, side = "poison", len(places)  # a register of which no number is set
     for second in sorted({register for register, _ in places}):
@@ -183,9 +186,12 @@ class _RunsInLanes(NamedTuple):
             text.lines.append(f"  store {vector} {column}, ptr {address}, {alignment}")
 
     def write_entry(self, i: str) -> None:
-        """Write the move of entry i of each run, one number after another."""
+        """Write the moves of entry i of each run, one number at a time: from its run into its lane, or back.
+
+        `rows` holds the names of the runs' addresses. `inwards`: from runs into lanes.
+        """
         text, bits = self.text, self.bits
-        # Entry i of all lanes is a row of `width` numbers, of which these runs have `first_lane` and those behind it.
+        # Entry i of all lanes is a row of `width` numbers; the first of these runs has the lane `first_lane`.
         base = text.add(f"mul i64 {i}, {self.width}")
         base = text.add(f"add i64 {base}, {self.first_lane}")
         base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")

@@ -29,11 +29,12 @@ def gather_name(bits: int, spread: bool) -> str:
 
 
 def write_gather(bits: int, spread: bool, width: int) -> str:
-    """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, which loads in each lane the number at its place.
+    """Write an LLVM function that loads for each lane the number at this lane's own place.
 
-    Numbers have so many bits. If `spread`, a place has a number for each lane, of which each lane loads its own.
+    Its head is like `%i64 @hg_gather64_table(ptr %start, %i64 %places)`. Numbers have `bits` bits. If `spread`, a place
+    holds `width` numbers, one for each lane, and each lane loads its own.
     """
-    # The vector is put together lane by lane, from one of which no number is set ("poison").
+    # The vector begins without numbers ("poison"), and each lane is inserted.
     vector, text, gathered = f"%i{bits}", TextLines(), "poison"
     row = f"[{width} x i{bits}]" if spread else f"i{bits}"
     for lane in range(width):

@@ -22,8 +22,9 @@ CALLS = (
 
 
 def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the results of a call (jit, custom_jvp, ...), its function's program written in its place."""
+    """Return the results of a call (jit, custom_jvp, ...): the program of its function is written in its place."""
     params = equation.params
+    # Each kind of call has its own name for the program.
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
     return lowering.inline_program(inner, inputs)
 
@@ -34,9 +35,9 @@ def _inline_custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: lis
 
 
 def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the results of a composed operation, such as frexp in JAX from 0.12 on, by its definition in others.
+    """Return the results of an operation that is defined by other operations, such as frexp in JAX from 0.12 on.
 
-    The definition is traced, for arguments of these shapes and types, and written in the operation's place.
+    Its definition is traced for arguments of these shapes and types, and written in its place.
     """
     primitive = equation.params["_prim"]
 
@@ -51,7 +52,10 @@ def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _select_platform(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the number of the branch for CPUs, a constant; where none names them, the last one, for any platform."""
+    """Return the number of the branch for CPUs as a constant; if no branch names CPUs, it is the last branch.
+
+    `platforms` holds for each branch the names of its platforms, or None for any platform.
+    """
     platforms = equation.params["platforms"]
     number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
     return [lowering.make_known_array(np.int32(number))]
@@ -86,9 +90,10 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
 
 
 def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[Node]:
-    """Return for each of `count` branches the node of whether it is taken; indices beyond take the first or the last.
+    """Return for each of `count` branches the node of a flag: whether the branch is taken.
 
-    `which` is the index, or a flag, by itself or as an integer, that chooses among two.
+    `which` is the branch's index, or a flag that chooses between two. An index below 0 takes the first branch, and one
+    beyond the last takes the last.
     """
     graph = lowering.graph
     if which.op == "convert" and which.args[0].type == "bool":
@@ -145,7 +150,10 @@ def _count_block_nodes(block: Block) -> int:
 
 
 def _move_statements_out(block: Block, outer: Block) -> None:
-    """Move the operations and statements of a block into the one around it, with its record of nodes to be reused."""
+    """Move the operations and statements of a block into `outer`, the block around it.
+
+    `seen` holds a block's nodes by operation and arguments, so that equal ones are reused. It moves too.
+    """
     for statement in block.items:
         statement.block = outer  # type: ignore[union-attr]
     outer.items += block.items

@@ -60,14 +60,15 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 
         @cache
         def trace_plain_function(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_OperationProgram, Any]:
-            """Trace the plain function for arguments of these shapes and types; return it and its results' tree.
+            """Trace the plain function for arguments of these shapes and types (`kinds`).
 
-            `x64`: whether JAX's numbers are double now, on which the trace depends.
+            Returns the operation's program and the tree of its results. `x64`: whether JAX's numbers are double now,
+            on which the trace depends.
             """
             result_tree: list[Any] = []  # filled while it is traced
 
             def call_on_leaves(function: Callable[..., R], *leaves: Any) -> list[Any]:
-                """Return the leaves of the function's results from those of its arguments; note the results' tree."""
+                """Return the leaves of the function's results from its arguments' leaves; note the results' tree."""
                 args, kwargs = jax.tree.unflatten(tree, leaves)
                 results, structure = jax.tree.flatten(function(*args, **kwargs))
                 result_tree[:] = [structure]
@@ -97,10 +98,10 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 def _apply_plain(
     *leaves: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
 ) -> list[Any]:
-    """Return the results of an operation's plain function, not its native one, under its levels of `vmap`.
+    """Return the results of an operation's plain function, mapped by one `vmap` for each of `levels`.
 
-    A level has an axis, or None, for each argument; the innermost comes first. `sizes` is a parameter of the primitive,
-    not needed here.
+    A level holds the mapped axis of each argument, None for an argument that is not mapped. The innermost level comes
+    first. `sizes` is a parameter of the primitive that is not needed here.
     """
     function = jaxpr_as_fun(program.plain)
     for axes in levels:
@@ -111,7 +112,10 @@ def _apply_plain(
 def _find_result_shapes(
     *_: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
 ) -> list[Any]:
-    """Return shapes and types of the results: the plain function's, behind the `sizes` of the levels of `vmap`."""
+    """Return the shapes and types of an operation's results.
+
+    The shapes are those of the plain function, led by an axis for each level of `vmap`, whose lengths are `sizes`.
+    """
     return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
 
 
@@ -119,9 +123,9 @@ def _batch_operation(
     leaves: Sequence[Any], axes: Sequence[int | None], *, program: _OperationProgram, levels: tuple[Axes, ...],
     sizes: tuple[int, ...],
 ) -> tuple[list[Any], list[int]]:  # fmt: skip
-    """Return the results of an operation under a further `vmap`, as one operation with one more level.
+    """Return the results of an operation under one more `vmap`, as one operation with one more level.
 
-    `axes` has for each argument its axis of the batch, None if it has none; that axis becomes the first one.
+    `axes` holds the batch axis of each argument, None for one without a batch. The axis is moved to the front.
     """
     moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, axes, strict=True)]
     level = tuple(None if axis is None else 0 for axis in axes)
@@ -131,7 +135,10 @@ def _batch_operation(
 
 
 def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> tuple[list[Any], list[Any]]:
-    """Return the plain function's results and their tangents, by those arguments (primals) that have tangents."""
+    """Return the plain function's results and their tangents.
+
+    Only the arguments (primals) whose tangents are not zero are differentiated; the others are held fixed.
+    """
     has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
 
     def call(*varying: Any) -> list[Any]:
@@ -146,10 +153,10 @@ def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: An
 
 
 def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the results of an operation by its native function, written in its place, or by the plain one.
+    """Return the results of an operation by its native function, or else by its plain one.
 
-    That is where native code does not take the native one, or it has more than MANY_TERMS operations. How many it has
-    depends on known zeros of the arguments: so it is tried.
+    The plain function is used if native code does not take the native function, or if that has more than MANY_TERMS
+    operations. Known zeros in the arguments reduce this count, so it is only known once the function is written out.
     """
     program: _OperationProgram = equation.params["program"]
     try:
@@ -160,23 +167,26 @@ def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
 
 
 def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:
-    """Return the program of a function of one item in a loop for each level of `vmap`, traced once for equal shapes."""
+    """Return the program of a function of one item, called in one loop for each level of `vmap`.
+
+    `lowering.kernels` keeps the programs, so that equal shapes and types are traced once.
+    """
     program, levels = equation.params["program"], equation.params["levels"]
     kinds = tuple((v.aval.shape, v.aval.dtype) for v in equation.invars)  # type: ignore[attr-defined]
     key = program, function is program.native, levels, kinds
     if key not in lowering.kernels:
         for axes in levels:
             function = partial(_apply_one_by_one, function, axes)
-        # In the precision that was JAX's when the operation was called.
+        # Trace in the precision that JAX had when the operation was called.
         with jax.enable_x64(program.x64):
             lowering.kernels[key] = jax.make_jaxpr(function)(*(make_placeholder(*kind) for kind in kinds))
     return lowering.kernels[key]
 
 
 def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
-    """Return a function's results for one entry of a batch after another, stacked: `vmap` in a loop.
+    """Return a function's results for each entry of a batch, stacked: a `vmap` that is computed in a loop.
 
-    `axes` is 0 for leaves that have a batch, along their first axis, and None for those that all entries share.
+    `axes` holds 0 for a leaf with a batch along its first axis, and None for a leaf that all entries share.
     """
 
     def call(entries: list[Any]) -> list[Any]:

@@ -40,7 +40,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     rounding = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
 
     def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
-        """Return whether an entry above the diagonal exceeds `rounding`, and fewer than SWEEPS sweeps are done."""
+        """Return whether to go on: an entry above the diagonal exceeds `rounding`, and sweeps are fewer than SWEEPS."""
         entries, _vectors, sweeps = state
         large = [jnp.abs(entries[pair]) > rounding for pair in combinations(range(n), 2)]
         return jnp.any(jnp.stack(large)) & (sweeps < SWEEPS)
@@ -48,7 +48,10 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     turns, turn = _make_tournament_turn(n)
 
     def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
-        """Rotate each pair of rows once, so that its entry becomes 0; after `turns` turns each row is in its place."""
+        """Rotate each pair of rows once, so that the pair's entry becomes 0.
+
+        A sweep is `turns` turns, after which each row is back in its place.
+        """
         entries, vectors, sweeps = state
         (entries, vectors), _ = jax.lax.scan(turn, (entries, vectors), length=turns)
         return entries, vectors, sweeps + 1
@@ -80,9 +83,9 @@ def _make_tournament_turn(
     moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]  # place i gets the row at place moved[i]
 
     def turn(state: tuple[Numbers, Numbers], _: None) -> tuple[tuple[Numbers, Numbers], None]:
-        """Rotate each of `pairs` of rows in (entries of A, eigenvectors), then move the rows on, from places `moved`.
+        """Rotate each of the `pairs` of rows, then move the rows: row i comes from place moved[i].
 
-        Of A only the entries (i, j), i <= j, are kept.
+        The state is (entries of A, eigenvectors). A is symmetric, so only its entries (i, j) with i <= j are kept.
         """
         entries, vectors = map(dict, state)
         for p, q in pairs:
@@ -122,7 +125,10 @@ def _sort_by_transposition(
     n = len(values)
 
     def exchange_neighbours(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
-        """Exchange neighbours of n values in the wrong order: at even places, then at odd ones, with their columns."""
+        """Exchange neighbours that are in the wrong order, among n values and their columns.
+
+        Pairs that begin at even places come first, then those at odd places.
+        """
         values, columns = list(state[0]), list(state[1])
         for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
             _exchange_if_descending(values, columns, i)
@@ -133,7 +139,7 @@ def _sort_by_transposition(
 
 
 def _exchange_if_descending(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
-    """Exchange values i and i + 1, and their columns, in the lists, unless they are in ascending order."""
+    """Exchange values i and i + 1, and columns i and i + 1, in these lists if value i is the greater one."""
     is_descending = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
     pairs = list(zip(columns[i], columns[i + 1], strict=True))
@@ -151,9 +157,9 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
 
 
 def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
-    """Return the results of a program of one matrix for each of many, along leading axes, one after another.
+    """Return the results of a program of one matrix for each matrix of a stack (..., n, m).
 
-    The program is written out once for each; its k-th results, entry by entry, become the k-th array.
+    The program is written out once for each matrix. Array k holds its k-th results, along the same leading axes.
     """
     (of_one_matrix,) = program.in_avals
     leading = matrices.shape[: len(matrices.shape) - len(of_one_matrix.shape)]
@@ -209,9 +215,9 @@ def _exchange_if(condition: jax.Array, items: list[jax.Array], i: int, j: int) -
 
 
 def permutation(pivots: jax.Array, size: int) -> jax.Array:
-    """Return the order of `size` rows after the exchanges of row j with row pivots[j] >= j, j = 0, 1, ...
+    """Return the order of `size` rows after row j was exchanged with row pivots[j] >= j, for j = 0, 1, ...
 
-    An exchange is a selection with each row that may be meant, since data decide the pivots.
+    The data decide the pivots. So each row i > j is exchanged with row j by a selection, if pivots[j] is i.
     """
     order = list(jnp.arange(size, dtype=pivots.dtype))
     for j in range(len(pivots)):
@@ -221,7 +227,10 @@ def permutation(pivots: jax.Array, size: int) -> jax.Array:
 
 
 def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the factors (L and U in one), pivots and order of rows of square matrices up to FEW rows, by `lu`."""
+    """Return the factors, pivots and order of rows of square matrices of up to FEW rows, by `lu` written out.
+
+    The factors L and U share one matrix.
+    """
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > FEW:
@@ -250,9 +259,9 @@ def _trace_permutation(count: int, size: int) -> ClosedJaxpr:
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Solve a system by the solver that it comes with.
+    """Return the solution of a linear system (JAX's `linear_solve`) by the program `solve` that it comes with.
 
-    Its inputs are constants of the four programs matvec, vecmat, solve and transpose_solve, then right sides.
+    The inputs are the constants of its programs matvec, vecmat, solve and transpose_solve, and then the right sides.
     """
     programs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
     first = lengths.matvec + lengths.vecmat  # the first constant of `solve`

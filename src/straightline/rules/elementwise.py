@@ -26,7 +26,7 @@ WORDS: dict[Type, tuple[Type, Type]] = {"f64": ("u64", "i64"), "f32": ("u32", "i
 
 
 def broadcast_entries(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
-    """Return the entries of several arrays in row-major order, repeated along axes of length 1 to fill a shape."""
+    """Return a list of entries for each array, broadcast to `shape` and in row-major order."""
     size = math.prod(shape)
     return [
         [a.item()] * size if a.size == 1 else (a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist()
@@ -38,7 +38,7 @@ def _make_elementwise_rule(op: str) -> Rule:
     """Return the rule of an operation that is applied to each entry."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return a node of the operation `op` for each entry of the result, of the arguments' entries there."""
+        """Return an array of nodes: entry i of the result is `op` applied to entry i of each argument."""
         shape, type = result_shape(equation), result_type(equation)
         arguments_of_entries = zip(*broadcast_entries(inputs, shape), strict=True)
         return [arrange_nodes([lowering.graph.node(op, type, *nodes) for nodes in arguments_of_entries], shape)]
@@ -50,7 +50,7 @@ def _make_rule_of_entries(function: Any) -> Rule:
     """Return the rule that makes each entry of the result by function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return for each entry of the result what `function` makes of the arguments' entries there."""
+        """Return an array of nodes: entry i is what `function` makes of entry i of each argument."""
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
         entries = zip(*broadcast_entries(inputs, shape), strict=True)
         return [arrange_nodes([function(graph, type, equation.params, *entry) for entry in entries], shape)]
@@ -59,14 +59,17 @@ def _make_rule_of_entries(function: Any) -> Rule:
 
 
 def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
-    """Return the node of a where the condition holds, else b; of keys of random numbers word by word."""
+    """Return the node of "a if condition else b"; random keys are selected word by word."""
     if isinstance(a, RandomKey):
         return RandomKey(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
     return graph.node("select", a.type, condition, a, b)
 
 
 def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -> Any:
-    """Return the case whose number is `which`, a flag or an integer, by selections from the last case back."""
+    """Return the case whose number is `which`, a flag or an integer.
+
+    It is a chain of selections, made from the last case backward. A number that no other case has takes the last case.
+    """
     if len(cases) == 2 and which.type == "bool":
         return select(graph, which, cases[1], cases[0])
     chosen = cases[-1]
@@ -76,17 +79,20 @@ def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -
 
 
 def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `select_n`, of numbers or of keys: the first input says for each entry which of the others is taken."""
-    # The type "u32" and no parameters: selections have the type of their cases.
+    """Lower `select_n`, whose first input says for each entry which of the other inputs is taken.
+
+    The inputs that are chosen from hold numbers or random keys.
+    """
+    # `_select_n` uses neither its type ("u32") nor its parameters (None): a selection has the type of its cases.
     shape = result_shape(equation)
     entries = zip(*broadcast_entries(inputs, shape), strict=True)
     return [arrange_nodes([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
 
 
 def _raise_to_integer(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return x^n of a whole n, params["y"], by repeated squaring; for n < 0 one over x^-n."""
+    """Return the node of x^n by repeated squaring, with the integer n = params["y"]; for n < 0 it is 1 / x^-n."""
     exponent = abs(params["y"])
-    factors, power = [], x  # power: x, x^2, x^4, ..., for each bit of the exponent from the lowest on
+    factors, power = [], x  # power: x, x^2, x^4, ..., one for each bit of the exponent from the lowest on
     while exponent:
         if exponent % 2:
             factors.append(power)
@@ -114,7 +120,10 @@ def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the bits of numbers read as others of as many bits, or of 64 bits as two words each, the low one first."""
+    """Return numbers whose bits are read as another type.
+
+    The other type has as many bits, or a number of 64 bits becomes two words of 32 bits, the low one first.
+    """
     (x,), type, shape, node = inputs, result_type(equation), result_shape(equation), lowering.graph.node
     numbers = x.ravel().tolist()
     kinds = {n.type for n in numbers}
@@ -130,7 +139,7 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return the node of the logistic function 1 / (1 + e^-x); `params`, those of the operation, are not used."""
+    """Return the node of the logistic function 1 / (1 + e^-x); the operation's `params` are not used."""
     unit = graph.constant(1.0, type)
     power = graph.node("exp", type, graph.node("neg", type, x))
     return graph.node("div", type, unit, graph.node("add", type, unit, power))
@@ -157,7 +166,7 @@ def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: Node) -> Node:
-    """Return the node of c_0 + c_1 x + c_2 x^2 + ... by Horner's rule; `params`, of the operation, are not used."""
+    """Return the node of c_0 + c_1 x + c_2 x^2 + ... by Horner's rule; the operation's `params` are not used."""
     value = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         value = graph.node("add", type, graph.node("mul", type, value, x), c)
@@ -178,8 +187,10 @@ def _make_total_order_rule(op: str) -> Callable[..., Node]:
     """Return the comparison by the total order of IEEE 754, -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
 
     def rank_by_bits(graph: Graph, x: Node) -> Node:
-        """Return a real number as an unsigned integer of the same order, made of its bits; other numbers unchanged."""
-        # All bits of a negative number are turned round, of others the sign's.
+        """Return an unsigned integer made of a real number's bits, such that integers have the order of the reals.
+
+        All bits of a negative number are inverted, and only the sign bit of any other. Integers are left unchanged.
+        """
         if x.type not in REAL:
             return x
         word, highest = WORDS[x.type][0], int(x.type[1:]) - 1  # the unsigned type of as many bits; the sign's bit

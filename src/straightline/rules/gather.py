@@ -25,9 +25,10 @@ from straightline.strided_arrays import contiguous_strides
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `gather`: return the windows of x at rows of indices, these clipped so that each lies inside.
+    """Lower `gather`: return the windows of x that begin at the rows of `indices`.
 
-    Where the operation's mode fills, a window that is not inside is filled with a value instead.
+    An index is clipped so that its window lies inside x. If the operation's mode is to fill, the entries of a window
+    that is not inside are a fill value instead.
     """
     x, indices = inputs
     if not fills_outside(equation):
@@ -42,9 +43,9 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 
 
 def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
-    """Return for each row of indices the node of whether its window is inside an array of this shape.
+    """Return for each row of indices the node of a flag: whether its window lies inside an array of this shape.
 
-    A row has a start for each of the operation's axes; `slice_sizes` is the window's shape.
+    A row holds the window's first index along each of the operation's axes. `slice_sizes` is the window's shape.
     """
     axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
@@ -57,9 +58,10 @@ def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], i
 
 
 def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Return the windows of x at indices, clipped to the array: of known ones the nodes that are there.
+    """Return the windows of x at `indices`, which are clipped so that each window lies inside x.
 
-    Where data decide an index, it is compared with all places.
+    If all indices are known, the result consists of nodes of x. Else an index that depends on data is compared with
+    all places.
     """
     known = known_integers(indices)
     if known is None:
@@ -74,10 +76,11 @@ def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indic
 def _find_gathered_places(
     shape: tuple[int, ...], sizes: tuple[int, ...], indices: bytes, of: tuple[int, ...], numbers: GatherDimensionNumbers
 ) -> np.ndarray:
-    """Return the places in the flat array, of this shape, that a gather takes at known indices.
+    """Return the places in the flat array of this `shape` that a gather takes at known indices.
 
-    They have the axes of the indices (int64 `indices` of shape `of`, but the last), then those of the window, moved to
-    where the result has them. Kept, since a filter has each gather a dozen times.
+    `indices` are the bytes of an int64 array of shape `of`. The places have the axes of the result: those of the
+    indices without the last, with the window's axes (`offset_dims`) among them. The answer is cached, since a filter
+    makes each gather a dozen times.
     """
     known = np.frombuffer(indices, dtype=np.int64).reshape(of)
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
@@ -148,7 +151,10 @@ def _gather_from_memory(
 
 
 def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
-    """Return the indices with those of one `column`, the axis, that depend on data replaced by a number."""
+    """Return a copy of the indices in which `number` replaces those of one column that depend on data.
+
+    The column holds the indices along one axis of the array.
+    """
     replaced = indices.copy()
     for row in np.ndindex(*indices.shape[:-1]):
         node = indices[(*row, column)]

@@ -29,7 +29,7 @@ def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
 
 
 def is_inside(graph: Graph, start: Node, last: int) -> Node:
-    """Return the node of whether a place is one of 0 ... last; an unsigned one cannot be below 0."""
+    """Return the node of the flag 0 <= start <= last; an unsigned number needs no test against 0."""
     is_at_most_last = graph.node("le", "bool", start, graph.constant(last, start.type))
     if start.type[0] == "u":
         return is_at_most_last
@@ -49,7 +49,10 @@ def convert_to_32_bits(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
 
 
 def make_fill_value(lowering: Lowering, equation: JaxprEqn) -> Node:
-    """Return the node of the value that a gather has in place of what is outside of the array; keys have none."""
+    """Return the node of the value that a gather takes for entries outside the array.
+
+    Random keys have no such value, and raise Unsupported.
+    """
     aval: Any = equation.outvars[0].aval
     if jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key):
         raise Unsupported("a key of random numbers in place of one that is not there")

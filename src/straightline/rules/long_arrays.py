@@ -37,11 +37,10 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Return whether nodes (one operation each) for all entries of an argument would be too many.
+    """Return whether an argument in memory is too long to have a node for each of its entries.
 
-    More than LOADED numbers in memory always are. More than TABLE are, unless all arrays in memory are tables of
-    constants and the other arguments are as many nodes, or what is left to compute is known or, as in q I, of few
-    entries. Zeros stay structure then.
+    More than LOADED numbers are always too long, and TABLE or fewer never. In between, an argument is too long unless
+    all arrays in memory are tables of constants and `_are_written_out` holds. The tables' zeros then save operations.
     """
     views = [x for x in inputs if isinstance(x, StridedArray)]
     longest = max((x.size for x in views), default=0)
@@ -56,10 +55,11 @@ def _is_table(x: Value) -> bool:
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
-    """Return whether a result of `count` entries, of tables (constants in memory) and arrays of nodes, is written out.
+    """Return whether a result of `count` entries is written out entry by entry.
 
-    So it is where one of the arrays is as many nodes already, where all are known, or where there are but single
-    numbers beside tables with at most TABLE entries that are not zero.
+    `inputs` are tables (constants in memory) and arrays of nodes. The result is written out in three cases: an array
+    has as many nodes already; all nodes are constants; or all arrays are single numbers, and no table has more than
+    TABLE entries that are not zero (as in q I).
     """
     arrays = [x for x in inputs if not isinstance(x, StridedArray)]
     tables = [x for x in inputs if isinstance(x, StridedArray)]
@@ -97,15 +97,16 @@ def _make_row_by_row_rule(name: str) -> Rule:
 def load_as_nodes(
     lowering: Lowering, results: tuple[list[Value], list[Value]]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the carried and the stacked arrays of a loop's turn as nodes, loaded where they are in memory."""
+    """Return the carried and the stacked arrays of a loop's turn as nodes; arrays in memory are loaded."""
     carried, stacked = results
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
 
 def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
-    """Return the part of an argument that a row of the result, of `ndim` axes, needs: that row, its only row, or all.
+    """Return the part of an argument that one row of the result needs; the result has `ndim` axes.
 
-    All of it where it has fewer axes than the result. The `row` is a node, a loop's counter.
+    That is all of an argument with fewer axes, which every row shares. Else it is the argument's only row if it has
+    just one, or its row with the number `row`, a node (the counter of a loop).
     """
     if x.ndim < ndim:
         return x
@@ -115,7 +116,10 @@ def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> 
 
 
 def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
-    """Return the same operation for one row: what looks like it to a rule, with results that lack the first axis."""
+    """Return a stand-in for an operation that a rule can lower for one row: its results lack the first axis.
+
+    `params` replace parameters of the operation.
+    """
     avals: list[Any] = [v.aval for v in equation.outvars]
     rows = [SimpleNamespace(aval=make_placeholder(a.shape[1:], a.dtype)) for a in avals]
     return SimpleNamespace(
@@ -125,10 +129,10 @@ def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower a product of arrays (JAX's `dot_general`): of short ones written out, of long ones row by row in a loop.
+    """Lower a product of arrays (JAX's `dot_general`), written out or row by row in a loop.
 
-    Written out are results of one number from arrays of which nodes may be loaded, short arrays, and products by a
-    known matrix whose zeros leave few terms.
+    Written out are three kinds: products of short arrays; results of a single number from arrays of at most LOADED
+    numbers; and products by a known matrix whose zeros leave few terms.
     """
     is_short_scalar_product = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
     if is_short_scalar_product or not is_long(inputs):
@@ -182,9 +186,10 @@ def _find_free_axis(x: StridedArray, contracted: Sequence[int]) -> int | None:
 
 
 def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
-    """Return a product of arrays of nodes: written out, or with more than MANY_TERMS terms in a loop over rows.
+    """Return a product of arrays of nodes, written out or as a loop over rows.
 
-    Of several matrices (batch), or of a sum over several axes, it is always written out.
+    It is a loop if there are more than MANY_TERMS terms. A batch of matrices, and a sum over several axes, is always
+    written out.
     """
     (left, right), (batch, _) = equation.params["dimension_numbers"]
     if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
@@ -193,18 +198,19 @@ def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
 
 
 def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
-    """Return how many terms the sums over axis `left` of a and `right` of b have, without those with a known zero.
+    """Return how many terms the product of a and b has, without terms that have a known zero as a factor.
 
-    0 stands for few enough, which is known without counting.
+    The product sums over axis `left` of a and axis `right` of b. The answer is 0 if the terms are at most MANY_TERMS
+    even with zeros: they are then not counted.
     """
-    if a.size * b.size <= MANY_TERMS * a.shape[left]:  # few enough with all zeros: no need to count them
+    if a.size * b.size <= MANY_TERMS * a.shape[left]:
         return 0
-    # At each place along the axis, each entry of a that is no known zero meets each such entry of b.
+    # At each place along the summed axis, each entry of a that is no known zero meets each such entry of b.
     return int(_count_nonzero_entries(a, left) @ _count_nonzero_entries(b, right))
 
 
 def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
-    """Return for each place along an axis how many entries there are no known zero."""
+    """Return for each place along an axis how many of the entries there are not known to be zero."""
     is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
     counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
     return counts
@@ -215,7 +221,7 @@ def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: 
     sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the sum so far with the number of this turn (`turn`), as the carry, and nothing to stack."""
+        """Return the sum so far plus the number that `turn` would stack, as the carry; nothing is stacked."""
         _no_carry, stacked = turn(row, [])
         pair = np.stack([carry[0], *stacked])
         return [np.asarray(RULES["reduce_sum"](lowering, sum_along_first, [pair])[0])], []
@@ -248,9 +254,9 @@ def _find_sparse_product(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.nd
 def _write_out_product(
     lowering: Lowering, equation: JaxprEqn, factors: tuple[np.ndarray, np.ndarray]
 ) -> list[np.ndarray]:
-    """Write out A B' entry by entry, terms with a known zero left out: entry (a, b) is the sum over k of a_k b_k.
+    """Write out A B' entry by entry: the entry of rows a of A and b of B is the sum over k of a_k b_k, k ascending.
 
-    `factors`: A and B as (rows, contracted axis); k ascends.
+    Terms with a known zero are left out. `factors` are A and B, each (rows, contracted axis).
     """
     graph, type = lowering.graph, result_type(equation)
     left, right = ([_find_nonzero_entries(graph, type, row) for row in factor] for factor in factors)
@@ -263,7 +269,10 @@ def _write_out_product(
 
 
 def _find_nonzero_entries(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
-    """Return the nodes of a row's entries that are no known zeros, by their places; a row of numbers as constants."""
+    """Return the nodes of a row's entries that are not known to be zero, by their places.
+
+    A row of numbers, rather than of nodes, is made constants.
+    """
     if row.dtype != object:
         return {int(k): graph.constant(row[k].item(), type) for k in np.flatnonzero(row)}
     return {k: n for k, n in enumerate(row.tolist()) if n.op != "constant" or n.value}
@@ -281,10 +290,10 @@ def _renumber_axes(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
 
 
 def _make_reduction_rule(name: str) -> Rule:
-    """Return the rule of a reduction, such as `reduce_sum`: of short arrays at once, of long ones row by row."""
+    """Return the rule of a reduction, such as `reduce_sum`: short arrays at once, long ones row by row."""
 
     def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Lower the reduction (`name`) of one array along the operation's axes: at once, of a long one row by row."""
+        """Lower the reduction `name` of an array along the operation's axes; a long array is reduced row by row."""
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
         return _reduce_long(lowering, equation, name, inputs[0])

@@ -29,9 +29,10 @@ def repeat_turns(
     graph, outer = lowering.graph, lowering.graph.current
 
     def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
-        """Lower one of the `length` turns by `turn`; return the next carry, and memory with a row for each turn.
+        """Lower the body of a loop of `length` turns by `turn`; return the next carry and the stacked arrays.
 
-        The memory (length, ...) belongs to the block `outer` around the loop; the turn of row k stores row k of it.
+        A stacked array (length, ...) lies in memory of the block `outer` around the loop. Each turn stores one row, and
+        if `backwards` the first turn stores the last row.
         """
         loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
@@ -85,7 +86,7 @@ def _make_carried_nodes(graph: Graph, op: str, loop: Loop, block: Block) -> list
 
 
 def is_symmetric(x: np.ndarray) -> bool:
-    """Return whether the entries of matrices (..., n, n), n > 1, are the same nodes across the diagonal."""
+    """Return whether matrices (..., n, n) with n > 1 are symmetric: entries (i, j) and (j, i) are the same node."""
     if x.ndim < 2 or x.shape[-1] != x.shape[-2] or not x.size or x.shape[-1] == 1:
         return False
     return all(a is b for a, b in zip(x.ravel().tolist(), np.swapaxes(x, -1, -2).ravel().tolist(), strict=True))
@@ -100,14 +101,15 @@ def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list
 def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> StridedArray:
-    """Store one turn's array as one row of memory in the block `outer`; return the array (length, ...) of all turns.
+    """Store one turn's array as one row of new memory; return the array (length, ...) of all turns.
 
-    The row's number is that of the turn, `counter`, or, `backwards`, counted from the last row back.
+    The memory belongs to the block `outer`. The row's number is that of the turn, `counter`. If `backwards`, turn 0
+    has the last row.
     """
     nodes = _list_nodes_of_numbers(value)
     type: Type = nodes[0].type if nodes else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
-    # The first place of each node in a row, if some nodes have several: noted from the end on, so that the first stays.
+    # The first place of each node in a row. Places are noted from the last to the first, so that the first one stays.
     size, first_places = len(nodes), {node: place for place, node in reversed(list(enumerate(nodes)))}
     buffer.first = [first_places[node] for node in nodes] if len(first_places) < size else []
     first_row, stride = ((length - 1) * size, -size) if backwards else (0, size)
@@ -148,17 +150,17 @@ def _restore_arrays(
 
 def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
-    # The place of each entry in its row: those below the diagonal, 0 here, have the place of the entry across it.
+    # The place of each entry in the flat triangle. Below the diagonal it is 0; the maximum takes the mirror image's.
     places = np.zeros((n, n), dtype=int)
     places[np.triu_indices(n)] = np.arange(upper.shape[-1])
     return upper[..., np.maximum(places, places.T)]
 
 
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower `scan`: written out if it is short, else as a loop; return its carry, then what it stacks.
+    """Lower `scan`, and return its carry and then what it stacks.
 
-    The arguments of a scan are constants, the carry, and arrays of which each turn gets a row. Short: all turns compute
-    no more than `written_out` numbers, by an estimate.
+    It is written out turn by turn if all turns compute at most `written_out` numbers, else it becomes a loop. The
+    arguments are constants, the carry, and arrays of which each turn gets a row.
     """
     params = equation.params
     (consts, carried), length = _count_scan_arguments(params), params["length"]
@@ -217,8 +219,9 @@ class _ScanBody(NamedTuple):
     def lower_turn(self, row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Lower one turn of the loop; return the carried nodes after it, and the results that it stacks, as nodes.
 
-        `row` is the row of the stacked arguments that the turn reads; `numbers` are the nodes, before the turn, of the
-        carried arrays `self.as_numbers`. Those in memory are read and filled there.
+        `row` is the row of the stacked arguments that the turn reads. `numbers` are the nodes before the turn of the
+        carried arrays whose places are in `self.as_numbers`. The other carried arrays lie in memory, by place in
+        `self.in_memory`, and are read and filled there.
         """
         carried: dict[int, Value] = dict(zip(self.as_numbers, numbers, strict=True))
         carried |= {k: memory.view_in_turn() for k, memory in self.in_memory.items()}
@@ -237,7 +240,7 @@ class CarriedMemory:
     """
 
     def __init__(self, lowering: Lowering, start: Value):
-        """Make memory for an array that a loop carries, with `start` copied into it before the first turn."""
+        """Make memory for an array that a loop carries; `start` is copied into it before the first turn."""
         self._graph = lowering.graph
         self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
@@ -262,9 +265,10 @@ class CarriedMemory:
 
 
 def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
-    """Fill the memory of carried arrays, at the end of a turn, each with the array paired with it.
+    """Fill the memory of carried arrays at the end of a turn; `filled` pairs each with its next array.
 
-    An array that lies in carried memory itself, as where two are exchanged, is copied first.
+    An array that lies in carried memory itself is copied first, since filling could overwrite it. This happens if two
+    carried arrays are exchanged.
     """
     carried_memory = {target.memory for target, _ in filled}
     pairs = []
@@ -314,7 +318,7 @@ def _take_row(x: np.ndarray, turn: int) -> np.ndarray:
 
 
 def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return an array in memory: as it is if it is there, a table of constants, else stored entry by entry."""
+    """Return an array in memory: constants become a table, and other nodes are stored one by one in a new buffer."""
     if isinstance(value, StridedArray):
         return value
     flat = _list_nodes_of_numbers(value)
@@ -344,10 +348,11 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
 
     def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
-        """Lower the check of the condition, then one turn; return the next carry, and nothing that is stacked.
+        """Lower the check of the condition and then one turn; return the next carry. Nothing is stacked.
 
-        `params` are JAX's, with both programs; `of_condition` and `of_body` their arguments beside the carry. The loop
-        goes on while any run's condition holds; a run whose own does not keeps its numbers.
+        `params` holds JAX's programs of the condition and of the body. `of_condition` and `of_body` are their arguments
+        before the carry. The loop goes on while any run's condition holds. A run whose condition fails keeps its
+        numbers.
         """
         active = lowering.nodes(lowering.inline_program(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), list_nodes(active))
@@ -362,7 +367,7 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """Return new entries where a loop goes on (`active`), and the old ones elsewhere.
 
-    `active` has a flag for each item of a batch, along leading axes: it is repeated for the item's entries.
+    `active` holds a flag for each item of a batch, along leading axes. It is repeated for all entries of the item.
     """
     conditions = np.repeat(active.ravel(), new.size // active.size).tolist()
     entries = zip(conditions, new.ravel().tolist(), old.ravel().tolist(), strict=True)
@@ -370,7 +375,10 @@ def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old:
 
 
 def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
-    """Return about how many numbers a traced program computes: a scan's body in each turn, a while loop's once."""
+    """Return an estimate of how many numbers a traced program computes; `lowering.sizes` keeps the answers.
+
+    The body of a scan counts once for each turn, and that of a while loop counts once.
+    """
     if jaxpr in lowering.sizes:
         return lowering.sizes[jaxpr]
     total = 0

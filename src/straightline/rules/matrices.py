@@ -22,12 +22,15 @@ def combine_nodes(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empt
 
 
 def _make_reduction_rule(op: str, empty: float) -> Rule:
-    """Return the rule of an operation that reduces an array along axes by `op`; of no entries the result is `empty`."""
+    """Return the rule of an operation that reduces an array along axes by `op`.
+
+    `empty` is the result where there are no entries.
+    """
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array reduced by `op` along the axes of the operation; `empty` is the result of no entries."""
+        """Return the array reduced by `op` along the operation's axes; where there are no entries it is `empty`."""
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
-        # A row of terms for each entry of the result; a sum over nothing has rows of length 0.
+        # Make a row of terms for each entry of the result; a reduction of no entries has rows of length 0.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
         rows = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
         of_no_entries = _replace_not_finite(type, empty)
@@ -43,10 +46,10 @@ ALL_BITS = np.nan
 
 
 def _replace_not_finite(type: Type, number: float) -> float:
-    """Return a reduction's result of no entries as a number of a type: integers and flags have limits for infinities.
+    """Return the result of reducing no entries as a number of a type.
 
-    Infinity becomes the greatest number of the type, minus infinity the least, and ALL_BITS the one with all bits set.
-    Finite numbers, and all numbers of a real type, are as they were.
+    For integers and flags, infinity becomes the greatest number of the type, minus infinity the least, and ALL_BITS
+    the one with all bits set. Finite numbers, and all numbers of a real type, stay as they are.
     """
     if type in REAL or np.isfinite(number):
         return number
@@ -63,11 +66,11 @@ def _make_accumulation_rule(op: str) -> Rule:
     """Return the rule that accumulates along an axis by `op`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array with each entry combined (`op`) with all before it along the axis; in reverse, behind it."""
+        """Return the array accumulated by `op` along the operation's axis; in reverse, from its last entry on."""
         axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
-        # Rows along the axis, each combined with what is accumulated before it.
+        # Make the axis the first one; each row is then combined with what is accumulated so far.
         x = np.moveaxis(inputs[0], axis, 0)
         shape = x.shape
         x = (x[::-1] if reverse else x).reshape(len(x), -1)
@@ -81,13 +84,10 @@ def _make_accumulation_rule(op: str) -> Rule:
 
 
 def _make_extreme_index_rule(op: str) -> Rule:
-    """Return the rule of `argmax` (op "gt") or `argmin` ("lt"): along one axis, with the result's other axes."""
+    """Return the rule of `argmax` (op "gt") or `argmin` ("lt") along one axis."""
 
     def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the index along the axis of the greatest (`op` "gt") or least ("lt") entry, for each place beside it.
-
-        That is argmax, or argmin, of the array's nodes along one axis.
-        """
+        """Return argmax (`op` is "gt") or argmin ("lt") of an array of nodes along the operation's only axis."""
         axis = equation.params["axes"][0]
         rows = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in rows.tolist()]
@@ -97,13 +97,13 @@ def _make_extreme_index_rule(op: str) -> Rule:
 
 
 def _find_first_extreme(graph: Graph, op: str, type: Type, row: list[Node]) -> Node:
-    """Return the first index of the greatest (op "gt") or least ("lt") number, or of the first NaN, as in JAX.
+    """Return the first index of the greatest (op "gt") or least ("lt") number of a row of nodes.
 
-    `type`: of the index.
+    If there is a NaN, it is the index of the first NaN, as in JAX. `type` is the type of the index.
     """
     best, index = row[0], graph.constant(0, type)
     for number, entry in enumerate(row[1:], 1):
-        # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
+        # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN already.
         best_is_number = graph.node("eq", "bool", best, best)
         beyond = graph.node(op, "bool", entry, best)
         is_nan = graph.node("ne", "bool", entry, entry)
@@ -114,9 +114,9 @@ def _find_first_extreme(graph: Graph, op: str, type: Type, row: list[Node]) -> N
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Write `dot_general` out: for each place on the batch axes a product A B', entry by entry.
+    """Write out `dot_general` entry by entry: a product A B' for each place on the batch axes.
 
-    A and B are (free, contracted): the contracted axes are summed over, the free ones are the result's.
+    A and B are (free, contracted). The contracted axes are summed over, and the free axes are those of the result.
     """
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     type = result_type(equation)
@@ -148,11 +148,11 @@ def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndar
 
 
 def _sum_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Node]:
-    """Return sum_k a_k b_k of each pair of vectors (a, b).
+    """Return sum_k a_k b_k for each pair of vectors (a, b).
 
-    All sums grow term by term at once, so that none waits for the last of another. A term of data that is multiplied by
-    a known zero is left out, whatever the data: a zero in a matrix of a model says what does not depend on what, and
-    NaN passes only to what does.
+    All sums grow together, term by term, so that the processor can compute them side by side. A term with a known zero
+    is left out, whatever the data: a zero in a model's matrix says that nothing depends on that number, so that its
+    NaN must not pass.
     """
     product, sum_ = ("and", "or") if type == "bool" else ("mul", "add")
     sums: list[Node | None] = [None] * len(pairs)
@@ -171,7 +171,7 @@ def _is_zero_term(x: Node, y: Node) -> bool:
 
 
 def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A = B diag(w), for arrays of nodes: in each column A's entries are B's times the same node."""
+    """Return whether A = B diag(w) for some nodes w: each column of A is the column of B times one node."""
     if a.shape != b.shape:
         return False
     weights = [[_find_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
@@ -179,7 +179,7 @@ def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _find_weight(x: Node, y: Node) -> Node | None:
-    """Return the node w of a number x that was computed as w y, None of any other; x itself where y is 1."""
+    """Return the node w if x is the product w y, or None if it is not; if y is the constant 1, w is x itself."""
     if y.op == "constant" and y.value == 1:
         return x
     if x.op != "mul" or not any(factor is y for factor in x.args):
@@ -210,20 +210,20 @@ def _convert(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
 
 
 def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-    """Return an array as (batch, free, contracted), each of one axis: the free ones are in neither list of axes."""
+    """Return an array as (batch, free, contracted): each kind of axes is merged into one.
+
+    The free axes are those in neither list.
+    """
     free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
     sizes = [math.prod(x.shape[d] for d in axes) for axes in (batch, free, contracted)]
     return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
 
 
 def _for_each_matrix(function: Any) -> Rule:
-    """Return the rule of an operation on matrices, the last two axes: function(graph, parameters, *matrices).
-
-    It is called for each place on the other axes.
-    """
+    """Return the rule that calls function(graph, parameters, *matrices) for each matrix of a stack (..., n, m)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return what `function` makes of the matrices at each place on the axes before the last two, one by one."""
+        """Return what `function` makes of the matrices, one by one; they lie along each argument's last two axes."""
         stacks = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
         results = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*stacks, strict=True)]
         return [arrange_nodes((node for x in results for node in x.ravel().tolist()), result_shape(equation))]

@@ -20,12 +20,13 @@ _present: Any = Primitive("present")
 
 
 def present(x: Shaped[jax.Array | np.ndarray, "*shape"]) -> Shaped[jax.Array, "*shape"]:
-    """Return the same numbers, marked as never NaN: `jnp.isnan` of them is known to be false when code is made.
+    """Return the same numbers, marked as never NaN.
 
-    So the branch for a missing number (NaN) costs nothing where none is ever missing. XLA ignores the mark.
+    Where native code is made, `jnp.isnan` of them is known to be false. A branch for missing numbers (NaN) then costs
+    nothing. XLA ignores the mark.
 
     Args:
-        x: numbers that the caller knows to be there.
+        x: numbers that are never NaN, as the caller knows.
     """
     marked: jax.Array = _present.bind(jnp.asarray(x))
     return marked

@@ -27,9 +27,10 @@ PARITY = 0x1BD11BDA
 
 
 def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
-    """Return the node of a hash of 64 bits, of a counter's two words (32 bits each) by a key; a constant if known.
+    """Return the node of the 64-bit hash of a counter by a key; it is a constant if all words are known.
 
-    Its first word is in the upper bits, the second in the lower.
+    The counter consists of two words of 32 bits, `high` and `low`. The hash's first word is in its upper 32 bits, and
+    the second in its lower.
     """
     words = (key.first, key.second, high, low)
     if all(word.op == "constant" for word in words):
@@ -38,7 +39,7 @@ def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
 
 
 def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
-    """Return the hash of a counter's two words by a key, as a new key: of its upper and lower 32 bits."""
+    """Return a new random key: the two words of the hash of a counter (words `high` and `low`) by a key."""
     bits = threefry(graph, key, high, low)
     upper = graph.node("shift_right", "u64", bits, graph.constant(32, "u64"))
     return RandomKey(graph.node("convert", "u32", upper), graph.node("convert", "u32", bits))
@@ -51,14 +52,14 @@ def _make_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
 
 
 def _read_key_words(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the two words of each key of random numbers: an array (..., 2) of nodes from keys (...)."""
+    """Return the two words of each random key: an array (..., 2) of nodes from an array (...) of keys."""
     _check_key_type(equation.invars[0])
     words = [word for key in inputs[0].ravel().tolist() for word in (key.first, key.second)]
     return [arrange_nodes(words, result_shape(equation))]
 
 
 def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key and number the key that is the hash, by the key, of the words (0, number)."""
+    """Return for each pair of a key and a number a new key: the hash of the words (0, number) by the key."""
     _check_key_type(equation.invars[0])
     shape, zero = result_shape(equation), lowering.graph.constant(0, "u32")
     pairs = zip(*broadcast_entries(inputs, shape), strict=True)
@@ -66,7 +67,7 @@ def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key the new keys that are the hashes, by it, of 0, 1, 2, ..., as many as the shape asks for."""
+    """Return for each key several new keys: the hashes of 0, 1, 2, ... by the key, one for each place of a shape."""
     _check_key_type(equation.invars[0])
     graph, counters = lowering.graph, _make_counters(lowering.graph, equation.params["shape"])
     keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
@@ -74,7 +75,10 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key random bits: the hashes of 0, 1, 2, ... by it; of 32 bits the exclusive or of both halves."""
+    """Return random bits for each key: the hashes of 0, 1, 2, ... by the key.
+
+    A hash has 64 bits. If 32 bits are asked for, its two halves are combined by exclusive or.
+    """
     _check_key_type(equation.invars[0])
     graph, width = lowering.graph, equation.params["bit_width"]
     counters = _make_counters(graph, equation.params["shape"])
@@ -89,12 +93,12 @@ def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each number (a seed) the key whose two words are the upper and lower 32 bits of it."""
+    """Return for each seed, an integer, the key whose two words are its upper and its lower 32 bits."""
     _check_key_type(equation.outvars[0])
     graph = lowering.graph
 
     def make_key(seed: Node) -> RandomKey:
-        """Return the key of a seed: its upper 32 bits, 0 for a type of 32 bits, and its lower ones."""
+        """Return the key of a seed: its upper 32 bits and its lower 32 bits; a seed of 32 bits has 0 as upper bits."""
         if seed.type[1:] == "32":
             return RandomKey(graph.constant(0, "u32"), graph.node("convert", "u32", seed))
         bits = graph.node("convert", "u64", seed)
@@ -105,7 +109,10 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return both words of the hashes (Threefry) of counters' word pairs by keys, in two arrays, as JAX does."""
+    """Return the two words of each Threefry hash, in two arrays, as JAX's operation `threefry2x32` does.
+
+    The inputs are four arrays: the keys' two words, and the counters' two words.
+    """
     shape = result_shape(equation)
     items = zip(*broadcast_entries(inputs, shape), strict=True)
     keys = [_new_key(lowering.graph, RandomKey(first, second), high, low) for first, second, high, low in items]
@@ -113,7 +120,7 @@ def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.nda
 
 
 def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Any:
-    """Lower random gamma variables by JAX's own program for them, a loop until a proposal is accepted."""
+    """Lower random gamma variables by JAX's own program, which is a loop until a proposal is accepted."""
     gamma: Any = equation.primitive.impl
     avals: list[Any] = [v.aval for v in equation.invars]
     program = jax.make_jaxpr(lambda *args: gamma(*args, **equation.params))(*avals)
@@ -126,9 +133,10 @@ def _return_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray
 
 
 def _make_counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
-    """Return 0, 1, 2, ... as two words (upper, lower) each, one for each place of a shape; refuse more than LOADED.
+    """Return the counters 0, 1, 2, ..., one for each place of a shape, each as two words (upper, lower).
 
-    Hashes of so many would be in no program, and take long to refuse one by one.
+    More than LOADED counters raise Unsupported at once. So many hashes make a program too long, and it would take long
+    to write them until they are refused.
     """
     if math.prod(shape) > LOADED:
         raise Unsupported(f"{math.prod(shape):,} random numbers at once")
@@ -136,7 +144,10 @@ def _make_counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Nod
 
 
 def _check_key_type(variable: Any) -> None:
-    """Raise Unsupported unless keys are of JAX's default hash, with the counters of jax_threefry_partitionable."""
+    """Raise Unsupported unless keys are of JAX's default kind (Threefry) and jax_threefry_partitionable is set.
+
+    That option decides which counters are hashed.
+    """
     if str(variable.aval.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {variable.aval.dtype}")
     if not jax.threefry_partitionable.value:
@@ -151,10 +162,11 @@ RULES |= {
 
 
 def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
-    """Return the hash, of 64 bits, of a counter's words by a key's: Threefry of two words of 32 bits.
+    """Return the 64-bit Threefry hash of a counter (words `high`, `low`) by a key (words `first`, `second`).
 
-    20 rounds of addition, rotation (ROTATIONS: by how many bits) and exclusive or; key words are added every four
-    rounds. PARITY, a constant of Threefry's definition, makes the third key word.
+    All words have 32 bits. There are 20 rounds of addition, rotation and exclusive or. ROTATIONS says by how many bits
+    each round rotates. Words of the key are added after every four rounds; the third word is made with PARITY, a
+    constant of Threefry's definition.
     """
     keys = (first, second, first ^ second ^ PARITY)
     mask = 0xFFFFFFFF  # keeps the lower 32 bits of a sum

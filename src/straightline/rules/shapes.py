@@ -14,9 +14,9 @@ from straightline.size_limits import FEW
 
 
 def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
-    """Return the rule of an operation that only moves the nodes of one array, by function(array, parameters, shape).
+    """Return the rule of an operation that only moves the nodes of one array.
 
-    The shape is that of the result.
+    function(array, parameters, shape) returns the moved nodes, where `shape` is that of the result.
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -27,7 +27,7 @@ def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]]
 
 
 def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array repeated to a shape, in which its own axes have the places `broadcast_dimensions`."""
+    """Return an array broadcast to a shape; the array's axis k becomes axis broadcast_dimensions[k] of the result."""
     placed = [1] * len(shape)
     for size, axis in zip(x.shape, params["broadcast_dimensions"], strict=True):
         placed[axis] = size
@@ -63,11 +63,12 @@ def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `pad`: return an array of the filling with x's entries in their places; negative padding cuts some off."""
+    """Lower `pad`: return x surrounded by a filling; negative padding cuts entries of x off."""
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]
-    # Axis by axis, which entries stay and where they go: `low` places before the first one, `inner` between neighbours.
+    # Find for each axis which entries stay, and where they go. There are `low` places before the first entry, and
+    # `inner` between neighbours.
     sources, targets = [], []
     for size, length, (low, _high, inner) in zip(x.shape, padded.shape, equation.params["padding_config"], strict=True):
         places = low + np.arange(size) * (1 + inner)
@@ -79,7 +80,7 @@ def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
 
 
 def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
-    """Return the constant array that is 0, 1, 2, ... along one axis, and the same along the others."""
+    """Return a constant array that counts 0, 1, 2, ... along one axis and does not change along the others."""
     shape, axis = result_shape(equation), equation.params["dimension"]
     numbers = np.arange(shape[axis]).astype(equation.params["dtype"])
     along_axis = numbers.reshape([-1 if d == axis else 1 for d in range(len(shape))])
@@ -92,8 +93,11 @@ def _make_empty_array(lowering: Lowering, equation: JaxprEqn, inputs: list[np.nd
 
 
 def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
-    """Return the array among `cases` whose number is `which`, the first below 0 and the last beyond, by selections."""
-    # From the last case back, each is chosen where `which` is at most its number, over those behind it.
+    """Return the array among `cases` whose number is `which`: the first if `which` < 0, the last if it is too large.
+
+    It is a chain of selections.
+    """
+    # Go from the last case backward: if `which` is at most a case's number, the case replaces those after it.
     selected = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
         is_up_to_here = graph.node("le", "bool", which, graph.constant(number, which.type))
@@ -103,7 +107,10 @@ def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarr
 
 
 def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `dynamic_update_slice`: x with `update` put at its starts, of which data may decide one of few places."""
+    """Lower `dynamic_update_slice`: return x with `update` written at its starts, one for each axis.
+
+    A start that depends on data may have at most FEW places: the result is selected among those of all places.
+    """
     x, update, starts = inputs[0], inputs[1], [lowering.get_only_node(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
         last_start = x.shape[axis] - update.shape[axis]

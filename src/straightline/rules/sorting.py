@@ -31,7 +31,10 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _is_behind(graph: Graph, a: Node, b: Node) -> Node:
-    """Return the node of whether a belongs behind b in ascending order: a > b, or a is NaN and b is none."""
+    """Return the node of a flag: whether a comes after b in ascending order, where NaN comes last.
+
+    That is if a > b, or if a is NaN and b is not.
+    """
     is_larger = graph.node("gt", "bool", a, b)
     if a.type not in REAL:
         return is_larger

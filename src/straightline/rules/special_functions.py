@@ -75,7 +75,7 @@ def _sum_lower_series(a: jax.Array, x: jax.Array, skipped: jax.Array) -> jax.Arr
     """
 
     def add_term(state: SeriesState) -> SeriesState:
-        """Add the next term of the series, the last one times x over the next denominator, a + 1, a + 2, ..."""
+        """Add the next term of the series: the last term times x / d, where d is a + 1, a + 2, ... in turn."""
         denominator, term, total = state
         term = term * x / (denominator + 1)
         return SeriesState(denominator + 1, term, total + term)
@@ -98,9 +98,10 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
     """
 
     def continue_fraction(state: ContinuedFraction) -> ContinuedFraction:
-        """Add level n of the continued fraction: partial numerator n (a - n) over x + 2 n + 1 - a.
+        """Add level n of the continued fraction, with the numerator n (a - n) and the denominator x + 2 n + 1 - a.
 
-        By Lentz's method: the fraction is a product of ratios c d, and ends where the last one is 1.
+        By Lentz's method the fraction is a product of ratios c d, and it has converged when the last ratio is 1. The
+        last number of the state is |c d - 1|.
         """
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
@@ -190,9 +191,10 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     is_far = size > FAR
 
     def add_term(state: SeriesState) -> SeriesState:
-        """Add term k of the series that serves, the last term times a ratio: where `is_far` the asymptotic one.
+        """Add term k of the series of a Bessel function: the last term times a ratio.
 
-        The other is the power series; `size` is the argument of the Bessel function, `order` its order.
+        Where `is_far` it is the asymptotic series, elsewhere the power series. `size` is the function's argument, and
+        `order` its order.
         """
         k, term, total = state
         power_ratio = size * size / (4 * k * (k + order))
@@ -249,7 +251,7 @@ def _inline_in_double(
 ) -> list[Value]:
     """Return the results of a function of scalars for each entry of arrays, computed in double precision.
 
-    The arguments' type may be double or float, to which results are converted back.
+    The arguments may be doubles or floats. The results are converted back to the arguments' type.
     """
     avals: list[Any] = [v.aval for v in equation.invars]
     if avals[0].dtype not in (np.float64, np.float32):
@@ -267,7 +269,7 @@ def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
 
 @cache
 def _trace_over_arrays(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the program of a function of `count` scalars for each entry of arrays of a shape, in double precision."""
+    """Return the program that applies a function of `count` scalars to each entry of `count` arrays, in double."""
     over_arrays = function
     for _ in shape:
         over_arrays = jax.vmap(over_arrays)

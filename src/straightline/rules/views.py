@@ -20,13 +20,14 @@ View = Callable[[StridedArray, Any, tuple[int, ...]], StridedArray | None]
 
 
 def _make_view_rule(name: str, view: View) -> Rule:
-    """Return the rule of an operation on an array in memory: its view(array, parameters, shape), which copies nothing.
+    """Return the rule of an operation on an array in memory, whose result is view(array, parameters, shape).
 
-    Where no strides describe that, and it is None, nodes are loaded and rearranged by the operation's rule for nodes.
+    A view copies nothing. If no strides describe the result, `view` returns None. The nodes are then loaded, and the
+    operation's rule for nodes (RULES[name]) rearranges them.
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Return the `view` of an array in memory; where there is none, nodes by the operation's rule (`name`)."""
+        """Return the `view` of an array in memory, or if there is none, nodes by the operation's rule `name`."""
         array_view = view(inputs[0], equation.params, result_shape(equation))
         if array_view is not None:
             return [array_view]
@@ -36,7 +37,7 @@ def _make_view_rule(name: str, view: View) -> Rule:
 
 
 def _slice(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return the view that `slice` takes of an array in memory: from start to limit along each axis, by steps."""
+    """Return the view that `slice` takes of an array in memory: from its start by its steps, along each axis."""
     steps = params["strides"] or (1,) * x.ndim
     offset = sum(s * first for s, first in zip(x.strides, params["start_indices"], strict=True))
     return x.view(shape, [s * step for s, step in zip(x.strides, steps, strict=True)], offset)
@@ -44,7 +45,7 @@ def _slice(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray
 
 def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
     """Return the view of an array in memory that goes backwards along some axes."""
-    # From the last entry of each such axis, by negative strides.
+    # Begin at the last entry of each such axis, and go by negative strides.
     axes = params["dimensions"]
     offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
     return x.view(shape, [-s if a in axes else s for a, s in enumerate(x.strides)], offset)
@@ -61,7 +62,7 @@ def _reshape(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArr
 
 
 def _broadcast_view(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return the view that repeats an array in memory along new axes, and axes of length 1, by strides of zero."""
+    """Return the view that broadcasts an array in memory: new axes, and axes of length 1, have strides of zero."""
     strides = [0] * len(shape)
     for size, stride, axis in zip(x.shape, x.strides, params["broadcast_dimensions"], strict=True):
         strides[axis] = 0 if size == 1 else stride
@@ -69,7 +70,7 @@ def _broadcast_view(x: StridedArray, params: Any, shape: tuple[int, ...]) -> Str
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return views of the parts, of the operation's sizes, into which an array in memory is split along an axis."""
+    """Return views of an array in memory, which is split along one axis into parts of the operation's sizes."""
     x, axis, parts, start = inputs[0], equation.params["axis"], [], 0
     for size in equation.params["sizes"]:
         shape = [size if a == axis else n for a, n in enumerate(x.shape)]
@@ -81,7 +82,7 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
 def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower `dynamic_slice` of an array in memory to a view, which copies nothing.
 
-    A start that is known adds to the view's offset; one that data decide is a move: (stride, node of the start).
+    A start that is known is added to the view's offset. A start that depends on data is a move: (stride, its node).
     """
     sizes = equation.params["slice_sizes"]
     x = make_indexable(lowering, inputs[0], inputs[1:])
@@ -98,7 +99,11 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
 
 
 def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Value]:
-    """Slice one axis after another, each start clamped so that the slice lies inside; in memory if places are many."""
+    """Return `dynamic_slice` of an array of nodes: slice one axis after another.
+
+    Each start is clamped so that the slice lies inside. If data decide among more than FEW places, the array is put
+    in memory and sliced there.
+    """
     x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.get_only_node(x) for x in inputs[1:]]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last_start = x.shape[axis] - size
@@ -109,9 +114,10 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
 
 
 def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
-    """Return `size` entries of an array of nodes along an axis, from a start that is clamped so that they are inside.
+    """Return `size` entries of an array of nodes along an axis, from `start` on.
 
-    Where the start depends on data, they are selected among those of all starts.
+    The start is clamped so that all entries are inside the array. If it depends on data, the entries are selected among
+    those of all possible starts.
     """
     last_start: int = x.shape[axis] - size
     along_axis = [(slice(None),) * axis + (slice(first, first + size),) for first in range(last_start + 1)]
@@ -122,9 +128,10 @@ def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, siz
 
 
 def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
-    """Return x in memory if data decide the `places` at which its entries are selected; else as it is.
+    """Return x in memory if that serves to read it at `places`, else x as it is.
 
-    In memory are only a table of constants and what is longer than FEW; keys of random numbers never are.
+    It is put in memory if data decide the places, and x is a table of constants or longer than FEW. Arrays of random
+    keys are never put in memory.
     """
     nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
     places_are_known = all(n.op == "constant" for n in nodes)
@@ -207,9 +214,10 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> StridedArray:
-    """Return arrays one after another in one buffer of this shape, that of their concatenation along the first axis.
+    """Return the concatenation of arrays along the first axis, in one buffer of this `shape`.
 
-    An array that has a buffer of its own (`_is_whole_buffer`) is computed into it directly, all others are copied.
+    An array that has a buffer of its own (`_is_whole_buffer`) is computed into its place directly. All others are
+    copied.
     """
     graph = lowering.graph
     type = next(x for x in parts if isinstance(x, StridedArray)).type
@@ -224,7 +232,7 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
 
 
 def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
-    """Return whether an array is all of a buffer that this block fills and that has no place in another buffer."""
+    """Return whether an array is all of a buffer that this block fills and that lies inside no other buffer."""
     buffer = x.buffer
     is_contiguous = not x.moves and x.offset == 0 and x.strides == contiguous_strides(x.shape)
     is_whole = is_contiguous and x.size == buffer.size
@@ -232,7 +240,10 @@ def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
 
 
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
-    """Store an array into a buffer from a place on: entry by entry up to TABLE entries or of nodes, else by a loop."""
+    """Store an array into a buffer, from place `start` on.
+
+    Up to TABLE entries, and arrays of nodes, are stored entry by entry. A longer array in memory is copied by a loop.
+    """
     graph = lowering.graph
     if x.size <= TABLE or not isinstance(x, StridedArray):
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):

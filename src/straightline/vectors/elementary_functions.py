@@ -50,10 +50,10 @@ SCALAR = {
 
 
 def write_elementary_functions(names: Iterable[str], width: int) -> str:
-    """Return the LLVM text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations.
+    """Return the LLVM text of a function of vectors, `%double @hg_NAME(%double ...)`, for each name.
 
-    A name that ends in f is that of a function of floats, as in C. Those in SCALAR call the C library lane by lane; the
-    others have a formula for whole vectors.
+    A name that ends in f is that of a function of floats, as in C. A function in SCALAR calls the C library lane by
+    lane, and needs a declaration. The others have a formula for whole vectors.
     """
     declared, texts = [], []
     for name in sorted(set(names)):
@@ -69,9 +69,9 @@ def write_elementary_functions(names: Iterable[str], width: int) -> str:
 
 
 def _write_by_number(name: str, kind: str, count: int, width: int) -> str:
-    """Return the LLVM text of a function of vectors that calls the C library's, of `count` arguments, for each lane."""
+    """Return the LLVM text of a function of vectors that calls a C function of `count` arguments for each lane."""
     real = f"%{kind}"
-    lines, results = [], "poison"  # the vector of results so far, at first one of which no number is set
+    lines, results = [], "poison"  # `results` names the vector of results so far; "poison" has no number set
     for lane in range(width):
         for i in range(count):
             lines.append(f"%a{lane}_{i} = extractelement {real} %x{i}, i64 {lane}")

@@ -74,7 +74,10 @@ LOG1P = (
 
 
 def erf(x: Vector) -> Vector:
-    """Return 2 / sqrt(pi) times the integral of e^(-t^2) from 0 to x, by one formula for each range of |x|."""
+    """Return erf x, 2 / sqrt(pi) times the integral of e^(-t^2) from 0 to x, by a formula for each range of |x|.
+
+    With s = |x|: s + s centre below 0.84375, AT_ONE + middle below 1.25, 1 - tail below 6, and 1 beyond.
+    """
     size = abs(x)
     centre, middle, tail = _evaluate_ranges(size)
     outer = select(size < 1.25, AT_ONE + middle, select(size >= 6.0, 1.0, 1 - tail))
@@ -82,7 +85,10 @@ def erf(x: Vector) -> Vector:
 
 
 def erfc(x: Vector) -> Vector:
-    """Return 1 - erf x, precise where it is small, by one formula for each range of |x| and sign of x."""
+    """Return erfc x = 1 - erf x, precise where it is small, by a formula for each range of |x| and sign of x.
+
+    The three parts are those of `erf`: erf x is x + x centre near 0, AT_ONE + middle around 1, and 1 - tail far out.
+    """
     size = abs(x)
     centre, middle, tail = _evaluate_ranges(size)
     inner = select(x < 0.25, 1 - fma(x, centre, x), 0.5 - (x - 0.5 + x * centre))
@@ -121,7 +127,10 @@ def erf_inv(x: Vector) -> Vector:
     w = -_log1p(-(x * x))
 
     def compute_outer_factor() -> Vector:
-        """Return the factor for w = -log(1 - x^2) >= 6.25, which one draw in a thousand needs: by two polynomials."""
+        """Return the factor for w = -log(1 - x^2) >= 6.25, which about one draw in a thousand needs.
+
+        It is a polynomial in sqrt(w) - 3.25 for w < 16, and one in sqrt(w) - 5 beyond.
+        """
         is_below_16, root = w < 16.0, sqrt(w)
         above = polynomial(root - 5, INVERSE[2][::-1])
         below = polynomial(root - 3.25, INVERSE[1][::-1])
@@ -134,14 +143,16 @@ def erf_inv(x: Vector) -> Vector:
 
 
 def erf_inv_of_floats(x: Vector) -> Vector:
-    """Invert erf by XLA's polynomials for float32: in w - 2.5 for w < 5, in sqrt(w) - 3 beyond, w = -log(1 - x^2).
+    """Return the inverse of erf as x times one of XLA's two polynomials for float32, with w = -log(1 - x^2).
 
+    For w < 5 it is a polynomial in w - 2.5, beyond in sqrt(w) - 3. At |x| = 1 the result is infinite.
     Source: Giles, Approximating the erfinv function (2010).
     """
     w = -log1p(-(x * x))
     is_near = w < 5.0
     argument = select(is_near, w - 2.5, sqrt(w) - 3)
-    # In each lane the coefficients of its own polynomial. Tables have the highest first, `polynomial` takes it last.
+    # Each lane takes the coefficients of its own polynomial. The tables have the highest coefficient first, and
+    # `polynomial` takes it last.
     highest_first = [select(is_near, x.like(near), far) for near, far in zip(*INVERSE_OF_FLOATS, strict=True)]
     factor = polynomial(argument, highest_first[::-1])
     return x * select(abs(x).equals(1.0), math.inf, factor)
@@ -150,8 +161,9 @@ def erf_inv_of_floats(x: Vector) -> Vector:
 def _log1p(t: Vector) -> Vector:
     """Return log(1 + t) as XLA does, so that random numbers agree.
 
-    From jaxlib 0.11.2 on (PRECISE) it is precise. Before (0.11.0 is the last that was tried) XLA's is 53 units of
-    rounding off near -0.4: a quotient of polynomials for small |t|, else log(1 + t) as rounded.
+    From jaxlib 0.11.2 on (PRECISE), XLA's is precise. Earlier ones (0.11.0 was tried) are up to 53 units of rounding
+    off near -0.4. For |t| < sqrt(2) - 1 they compute t - t^2 / 2 + t^3 times a quotient of polynomials (LOG1P), and
+    else log(1 + t), where the sum is rounded.
     """
     if jaxlib.version.__version_info__ >= PRECISE:
         return log1p(t)

@@ -59,8 +59,11 @@ def find_format(x: Vector) -> PrecisionFormat:
 
 
 def exp(x: Vector) -> Vector:
-    """Return e^x = 2^n e^r, n the integer nearest to x / ln 2, r = x - n ln 2, e^r = 1 + r + r^2 times a polynomial."""
-    form = find_format(x)
+    """Return e^x = 2^n e^r, where n is the integer nearest to x / ln 2, and r = x - n ln 2.
+
+    e^r = 1 + r + r^2 p(r) with a polynomial p. ln 2 is a sum of two numbers, so that r is precise.
+    """
+    form = find_format(x)  # the constants for this width of numbers
     integer_n, n = round_to_nearest(x * LOG2_E)
     ln2_high, ln2_low = form.ln2
     r = fma(n, -ln2_low, fma(n, -ln2_high, x))
@@ -69,9 +72,10 @@ def exp(x: Vector) -> Vector:
 
 
 def exp_of_sum(x: Vector, low: Vector) -> Vector:
-    """Return e^(x + low), |low| small against 1, within 0.6 units of rounding.
+    """Return e^(x + low) within 0.6 units of rounding; |low| is small against 1.
 
-    As `exp`, but with r = x + low - n ln 2, and with 1 + r, as sums of two numbers: the second is what rounding loses.
+    It is computed as in `exp`, with r = x + low - n ln 2. But r, and also 1 + r, is kept as a sum of two numbers: the
+    second is what rounding takes from the first.
     """
     form = find_format(x)
     integer_n, n = round_to_nearest(x * LOG2_E)
@@ -101,8 +105,11 @@ def expm1(x: Vector) -> Vector:
 
 
 def log(x: Vector) -> Vector:
-    """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2); -infinity of 0, NaN below."""
-    # A subnormal x is made a normal number by a power of two, which is taken off its exponent.
+    """Return log x = k ln 2 + log m, where x = 2^k m and m lies between sqrt(1/2) and sqrt(2).
+
+    It is -infinity at x = 0, and NaN for x < 0.
+    """
+    # A subnormal x is multiplied by 2^power, which makes it normal; `power` is then subtracted from k.
     form = find_format(x)
     is_subnormal, power = x < form.tiny, form.fraction + 2
     k, m = _split_exponent(select(is_subnormal, x * 2.0**power, x))
@@ -111,8 +118,11 @@ def log(x: Vector) -> Vector:
 
 
 def log1p(x: Vector) -> Vector:
-    """Return log(1 + x) = log(u) + log((1 + x) / u), u = 1 + x as rounded; x itself where it is negligible."""
-    # The second logarithm is nearly what rounding took from 1 + x, over u.
+    """Return log(1 + x) = log(u) + log((1 + x) / u), where u is 1 + x after rounding.
+
+    Where x^2 is negligible against x, it is x itself.
+    """
+    # The second logarithm is close to d / u, where d is what rounding took from 1 + x.
     u = 1 + x
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _split_exponent(u)
@@ -121,9 +131,10 @@ def log1p(x: Vector) -> Vector:
 
 
 def tanh(x: Vector) -> Vector:
-    """Return the hyperbolic tangent, with the sign of x, of |x|: -t / (2 + t), t = e^(-2|x|) - 1.
+    """Return the hyperbolic tangent of |x|, with the sign of x.
 
-    Beyond 1/2 it is 1 - 2 / (2 + t), t = e^(2|x|) - 1: each form is precise where it is used.
+    For |x| <= 1/2 it is -t / (2 + t) with t = e^(-2|x|) - 1. Beyond, it is 1 - 2 / (2 + t) with t = e^(2|x|) - 1. Each
+    form is precise where it is used.
     """
     size = abs(x)
     large = size > 0.5
@@ -133,9 +144,10 @@ def tanh(x: Vector) -> Vector:
 
 
 def round_to_nearest(x: Vector) -> tuple[Vector, Vector]:
-    """Return the nearest integer, as one and as a real number; of doubles |x| < 2^51, of floats 2^22.
+    """Return the integer nearest to x, as an integer and as a real number; |x| < 2^51 (doubles) or 2^22 (floats).
 
-    A sum with a number so large that its last bit is 1 is rounded to an integer, which its lower bits are.
+    `form.round` is so large that the last bit of a sum with it is worth 1. The sum is therefore rounded to an integer,
+    which is in its lower bits. `form.round_bits` are the bits of `form.round` as an integer.
     """
     form = find_format(x)
     moved = x + form.round
@@ -143,7 +155,10 @@ def round_to_nearest(x: Vector) -> tuple[Vector, Vector]:
 
 
 def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
-    """Return x - n ln 2 as the sum of two numbers, the second what rounding takes from the first; ln 2 is a sum too."""
+    """Return x - n ln 2 as a sum of two numbers, where the second is what rounding takes from the first.
+
+    ln 2 is itself a sum of two numbers, ln2_high + ln2_low.
+    """
     ln2_high, ln2_low = find_format(x).ln2
     first = fma(n, -ln2_high, x)
     second = n * ln2_low
@@ -168,9 +183,10 @@ def _limit_result(x: Vector, value: Vector, largest: float, smallest: float) -> 
 
 
 def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
-    """Return k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number.
+    """Return k and m with x = 2^k m and sqrt(1/2) <= m < sqrt(2), for a positive normal number x.
 
-    The exponent is the upper bits of x as an integer: less those of sqrt(1/2), with the fraction shifted out, it is k.
+    The upper bits of x, read as an integer, are its exponent. k is what is left if the bits of sqrt(1/2) are
+    subtracted and the bits of the fraction are shifted out.
     """
     form = find_format(x)
     bits = x.as_type(form.word)
@@ -180,9 +196,10 @@ def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
 
 
 def _log(k: Vector, f: Vector, low: Vector | float) -> Vector:
-    """Return k ln 2 + log(1 + f) + low, where `low` is small against the rest or the rest is zero.
+    """Return k ln 2 + log(1 + f) + low, where `low` is small against the rest, or the rest is zero.
 
-    log(1 + f) = f - f^2 / 2 + s (f^2 / 2 + r), s = f / (2 + f), r a polynomial in s^2; ln 2 is a sum of two numbers.
+    log(1 + f) = f - f^2 / 2 + s (f^2 / 2 + r) with s = f / (2 + f) and a polynomial r in s^2. ln 2 is a sum
+    of two numbers.
     """
     form = find_format(f)
     s = f / (2 + f)

@@ -32,9 +32,10 @@ class FormulaBody:
         return Vector(self, scalar, name)
 
     def compute_where_needed(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
-        """Return what `costly` returns in the lanes where it is `needed`, else the value.
+        """Return the result of `costly` in the lanes where it is `needed`, and `value` in the others.
 
-        `costly` writes its operations as it is called, within a block that is jumped past if no lane needs it.
+        A call of `costly` writes its operations, and returns their result. They are written within a block that is
+        skipped if no lane needs it.
         """
         start, mark = self.block, len(self.lines)
         truth = self.type("i1")
@@ -56,13 +57,14 @@ class FormulaBody:
 def _make_operator(
     real_instruction: str, integer_instruction: str, is_reflected: bool = False
 ) -> Callable[["Vector", Operand], "Vector"]:
-    """Return the method of an operator of vectors, which writes LLVM's instruction for real numbers or for integers.
+    """Return the method of an operator of vectors, such as __add__, which writes an LLVM instruction.
 
-    `is_reflected`: whether the vector is the second operand, as in `2 - x` (Python's __rsub__).
+    Reals and integers have different instructions. `is_reflected`: whether the vector is the second operand, as in
+    `2 - x` (Python's __rsub__).
     """
 
     def apply(self: "Vector", other: Operand) -> "Vector":
-        """Write the instruction for self and other (for other and self, if `is_reflected`); return its result."""
+        """Write the instruction for (self, other), or for (other, self) if `is_reflected`; return its result."""
         operands = (self, self.like(other))
         a, b = reversed(operands) if is_reflected else operands
         instruction = real_instruction if self.scalar in REALS else integer_instruction
@@ -72,7 +74,7 @@ def _make_operator(
 
 
 def _make_comparison(real_condition: str, integer_condition: str) -> Callable[["Vector", Operand], "Vector"]:
-    """Return the method that compares vectors, by LLVM's condition for real numbers or for integers."""
+    """Return a method that compares vectors, such as __lt__; reals and integers have different LLVM conditions."""
 
     def compare(self: "Vector", other: Operand) -> "Vector":
         """Write the comparison of self with other; return its truth values, lane by lane."""
@@ -132,7 +134,7 @@ def rounded(value: float) -> float:
 
 
 def make_constant(body: FormulaBody, scalar: str, value: float) -> Vector:
-    """Return a vector with one number in all lanes, as LLVM's literal: a real one by its bits as a double."""
+    """Return a vector with one number in all lanes, as an LLVM literal; a real one is written by its bits as double."""
     if scalar in REALS:
         value = value if scalar == "double" else rounded(value)
         text = "0x" + struct.pack(">d", value).hex().upper()
@@ -144,9 +146,9 @@ def make_constant(body: FormulaBody, scalar: str, value: float) -> Vector:
 
 
 def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
-    """Return `yes` in the lanes where the condition holds, else `no`; one of them is a vector, or both are numbers.
+    """Return `yes` in the lanes where the condition holds, and `no` in the others.
 
-    Of two numbers the result is a vector of doubles.
+    Each of them is a vector or a number. Two numbers give a vector of doubles.
     """
     body = condition.body
     any_vector = next((v for v in (yes, no) if isinstance(v, Vector)), make_constant(body, "double", 0.0))
@@ -181,9 +183,10 @@ def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
 
 @cache
 def write_function(name: str, formula: Callable[..., Vector], arguments: int = 1, scalar: str = "double") -> str:
-    """Return the text of an internal function of vectors of doubles, or of floats: what a formula writes when called.
+    """Return the LLVM text of a function of vectors that computes a formula.
 
-    `formula` takes so many `arguments`, vectors of these scalars; each of its operations appends a line.
+    `formula` is called with as many vectors as `arguments` says, whose numbers are of type `scalar` ("double" or
+    "float"). Each operation on them appends a line to the text.
     """
     body = FormulaBody()
     real = body.type(scalar)

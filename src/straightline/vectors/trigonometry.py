@@ -51,10 +51,10 @@ TURNS = [
 
 
 def sin(x: Vector) -> Vector:
-    """Return the sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2.
+    """Return the sine of x = n pi / 2 + r, where |r| <= pi / 4; `quarter` is n.
 
-    Of an odd number of quarter turns it is the cosine; of two or three, modulo four, the sign is the other one. A small
-    x is its own sine.
+    It is sin r for even n and cos r for odd n. It is negated if n mod 4 is 2 or 3. The sine of a small x is x itself,
+    and that of a very large x is computed by the C library.
     """
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
@@ -64,10 +64,10 @@ def sin(x: Vector) -> Vector:
 
 
 def cos(x: Vector) -> Vector:
-    """Return the cosine: cosine or sine of what is left of x beyond the nearest multiple of pi / 2, with its sign.
+    """Return the cosine of x = n pi / 2 + r, where |r| <= pi / 4; `quarter` is n.
 
-    It is the sine a quarter turn further: of an odd number of quarter turns it is the sine, of one or two, modulo four,
-    the sign is the other one.
+    It is cos r for even n and sin r for odd n. It is negated if n mod 4 is 1 or 2. The cosine of a very large x is
+    computed by the C library.
     """
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
@@ -78,12 +78,13 @@ def cos(x: Vector) -> Vector:
 def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
     """Return the number n of quarter turns in x, and the rest x - n pi / 2 as a sum of two numbers.
 
-    pi / 2 is a sum of three, taken off one by one; the first difference is exact.
+    pi / 2 is a sum of three numbers (high, middle, low), which are subtracted one by one. The first difference,
+    x - n high, is exact.
     """
     quarter, n = round_to_nearest(x * (2 / math.pi))
     high, middle, low = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS
     first = fma(n, -high, x)
-    # first - n middle as a sum: the product and the difference each with what rounding takes from it.
+    # Compute first - n middle as a sum: rounding takes something from the product and from the difference.
     product = n * middle
     second = first - product
     subtracted = second - first
@@ -94,7 +95,10 @@ def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def _sin(x: Vector, low: Vector) -> Vector:
-    """Return sin(x + low), |x| <= pi / 4 and `low` what x lacks: x + x^3 times a polynomial in x^2, and low's part."""
+    """Return sin(x + low) = x + x^3 p(x^2) + low (1 - x^2 / 2), where |x| <= pi / 4 and `low` is tiny.
+
+    The polynomial p has the coefficients SIN.
+    """
     z = x * x
     v = z * x
     r = polynomial(z, _select_coefficients(x, SIN)[1:])
@@ -102,7 +106,10 @@ def _sin(x: Vector, low: Vector) -> Vector:
 
 
 def _cos(x: Vector, low: Vector) -> Vector:
-    """Return cos(x + low), |x| <= pi / 4, `low` what x lacks: 1 - x^2 / 2 + x^4 times a polynomial in x^2 - x low."""
+    """Return cos(x + low) = 1 - x^2 / 2 + x^4 p(x^2) - x low, where |x| <= pi / 4 and `low` is tiny.
+
+    The polynomial p has the coefficients COS. (1 - w) - half is what rounding takes from w = 1 - x^2 / 2.
+    """
     z = x * x
     half = 0.5 * z
     w = 1 - half
@@ -145,15 +152,15 @@ def _atan_of_positive(x: Vector) -> Vector:
 
 
 def atan2(y: Vector, x: Vector) -> Vector:
-    """Return the angle of the point (x, y), from -pi to pi, NaN if a coordinate is NaN.
+    """Return the angle of the point (x, y), from -pi to pi, or NaN if a coordinate is NaN.
 
-    That of |y / x|, taken from pi where x < 0, with the sign of y.
+    It is a = atan |y / x| for x > 0 and pi - a for x < 0, with the sign of y.
     """
-    # Of equal sizes the ratio would be NaN for 0/0 and infinity/infinity: along an axis it is 0, on a diagonal 1.
+    # If |x| = |y|, the quotient could be 0/0 or infinity/infinity, which is NaN. The ratio is 0 at the origin, else 1.
     have_equal_sizes = abs(x).equals(abs(y))
     ratio = select(have_equal_sizes, select(y.equals(0.0), y.like(0.0), 1.0), abs(y / x))
     angle = _atan_of_positive(ratio)
-    is_x_negative = x.as_type(find_format(x).word) < 0  # by its sign bit, so that -0 is too
+    is_x_negative = x.as_type(find_format(x).word) < 0  # as an integer, so that -0 counts as negative
     angle = select(is_x_negative, math.pi - (angle - PI_LOW[x.scalar]), angle)
     return copy_sign(select(_is_number(x) & _is_number(y), angle, math.nan), y)
 

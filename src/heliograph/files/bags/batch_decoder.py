@@ -53,11 +53,12 @@ class MessageLayout:
     """
 
     def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
-        """Find where the fields at `paths` stand in messages laid out as `data`; LayoutNotFixedError if one cannot be.
+        """Find where the fields at `paths` stand in messages that are laid out like `data`, one message's bytes.
 
-        `definitions`: fields of each type of messages; `kind`: type of this one. `self.lengths` gets the length of each
-        text or list by the byte where it stands, in byte 0 what must be the HEAD of the encoding; `self.fields` gets
-        by path the byte of a wanted number and its type.
+        `definitions` holds the fields of each message type, and `kind` is this message's type. `self.lengths` maps the
+        byte where a text's or list's length stands to that length; byte 0 holds the encoding's head, HEAD.
+        `self.fields` maps the path of a wanted number to its byte and type. LayoutNotFixedError is raised if a wanted
+        field has no fixed place.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
@@ -68,10 +69,10 @@ class MessageLayout:
             raise LayoutNotFixedError
 
     def fits(self, table: np.ndarray) -> np.ndarray:
-        """Return whether each message of a table of bytes, (messages, size), has the layout's lengths, (messages,).
+        """Return for each message of a table of bytes (messages, size) whether it has this layout, (messages,).
 
-        `self.lengths`: {first byte of the length of a text or list: that length, a uint32}; at byte 0 messages have the
-        four bytes of the encoding's head instead.
+        A message has it if all its texts and lists have the same lengths. `self.lengths` maps the first byte of each
+        length to the length, a uint32. Byte 0 holds the four bytes of the encoding's head instead.
         """
         has_equal_lengths = np.ones(len(table), dtype=bool)
         for first_byte, length in self.lengths.items():
@@ -83,10 +84,10 @@ class MessageLayout:
         return {path: _decode_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
     def _locate_message_numbers(self, begin: int, kind: str, prefix: str) -> int:
-        """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
+        """Note where the wanted numbers of a message stand, which begins at byte `begin`; return the byte of its end.
 
-        `prefix`: path of the message in the whole one, with a dot; "" for that itself. LayoutNotFixedError, here and
-        below, means that the message has no fixed places and is decoded alone.
+        `prefix` is the path of a message inside another one, with a dot; it is "" for the outermost message.
+        LayoutNotFixedError means that fields have no fixed places, so that messages must be decoded one by one.
         """
         if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
             raise LayoutNotFixedError
@@ -128,10 +129,10 @@ class MessageLayout:
         return begin
 
     def _locate_numbers_in_row(self, begin: int, kind: str, count: int, names: list[str]) -> int:
-        """Note where the wanted ones of `count` numbers in a row stand, by `names`; return the byte behind the last.
+        """Note the bytes of the wanted numbers among `count` numbers in a row; return the byte after the last.
 
-        `kind`: type of the numbers, such as "uint16"; NUMBERS has the bytes of each. Every number begins at a multiple
-        of its size.
+        `names` holds the paths of the numbers. `kind` is their type, such as "uint16", whose size in bytes is in
+        NUMBERS. Every number begins at a multiple of its size.
         """
         size = NUMBERS.get(kind)
         if size is None:
@@ -143,10 +144,10 @@ class MessageLayout:
         return begin + count * size
 
     def _note_length(self, begin: int) -> int:
-        """Return the length of a text or list that stands at this byte, and note it: the whole layout has it there.
+        """Return the length of a text or list, which stands at byte `begin`, and note it as part of the layout.
 
-        Messages with more lengths than MOST_LENGTHS, or one beyond their end, are decoded alone. Byte 0 has no length
-        but the head of the encoding.
+        If a message has more than MOST_LENGTHS lengths, or a text reaches beyond its end, messages are decoded one by
+        one (LayoutNotFixedError). Byte 0 holds the head of the encoding instead of a length.
         """
         length = int.from_bytes(self._data[begin : begin + 4], "little")
         self.lengths[begin] = length
@@ -262,11 +263,11 @@ class NodeReadings(NamedTuple):
 
 
 def _list_paths_of_numbers(source: Source) -> list[str]:
-    """Return dotted paths of the numbers that a source needs: its values, both parts of a stamp, its running count.
+    """Return the dotted paths of the numbers that a source reads: values, both parts of a stamp, and a running count.
 
     Raises:
-        LayoutNotFixedError: a source of which each message is decoded alone, since its plant or node stand in the
-            message, a condition (`where`) chooses messages, or times are steps.
+        LayoutNotFixedError: the source's messages must be decoded one by one. Its plant or node stands in the message,
+            a condition (`where`) chooses messages, or its times are steps.
     """
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutNotFixedError
@@ -318,12 +319,12 @@ def _make_node_readings(
 
 
 def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
-    """Return a value of many messages, (messages,): the field at a path, or what is computed of several; NaN for none.
+    """Return one value of many messages, (messages,): the field at `path`, or a number computed from several fields.
 
-    `columns`: by path of a field its numbers, one a message; those that are not finite are none.
+    `columns` maps the path of a field to its numbers (messages,). A number that is not finite becomes NaN.
 
     Raises:
-        LayoutNotFixedError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
+        LayoutNotFixedError: a field has an impossible number, such as a latitude beyond 90 degrees.
     """
     components = [columns[name].astype(np.float64) for name in _list_component_paths(path)]
     finite_or_nan = [np.where(np.isfinite(numbers), numbers, np.nan) for numbers in components]

@@ -58,18 +58,19 @@ class Pose:
     child: str = "base_link"
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless each field is a text, the name of the state on that axis, or None."""
+        """Raise ValueError unless each field, one an axis, is the name of a state or None."""
         for axis, state in vars(self).items():
             if state is not None:
                 text(f"pose, {axis}", state)
 
     def places(self, states: tuple[str, ...]) -> tuple[list[int | None], list[int | None]]:
-        """Return for each axis of the pose, and of the twist, the index of its state; None where it has none.
+        """Return the index of each axis's state, or None, for the pose's six axes and for the twist's six.
 
-        AXES are x, y, z and three angles, six of the pose; those of the twist, velocities, have a "v" before them.
+        AXES names the axes of the pose: x, y, z and three angles. The twist's axes, velocities, have a "v" before
+        these names.
 
         Raises:
-            ValueError: an unknown state.
+            ValueError: an axis has an unknown state.
         """
         axes = (*AXES, *(f"v{axis}" for axis in AXES))
         state_of_axis: list[str | None] = [getattr(self, axis) for axis in axes]
@@ -137,9 +138,9 @@ def _load_ros2_message_types() -> Any:
 
 
 def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
-    """Return times in nanoseconds since 1970: of dates, or of seconds from an origin (None: 1970).
+    """Return times in nanoseconds since 1970, from dates or from seconds after `origin` (1970 if it is None).
 
-    Times that are steps are taken as seconds.
+    Times that are numbers of steps are taken as seconds.
     """
     if time.dtype.kind == "M":
         return [int(nanoseconds) for nanoseconds in time.astype("datetime64[ns]").astype(np.int64)]
@@ -160,9 +161,10 @@ def _make_topic_prefix(node: str, filter_name: str) -> str:
 def _yield_topics_and_types(
     prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose
 ) -> Iterator[tuple[str, str]]:
-    """Yield topic and message type of each part of one filter's estimates: odometry, each state, its deviation.
+    """Yield (topic, message type) for each part of one filter's estimates: odometry, states and their deviations.
 
-    There is odometry where a state is an axis of the pose or twist, and deviations (sd) where the filter claims any.
+    There is odometry if a state is an axis of the pose or twist. There are standard deviations (sd) if the filter
+    claims a covariance.
     """
     axes_of_pose, axes_of_twist = pose.places(states)
     if any(state is not None for state in (*axes_of_pose, *axes_of_twist)):
@@ -271,9 +273,10 @@ def _make_odometry(
 def _select_pose_and_covariance(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
-    """Return the six numbers of pose or twist, and their covariance (36,), row by row; `places`: states by axis.
+    """Return the six numbers of a pose or twist, and their covariance (6, 6) row by row, (36,).
 
-    Both are 0 on an axis that no state is on. Where there is no covariance its first entry is UNKNOWN, -1, as in ROS.
+    `places` holds for each axis the index of its state, or None; an axis without a state has zeros. If `covariance` is
+    None, the first entry of the result is UNKNOWN, -1, as ROS prescribes.
     """
     numbers = [0.0 if state is None else float(mean[state]) for state in places]
     covariance_of_axes = np.zeros((6, 6))
@@ -287,7 +290,7 @@ def _select_pose_and_covariance(
 
 
 def _convert_angles_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of the rotation by yaw about z, then pitch about the new y, then roll about the new x."""
+    """Return the quaternion (x, y, z, w) of a rotation by yaw about z, pitch about the new y, and roll about the new x."""
     # Sines and cosines of half the angles.
     (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
     return (

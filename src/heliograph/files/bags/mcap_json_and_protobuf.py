@@ -46,17 +46,17 @@ class ProtobufType(NamedTuple):
 def holds_messages(path: Path) -> bool:
     """Return whether a file is MCAP with messages in JSON or Protocol Buffers.
 
-    OTHERS are the encodings that nothing here reads; a file with messages of ROS has neither and is read elsewhere.
+    False also means messages of ROS, which another module reads. OTHERS holds the encodings that nothing here reads.
 
     Raises:
-        ValueError: MCAP whose messages are all of an encoding that is not read.
+        ValueError: all messages of the MCAP file are in encodings of OTHERS.
     """
     if path.suffix.lower() != ".mcap" or not path.is_file():
         return False
     try:
         with path.open("rb") as file:
             channels = _find_channels(file)
-    except Exception:  # damage, which whoever reads the file reports
+    except Exception:  # the file is damaged, which its reader will report
         return False
     encodings = {channel.encoding for channel in channels}
     if encodings and encodings <= OTHERS:
@@ -136,10 +136,10 @@ def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | No
 
 
 def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufType], data: bytes) -> object:
-    """Return a message: in JSON its text, in Protocol Buffers its fields, in other encodings None.
+    """Return the content of a message: text in JSON, fields in Protocol Buffers, None in other encodings.
 
-    `types`: of each schema's number its message's name and types. The error of a message that cannot be decoded is
-    returned, not raised, so that the reader counts it and goes on.
+    `types` maps a schema's number to the message's name and types. If a message cannot be decoded, the error is
+    returned and not raised, so that the reader counts it and goes on.
     """
     if channel.encoding == JSON:
         return data.decode(errors="replace")
@@ -153,9 +153,10 @@ def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufT
 
 
 def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
-    """Return {number of a schema: its types} of a schema record; {} of another encoding, or of one that is damaged.
+    """Return {number of the schema: its types} from a schema record.
 
-    The record has its number, then name and encoding, each behind its length, then LENGTH and the description of types.
+    The answer is {} if the record is damaged or has another encoding than Protocol Buffers. A record consists of the
+    schema's number, its name and its encoding (each after its length), and the description of types after its length.
     """
     (number,) = NUMBER.unpack_from(content)
     name, end = _read_sized_text(content, NUMBER.size)
@@ -169,21 +170,21 @@ def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
 
 
 def _find_channels(file: BinaryIO) -> list[McapChannel]:
-    """Return the channels of the summary of an MCAP file; without one, those that stand before the first message."""
-    # The footer says where the summary begins; 0: there is none.
+    """Return the channels in the summary of an MCAP file, or, without a summary, those before the first message."""
+    # The footer says where the summary begins; 0 means that there is none.
     file.seek(-END.size - len(MAGIC), os.SEEK_END)
     kind, _length, summary_start, _offsets_start, _checksum = END.unpack(file.read(END.size))
     if kind == FOOTER and summary_start and file.read() == MAGIC:
         file.seek(summary_start)
         if channels := _list_channels(_read_records(file)):
             return channels
-    # Without a summary channels stand where they are first used: those behind the first message are not looked for.
+    # Without a summary each channel stands where it is first used. Those after the first message are not searched.
     file.seek(len(MAGIC))
     return _list_channels(takewhile(lambda record: record[0] != MESSAGE, _read_records(file)))
 
 
 def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
-    """Return the channels among records, each behind its schema."""
+    """Return the channels among records (kind, content); a channel's schema stands before it."""
     channels, types = list[McapChannel](), dict[int, ProtobufType]()
     for kind, content in records:
         if kind == SCHEMA:
@@ -225,8 +226,8 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[int, McapChannel]:
     """Return the number of a channel, and its topic, encoding and schema, from the content of its record.
 
-    `types`: types by number of a schema, as far as they are known; without them Protocol Buffers are BARE, unreadable.
-    The record begins with two numbers, of channel and schema, before its topic.
+    The record begins with the numbers of the channel and of its schema. `types` maps schemas' numbers to types. If the
+    schema of a Protocol Buffers channel is not among them, its encoding is BARE, which cannot be read.
     """
     (number,), (schema,) = NUMBER.unpack_from(content), NUMBER.unpack_from(content, NUMBER.size)
     topic, end = _read_sized_text(content, 2 * NUMBER.size)
@@ -237,7 +238,7 @@ def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[in
 
 
 def _read_sized_text(content: bytes, at: int) -> tuple[str, int]:
-    """Return the text whose length stands at byte `at`, just before it, and the byte behind its end."""
+    """Return the text whose length stands at byte `at` and which follows it, and the byte after the text."""
     (size,) = LENGTH.unpack_from(content, at)
     begin = at + LENGTH.size
     return content[begin : begin + size].decode(), begin + size

@@ -62,9 +62,10 @@ def list_flags(kind: str, paths: Collection[str]) -> set[str]:
 
 
 def blank_columns(kind: str, columns: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return fields of many messages of a type, (messages,) each, with NaN where one says that it has no value.
+    """Return the columns of many messages with NaN for values that do not exist, and which messages have such values.
 
-    `columns`: by path, those of `list_flags` too. Returned second is which messages have such a field, (messages,).
+    Some message types have flags that say that a field has no value (MARKS). `columns` maps the path of a field or flag
+    to its numbers (messages,). The second result is a mask (messages,).
     """
     blank, marked = dict(columns), np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
     for mark in MARKS.get(kind, ()):
@@ -76,11 +77,11 @@ def blank_columns(kind: str, columns: Mapping[str, np.ndarray]) -> tuple[dict[st
 
 
 def blank_message(kind: str, message: Any, paths: Collection[str]) -> bool:
-    """Set fields of a message of a type to NaN where it says that they have no value; return whether some were.
+    """Set the fields of a message to NaN that have no value, as the message itself says; return whether there are any.
 
     Args:
-        kind: the type.
-        message: the message, as rosbags has it.
+        kind: the type of the message.
+        message: the message, as rosbags decoded it.
         paths: dotted paths of the fields that are read.
     """
     marked = False
@@ -93,7 +94,7 @@ def blank_message(kind: str, message: Any, paths: Collection[str]) -> bool:
 
 
 def _get(message: Any, path: str) -> Any:
-    """Return the field of a message at a dotted path; NaN where there is none."""
+    """Return the field of a message at a dotted path, or NaN if there is no such field."""
     for part in path.split("."):
         if part.isdigit():
             message = message[int(part)] if int(part) < len(message) else np.nan
@@ -103,7 +104,7 @@ def _get(message: Any, path: str) -> Any:
 
 
 def _set(message: Any, path: str, value: float) -> None:
-    """Set the field of a message at a dotted path; a list is copied, since it may be that of the file."""
+    """Set the field of a message at a dotted path; a list is copied, since its memory may belong to the file."""
     *parents, last = path.split(".")
     if last.isdigit():
         numbers = np.array(_get(message, ".".join(parents)), dtype=np.float64)

@@ -87,9 +87,10 @@ class ProtobufSchema:
 
     @staticmethod
     def of(data: bytes) -> "ProtobufSchema":
-        """Return the schema of a FileDescriptorSet (files of types, encoded); raise ValueError at what is none."""
+        """Return the schema in an encoded FileDescriptorSet (files that define types); raise ValueError for other data."""
         schema = ProtobufSchema({}, {})
-        # Numbers of fields in descriptor.proto: 1 file; in it 2 package, 4 messages, 5 enumerations, 12 syntax.
+        # Field numbers in descriptor.proto: the set has 1 (file); a file has 2 (package), 4 (message types),
+        # 5 (enumerations) and 12 (syntax).
         for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
@@ -126,10 +127,10 @@ class ProtobufSchema:
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
-        """Read the descriptor of an enumeration into the table of the schema.
+        """Read the descriptor of an enumeration into `self.enums`, {full name: {number: name of the value}}.
 
-        `prefix`: full name of what it stands in, with a dot; `implicit`: not used here (that of messages needs it).
-        Numbers of fields: 1 its name, 2 its values; in a value 1 its name, 2 its number, 0 where absent.
+        `prefix` is the full name of the package or message around it, with a dot. `implicit` is not used here. The
+        descriptor has the fields 1 (name) and 2 (values). A value has 1 (name) and 2 (number, 0 if absent).
         """
         name_of_number = {}
         for content in _list_values_of_field(data, 2):
@@ -168,9 +169,9 @@ class ProtobufSchema:
         return {"sec": content["seconds"], "nsec": content["nanos"]} if name == STAMP else content
 
     def _read_value(self, field: FieldDescriptor, value: Any, depth: int) -> Any:
-        """Return a value of a field as JSON has it: a message as an object, an enumeration's by name, bytes as None.
+        """Return a field's value as in JSON: a message is an object, an enumeration's value its name, and bytes None.
 
-        `depth`: how many messages this one is within; `field.of`: full name of the message's or enumeration's type.
+        `depth` counts the messages around this one. `field.of` is the full name of the message's or enumeration's type.
         """
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
@@ -182,9 +183,10 @@ class ProtobufSchema:
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
 
     def _choose_default(self, field: FieldDescriptor) -> Any:
-        """Return the value of a field that a message leaves out: 0, false, "", a name of an enumeration, or None.
+        """Return the value of a field that a message leaves out.
 
-        In the table of kinds 1 is double, 2 float, 8 bool; all others are whole numbers.
+        It is 0, false or "", the name of an enumeration's value 0, or None for bytes. Of the kinds below, 1 is double,
+        2 is float and 8 is bool. All other kinds are integers.
         """
         if field.kind == ENUM:
             return self.enums.get(field.of, {}).get(0, 0)
@@ -217,9 +219,10 @@ def read_fields(data: bytes) -> Iterator[tuple[int, int, Wire]]:
 
 
 def _read_varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return the whole number at a place, and the place where it ends: seven bits a byte, the lowest first.
+    """Return the integer that begins at byte `at`, and the byte after its end.
 
-    The highest bit of a byte says that another follows; a number has ten bytes at most, of which 64 bits count.
+    Each byte holds seven bits, the lowest ones first. Its highest bit says that another byte follows. An integer has at
+    most ten bytes, and only its lowest 64 bits count.
     """
     number = shift = 0
     for place in range(at, min(at + 10, len(data))):
@@ -261,9 +264,9 @@ def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
 
 
 def _find_wire_type(field: FieldDescriptor) -> int:
-    """Return the wire type, which says how a field's value is laid out; raise ValueError at a type that is not read.
+    """Return a field's wire type, which says how its value is laid out; raise ValueError if its type is not read.
 
-    SIZED: its length stands before it; VARINT: a whole number of as many bytes as it needs.
+    SIZED: the value's length stands before it. VARINT: an integer that takes as many bytes as it needs.
     """
     if field.kind in (TEXT, BYTES, MESSAGE):
         return SIZED
@@ -285,7 +288,7 @@ def _read_text_field(data: bytes, number: int) -> str:
 
 
 def _decode_text(value: Any) -> str:
-    """Return a text; raise ValueError at what is none."""
+    """Return a value's bytes as text; raise ValueError if the value is a number."""
     if not isinstance(value, bytes):
         raise ValueError("a number where a text is expected")
     return value.decode()

@@ -44,9 +44,9 @@ def is_bag(path: Path) -> bool:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """Return the bag files in a folder in the order of their names; [] where it is one bag of ROS 2, or no folder.
+    """Return the bag files in a folder, sorted by name; [] if the path is a single bag or no folder.
 
-    A bag of ROS 2 is a folder with the file metadata.yaml.
+    A folder with the file metadata.yaml is a single bag of ROS 2.
     """
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return []
@@ -107,9 +107,10 @@ def read_bag(
 
 
 def _note_unmatched_topics(path: Path, sources: TopicReader, counts: Counter[str], events: EventTable) -> None:
-    """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
+    """Add notes to the events: on topics of the bag that no source has, and on sources' topics that the bag lacks.
 
-    `counts`: messages of the bag by topic. Topics of sources with a wildcard, + or #, are never said to be missing.
+    `counts` maps a topic of the bag to its number of messages. A source's topic with a wildcard (+ or #) never counts
+    as missing.
     """
     others = {topic: count for topic, count in counts.items() if not sources.of(topic)}
     if others:
@@ -121,12 +122,12 @@ def _note_unmatched_topics(path: Path, sources: TopicReader, counts: Counter[str
 
 @contextmanager
 def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
-    """Open a bag and yield its reader, and a line that says where it was cut off, "" if it was not.
+    """Open a bag and yield its reader, and a line that says where the bag was cut off, "" if it is complete.
 
-    Of an MCAP file that was cut off the reader has what is whole.
+    If an MCAP file was cut off, the reader reads a copy of its whole records.
 
     Raises:
-        ValueError: no bag, or one that cannot be opened; one line that names it.
+        ValueError: there is no bag, or it cannot be opened. The error is one line that names it.
     """
     if not path.exists():
         raise fail(str(path), "a bag", "nothing of that name")
@@ -141,12 +142,15 @@ def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
 
 @contextmanager
 def _open_reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
-    """Open a bag and yield its reader, which is closed at the end; one line if it cannot be opened."""
+    """Open a bag, yield its reader, and close it at the end; raise a one-line ValueError if it cannot be opened.
+
+    `path` is named in the error, and `readable` is the file that is read: the bag, or a copy of its whole records.
+    """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     try:
-        # Types of ROS itself, for bags of releases that did not write them into the bag.
+        # Older releases did not write message types into the bag. Then those of ROS itself are taken.
         reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     except Exception as error:  # whatever a damaged file makes a reader do
@@ -258,9 +262,9 @@ def _append_messages(
 
 
 def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
-    """Yield dotted path and basic type of the fields of a message type; a list has the type "list", its items none.
+    """Yield (dotted path, basic type) of the fields of a message type, down to `depth` messages inside it.
 
-    A type that the bag does not define has no fields.
+    A list has the type "list", and nothing is yielded for its items. A type that the bag does not define has no fields.
     """
     from rosbags.interfaces import Nodetype
 
@@ -280,7 +284,7 @@ def format_moment(nanoseconds: int) -> str:
 
 
 def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
-    """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
+    """Raise ValueError if a source maps a field that the message type of its topic does not have."""
     for connection in reader.connections:
         what, fields = f"{path}, {connection.topic}", dict(list_fields(reader, connection.msgtype))
         needed = [field for source, *_ in sources.of(connection.topic) for field in source.fields if field]
@@ -293,9 +297,9 @@ def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicRead
 
 
 def _has_field(fields: dict[str, str], path: str) -> bool:
-    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list.
+    """Return whether a path is that of a field, of a message with fields (such as a stamp), or of something in a list.
 
-    `fields`: type of each field by its path; that of a list is "list", and what is in it is not looked up.
+    `fields` maps the path of each field to its type, which is "list" for a list. What a list contains is not checked.
     """
     lists = [name for name, kind in fields.items() if kind == "list"]
     is_field_or_message = any(name == path or name.startswith(f"{path}.") for name in fields)
@@ -319,7 +323,7 @@ def _format_topic_counts(counts: Mapping[str, int]) -> str:
 
 
 def is_mcap_cut_off(path: Path) -> bool:
-    """Return whether a file begins as MCAP and does not end as MCAP does, with MAGIC too: it was cut off."""
+    """Return whether an MCAP file was cut off: it begins with MAGIC, but does not end with MAGIC."""
     if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
         return False
     with path.open("rb") as file:
@@ -331,10 +335,10 @@ def is_mcap_cut_off(path: Path) -> bool:
 def find_end_of_whole_records(path: Path) -> int:
     """Return the number of bytes of an MCAP file up to the end of its last whole record of data.
 
-    MAGIC is what the file begins with; a record of kind DATA_END or FOOTER follows the data.
+    The file begins with MAGIC. The data end at a record of kind DATA_END or FOOTER, or where a record is incomplete.
     """
     size, end = path.stat().st_size, len(MAGIC)
-    # A record: a byte for its kind, eight for the length of its content, and this.
+    # A record consists of a byte for its kind, eight bytes for the length of its content, and the content.
     head = struct.Struct("<BQ")
     with path.open("rb") as file:
         while end + head.size <= size:
@@ -348,9 +352,9 @@ def find_end_of_whole_records(path: Path) -> int:
 
 @contextmanager
 def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
-    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it.
+    """Yield a temporary copy of an MCAP file's whole records, and how many bytes were copied.
 
-    ENDING is what every whole file ends with, which a file that was cut off lacks; BLOCK bytes are copied at a time.
+    The copy is completed by ENDING, with which every whole file ends. BLOCK bytes are copied at a time.
     """
     size = find_end_of_whole_records(path)
     with TemporaryDirectory() as folder:

@@ -46,17 +46,19 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
 
 
 def write_estimates(record: Record, path: str | Path, predicted: Predicted | None = None) -> None:
-    """Write `estimate_columns` to a CSV or Parquet file, as a whole or not at all; in CSV, valid is 1 or 0.
+    """Write `estimate_columns` to a CSV or Parquet file, as a whole or not at all.
+
+    In CSV the column `valid` is 1 or 0.
 
     Args:
         record: the result of `run`.
         path: the file, ending in .csv or .parquet.
-        predicted: what `hg.forecasting.predict_record` returned for the record: of each row what was predicted of it
-            from those before, as columns predicted.STATE and predicted.output.OUTPUT with their deviations (.sd);
-            None by default.
+        predicted: what `hg.forecasting.predict_record` returned for the record: predictions of each row from the rows
+            before it. They become columns predicted.STATE and predicted.output.OUTPUT with deviations (.sd). None by
+            default.
 
     Raises:
-        ValueError: another format, a folder that cannot be written, predictions of other rows.
+        ValueError: the format is another one, the folder cannot be written, or the predictions are of other rows.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     instance("record", record, Record, "a Record")

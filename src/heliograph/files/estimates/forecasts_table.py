@@ -54,19 +54,19 @@ def make_forecast_columns(
 
 
 def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predicted: ByFilter | None = None) -> None:
-    """Write the estimates of a run, and forecasts in rows below them, to a CSV or Parquet file, whole or not at all.
+    """Write the estimates of a run, and below them rows of forecasts, to a CSV or Parquet file, whole or not at all.
 
-    Rows of forecasts have 1 in the column `forecast`; what each sensor would measure stands in forecast.OUTPUT and
-    forecast.OUTPUT.sd.
+    Rows of forecasts have 1 in the column `forecast`. The columns forecast.OUTPUT and forecast.OUTPUT.sd hold what each
+    sensor would measure.
 
     Args:
         record: the result of `run`.
         forecasts: what `forecast` returned for it.
         path: the file, ending in .csv or .parquet.
-        predicted: what was predicted of each row of data, as of `write_estimates`; None by default.
+        predicted: predictions of each row of data, as in `write_estimates`; None by default.
 
     Raises:
-        ValueError: no record, no forecast, another format, or a folder that cannot be written.
+        ValueError: there is no record or no forecast, the format is another one, or the folder cannot be written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     instance("record", record, Record, "a Record")
@@ -78,16 +78,17 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predic
 
 
 def _append_rows(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
-    """Return a column with `rows` more values: those `below`, or where these are None NaN (of floats) or false."""
+    """Return a column with `rows` more values: those in `below`, or if it is None, NaN (floats) or False (flags)."""
     if below is None:
         below = np.full(rows, np.nan if above.dtype.kind == "f" else False)
     return np.concatenate([above, below.astype(above.dtype)])
 
 
 def _make_output_columns(prefix: str, forecast: "heliograph.forecasting.Forecast", rows: int) -> dict[str, np.ndarray]:
-    """Return the columns of what the sensor would measure, and of its standard deviations; none that is all NaN.
+    """Return columns of what the sensor would measure, and of its standard deviations.
 
-    `prefix`: what their names begin with; `rows`: how many rows of data, with NaN, stand above those of the forecast.
+    Columns that would be all NaN are left out. `prefix` begins the names. Above the forecast stand `rows` rows of data,
+    which are NaN.
     """
     if forecast.outputs is None:
         return {}

@@ -26,10 +26,12 @@ Database = dict[tuple[int, bool], "Description"]  # by identifier, and whether i
 
 
 def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open a log of frames; without a database its messages are named by their identifiers and have no signals.
+    """Open a log of CAN frames; a database of messages (DBC) says what signals they carry.
+
+    Without a database, messages are named by their identifiers and have no signals.
 
     Raises:
-        ValueError: no database, or one that cannot be read.
+        ValueError: the database cannot be read.
         ModuleNotFoundError: python-can or cantools is not installed (extra "can"), or asammdf (extra "mdf").
     """
     database = {} if sources.dbc is None else read_can_database(sources.dbc)
@@ -39,7 +41,7 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         signals = message.signals
         units[message.name] = {signal.name: signal.unit or "" for signal in signals}
         kinds[message.name] = f"CAN 0x{message.frame_id:x}"
-        # The bits of signals that are plain whole numbers, as a counter is.
+        # How many bits each signal has that is a plain integer, such as a counter.
         bits[message.name] = {signal.name: signal.length for signal in signals if signal.scale == 1 and not signal.unit}
     return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read_messages(), notes, bits)
 
@@ -101,16 +103,19 @@ class FrameReader:
     """
 
     def __init__(self, path: Path, sources: LogSources, database: Database, wanted: Wanted, notes: list[str]):
-        """Prepare to read a log of frames by a database of its messages; `notes` gets lines on what was left out."""
+        """Prepare to read a log of frames by a database of its messages.
+
+        `wanted` says by a message's name whether it is read. `notes` gets lines on what was left out.
+        """
         self._path, self._sources, self._database, self._wanted, self._notes = path, sources, database, wanted, notes
-        # By name of the message: frames decoded, frames longer than described, sizes of those too short, channels.
+        # By a message's name: frames decoded, frames longer than described, sizes of too short frames, and channels.
         self._decoded, self._longer = Counter[str](), Counter[str]()
         self._short: dict[str, Counter[int]] = defaultdict(Counter)
         self._channels: dict[str, set[object]] = defaultdict(set)
-        # By name of the message the words of its signals, and how often each came in place of a number.
+        # By a message's name: its signals' words, and by signal and word how often it came instead of a number.
         self._words = {m.name: {s.name: find_words(s) for s in m.signals} for m in database.values()}
         self._came_as_words = Counter[str]()
-        # Frames by identifier, and frames left out by kind.
+        # How many frames came of each identifier, and how many of each kind were left out.
         self._identifiers, self._left_out = Counter[str](), Counter[str]()
 
     def read_messages(self) -> Iterator[FileMessage | InputError]:
@@ -136,9 +141,9 @@ class FrameReader:
         self._note_left_out()
 
     def _note_left_out(self) -> None:
-        """Append lines on frames left out, by kind, on those longer than the database has them, and on words that came.
+        """Append lines on frames left out, on frames longer than the database says, and on words instead of numbers.
 
-        `self._came_as_words`: by signal and word how often this came in place of a number.
+        The counters are by kind of frame, by message, and by signal and word.
         """
         if self._left_out:
             counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
@@ -197,16 +202,17 @@ class FrameReader:
         return signals
 
     def _check_channel(self, name: str, channel: object) -> None:
-        """Raise ValueError where a message, by its name, comes from a second bus; `channel`: the bus of this frame."""
+        """Raise ValueError if the message `name` comes from a second bus; `channel` is the bus of this frame."""
         seen = self._channels[name]
         seen.add(channel)
         if len(seen) > 1:
             raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
 
     def _check_frames_fit_database(self) -> None:
-        """Raise ValueError if the frames of a wanted message are all too short, or no frame is of a wanted one.
+        """Raise ValueError if all frames of a wanted message are too short, or if no frame is of a wanted message.
 
-        By message: `self._short`: sizes of frames too short to decode; `self._decoded`: how many could be decoded.
+        By a message's name, `self._short` counts the sizes of frames too short to decode, and `self._decoded` counts
+        decoded frames.
         """
         remedy = "another database, or another bus (channel=)?"
         for name, sizes in self._short.items():
@@ -279,16 +285,16 @@ def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
 
 
 def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
-    """Open an ASC log, whose frames have seconds from the begin; the stack closes it.
+    """Open an ASC log, whose frames have seconds since the log's begin; `stack` closes it.
 
-    The date of the begin has no zone: it is read as UTC, on every machine.
+    The date of the begin has no time zone, and is read as UTC on every machine.
 
     Raises:
-        ValueError: times from each event to the next.
+        ValueError: the times are differences between neighbouring events.
     """
     from can import ASCReader
 
-    # A first reader, for the header alone.
+    # This first reader reads only the header.
     header = ASCReader(path, relative_timestamp=False)
     stack.callback(header.stop)
     next(iter(header), None)

@@ -36,7 +36,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     notes = list[str]()
 
     def read_one_after_another() -> Iterator[FileMessage | InputError]:
-        """Yield the messages of all `logs` of the folder, and append what each notes, once it is read, to `notes`."""
+        """Yield the messages of all `logs` of the folder; after each log append its notes to `notes`."""
         for log in logs:
             yield from log.messages
             notes.extend(log.notes)
@@ -56,13 +56,14 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Return a vehicle's log, opened by the extension of its name; only messages that are wanted are decoded.
+    """Open a vehicle's log; its format follows from its extension, and only wanted messages are decoded.
 
-    MDF and ULog have decoded signals; all others, and MDF where a database is given, have frames, decoded by that.
+    ULog files, and MDF files without a database, hold decoded signals. All others hold frames, which a database
+    decodes.
 
     Raises:
-        ValueError: no such file, one that cannot be opened, frames without a database; one line.
-        ModuleNotFoundError: what reads it is not installed (extra "can", "mdf" or "ulog").
+        ValueError: there is no such file, it cannot be opened, or it holds frames and there is no database.
+        ModuleNotFoundError: the reader's package is not installed (extra "can", "mdf" or "ulog").
     """
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
@@ -77,17 +78,17 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
 
-    Of several logs in a folder those of one file after another; each message asked for has to be in one of them.
+    The logs in a folder are read one after another. Each message that is asked for must be in one of them.
 
     Args:
-        path: the log, or the folder.
+        path: the log, or the folder of logs.
         table: the sources as the network's file has them, a `LogSources` or a dictionary.
-        sources: the same, checked against the network.
-        notes: lines on units and on what was left out, which are appended.
+        sources: the same sources, checked against the network.
+        notes: a list to which lines on units and on what was left out are appended.
 
     Raises:
-        ValueError: no such log, no database, a message or a signal that is not there, or whose unit differs from log
-            to log; one line with the remedy.
+        ValueError: there is no such log or database, a message or a signal is missing, or its unit differs between
+            logs. The error is one line with the remedy.
     """
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
@@ -130,7 +131,7 @@ def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -
 
 
 def _suggest_names(name: str, known: dict[str, object] | dict[str, str] | dict[str, dict[str, str]]) -> str:
-    """Return in words which names there are instead: the closest one, or else the first LISTED."""
+    """Return words that say which known name is closest to `name`, or else list the first LISTED known names."""
     close = get_close_matches(name, known, 1)
     if close:
         return f"none of that name (closest: {close[0]!r})"

@@ -40,7 +40,7 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def _name_groups(file: "MDF") -> list[str]:
-    """Return a distinct name for each channel group: its own, with its number where it has none or another has it."""
+    """Return a distinct name for each channel group; the group's number is added if the name is missing or taken."""
     names = list[str]()
     groups: Any = file.groups
     for i, group in enumerate(groups):
@@ -50,7 +50,7 @@ def _name_groups(file: "MDF") -> list[str]:
 
 
 def _list_units(file: "MDF", group: int) -> dict[str, str]:
-    """Return the units of the signals of the group with this number, by name; its channel of times is none of them."""
+    """Return {name: unit} for the signals of the group with this number, without its channel of times."""
     index_of_times = file.masters_db.get(group)
     channels: Any = file.groups[group].channels
     return {
@@ -61,9 +61,9 @@ def _list_units(file: "MDF", group: int) -> dict[str, str]:
 
 
 def _read_group(file: "MDF", group: int, names: dict[str, str]) -> MessageSeries:
-    """Return the times, in seconds, and the signals of a group; `names`: those of the signals.
+    """Return the times, in seconds, and the signals of a group; `names` holds the names of the signals.
 
-    A sample that the file marks as invalid is None; signals of several numbers a sample are left out.
+    A sample that the file marks as invalid becomes None. A signal with several numbers per sample is left out.
     """
     time, values = np.zeros(0), dict[str, np.ndarray]()
     for name in names:

@@ -59,14 +59,14 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def _find_start_date(file: "ULog") -> float:
-    """Return the date, in seconds since 1970, at which the device began to run; 0 if the log does not say it.
+    """Return the date at which the device began to run, in seconds since 1970, or 0 if the log does not say it.
 
-    CLOCKS are the topics, of satellite receivers, whose field DATE has the date in microseconds, 0 until it is known;
-    STAMP is the time since the device began to run.
+    CLOCKS are topics of satellite receivers. Their field DATE holds the date in microseconds, 0 until it is known.
+    Their field STAMP holds the microseconds since the device began to run.
     """
     for data in file.data_list:
         if data.name in CLOCKS and DATE in data.data and len(known := np.flatnonzero(data.data[DATE])):
-            # The date less the time since the start, both in microseconds, of the first message with a date.
+            # In the first message with a date, subtract the time since the start.
             first = known[0]
             return (int(data.data[DATE][first]) - int(data.data[STAMP][first])) * MICROSECOND
     return 0.0

@@ -50,7 +50,7 @@ def is_log(path: Path) -> bool:
 
 
 def list_logs(path: Path) -> list[Path]:
-    """Return the logs at a path: itself, by its name, or those in a folder, by name; none where there are none."""
+    """Return the logs at a path: those in a folder, sorted by name, or the file itself if its extension is a log's."""
     if path.is_dir():
         return sorted(part for part in path.iterdir() if part.is_file() and part.suffix.lower() in LOGS)
     return [path] if path.suffix.lower() in LOGS else []

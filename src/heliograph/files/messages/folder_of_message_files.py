@@ -18,10 +18,10 @@ def is_message_folder(path: Path) -> bool:
 
 
 def list_message_files(folder: Path) -> list[Path]:
-    """Return the files of messages in a folder, by name: tables and files of lines, not those in folders within it.
+    """Return the message files directly in a folder, sorted by name: tables and files of lines.
 
     Raises:
-        ValueError: there is none; one line.
+        ValueError: there is no such file.
     """
     kinds = (*LINES, ".csv", ".parquet")
     files = sorted(path for path in folder.iterdir() if path.is_file() and find_extension(path) in kinds)
@@ -41,10 +41,12 @@ def list_used_files(folder: Path, sources: TopicReader) -> list[Path]:
 
 
 def read_message_folder(folder: Path, sources: TopicReader) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of the files that are topics of sources, file by file, or why one cannot be read.
+    """Yield the messages of the files whose topics sources read, file by file, or why one cannot be read.
+
+    A file's topic follows from its name, unless its messages have topics of their own.
 
     Raises:
-        ValueError: no file is; a file that cannot be read at all. One line.
+        ValueError: no source reads any file, or a file cannot be read at all.
     """
     files = list_used_files(folder, sources)
     if not files:
@@ -60,9 +62,9 @@ def read_message_folder(folder: Path, sources: TopicReader) -> Iterator[FileMess
 
 
 def describe_unused_files(folder: Path, sources: TopicReader) -> list[str]:
-    """Return a line on the files that are no topics of sources, and one on the topics that are no files.
+    """Return a line on files that no source reads, and a line on sources' topics for which there is no file.
 
-    A topic with a wildcard, + or #, is never said to be missing.
+    A topic with a wildcard (+ or #) never counts as missing.
     """
     used_files = list_used_files(folder, sources)
     unused = [path.name for path in list_message_files(folder) if path not in used_files]

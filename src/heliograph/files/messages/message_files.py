@@ -59,23 +59,23 @@ def table_has_topics(path: Path) -> bool:
 
 
 def read_parquet_names(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file; none of a file that is none."""
+    """Return the names of a Parquet file's columns, or [] if the file does not exist or is not Parquet."""
     import pyarrow.parquet as pq
 
     try:
         return list(pq.ParquetFile(path).schema_arrow.names)
-    except (ValueError, OSError):  # no such file: who reads it says so
+    except (ValueError, OSError):  # whoever reads the file will report the error
         return []
 
 
 def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, or why one cannot be read, in the order of the file.
 
-    Where the file is damaged or cut off the last is a `CutOffError`. Files with an extension of LINES have JSON or
-    what MQTT clients print, others are CSV or Parquet.
+    If the file is damaged or was cut off, the last item is a `CutOffError`. Files with an extension in LINES hold JSON
+    or the output of MQTT clients. Other files are CSV or Parquet.
 
     Raises:
-        ValueError: the file cannot be read at all; one line.
+        ValueError: the file cannot be read at all.
     """
     kind = find_extension(path)
     if not path.is_file():
@@ -93,7 +93,10 @@ def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
 
 
 def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
-    """Return topic, payload, arrival and whether it was stored of a message of a log in JSON; None for any other."""
+    """Return (topic, payload, arrival, was_stored) of a message that a log holds in JSON, or None for other content.
+
+    `was_stored`: the broker had stored the message (MQTT's flag "retain").
+    """
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
     payload = content[PAYLOAD]
@@ -102,9 +105,10 @@ def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
 
 
 def find_arrival_time(logged: Mapping[str, Any]) -> Any:
-    """Return when a message with a payload was logged, as the log says it; None if it does not.
+    """Return when a message with a payload was logged, in the log's own form, or None if the log does not say it.
 
-    ARRIVALS are fields that always mean that; CLOCKS, such as "time", do where they are dates or seconds since 1970.
+    Fields in ARRIVALS always hold this time. Fields in CLOCKS, such as "time", hold it if their value is a date or
+    seconds since 1970.
     """
     arrivals = [logged[name] for name in ARRIVALS if logged.get(name) is not None]
     arrivals += [logged[name] for name in CLOCKS if _is_moment(logged.get(name))]
@@ -112,7 +116,7 @@ def find_arrival_time(logged: Mapping[str, Any]) -> Any:
 
 
 def _is_moment(value: object) -> bool:
-    """Return whether a value is a date with a zone, or seconds since 1970 from 2001 to 2286 (YEARS), also as a text."""
+    """Return whether a value, possibly a text, is a date with a zone, or seconds since 1970 within YEARS (2001 to 2286)."""
     number = parse_number(value) if isinstance(value, str) else value
     if isinstance(number, str):
         try:
@@ -126,8 +130,8 @@ def _is_moment(value: object) -> bool:
 def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
     """Return the message of a row of a table.
 
-    Without a topic it is the row itself; with one it is what the column `payload` has, or the row if there is none.
-    Beside a payload columns such as `time` say when it was logged; without one they are fields of the message.
+    The content is the column `payload`, or the whole row if there is no column `topic` or no payload. In a row with a
+    payload, columns such as `time` say when it was logged. In any other row they are fields of the message.
     """
     arrival = find_arrival_time(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:
@@ -137,9 +141,9 @@ def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
 
 
 def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a file of JSON, one document or one message a line; an error in place of a bad one."""
+    """Yield the messages of a JSON file, which is one document or has a message on each line; errors replace bad ones."""
     with open_text(path) as file:
-        if find_extension(path) == ".json":  # one document, of any number of lines, or one a line
+        if find_extension(path) == ".json":  # try it as one document, and else read it line by line
             text = file.read()
             try:
                 yield from parse_message_document(text, str(path))
@@ -154,10 +158,10 @@ def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
 
 
 def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
-    """Return the messages of a document of JSON, in lists or lists of lists; an error in place of a bad one.
+    """Return the messages of a JSON document, which may be nested lists; an error stands in place of a bad message.
 
     Raises:
-        ValueError: no JSON; one line.
+        ValueError: the text is not JSON.
     """
     return [
         _make_message_of_json(f"{name}, message {n}", item, doubled)
@@ -166,9 +170,10 @@ def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | I
 
 
 def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
-    """Return the message of a line, those of a list of them, or why it cannot be read.
+    """Return the messages of a line, or the reason why it cannot be read.
 
-    A line of JSON comes first; one that is none may be a topic and a payload, as MQTT clients print them.
+    The line is JSON: a message or a list of messages. Otherwise it may be a topic and a payload, as MQTT clients print
+    them.
     """
     line = line.strip()
     if not is_valid_text(line):
@@ -181,9 +186,9 @@ def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
 
 
 def _make_message_of_json(where: str, content: object, doubled: str | None) -> FileMessage | InputError:
-    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file (topic None).
+    """Return the message of decoded JSON; its topic is None unless the content is a log's entry, which names it.
 
-    `doubled`: name of a field that it has twice, in place of which an error is returned; None if there is none.
+    `doubled` is the name of a field that occurs twice, for which an error is returned; None if there is no such field.
     """
     if doubled is not None:
         return fail_of_doubled(where, doubled)
@@ -201,9 +206,9 @@ def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
 
 
 def convert_cells(row: CsvRow) -> dict[str, Any]:
-    """Return the cells of a row by name: numbers with every digit of whole ones, None of empty cells, else texts.
+    """Return {name: value} for the cells of a row: numbers, None for empty cells, and texts.
 
-    A payload stays a text.
+    Integers keep every digit. A payload stays a text.
     """
     results: dict[str, Any] = {}
     for name, cell in zip(row.header, row.cells, strict=True):
@@ -215,7 +220,10 @@ def convert_cells(row: CsvRow) -> dict[str, Any]:
 
 
 def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield place and cells of each row, counted from 1; moments are dates of ISO 8601, in UTC if they have no zone."""
+    """Yield the place and the cells of each row of a Parquet file; rows are counted from 1.
+
+    Timestamps become dates in ISO 8601. Without a zone they are taken as UTC.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -239,10 +247,10 @@ def _format_moment(nanoseconds: int) -> str:
 
 
 def decode_message_content(message: FileMessage) -> object:
-    """Return the content of a message, decoded from JSON where it is the payload of a log.
+    """Return the content of a message; a text, the payload in a log, is decoded from JSON.
 
     Raises:
-        ValueError: no JSON, or a field that is there twice; one line.
+        ValueError: the text is not JSON, or a field occurs twice.
     """
     if not isinstance(message.content, str):
         return message.content

@@ -138,9 +138,9 @@ def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, stri
 
 
 def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
-    """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic.
+    """Return whether a recording consists of messages or events, as a bag or a log does, and not of rows of times.
 
-    A table is of messages if it has a column `topic`, or the sources name it as a topic.
+    The rows of a table are messages if it has a column `topic`, or if the sources name the table as a topic.
     """
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
@@ -160,7 +160,7 @@ def _holds_rows_of_own_format(source: Path | StoreTable) -> bool:
 def _yield_messages(
     source: Path | StoreTable, sources: TopicReader | None = None
 ) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a file, of those files of a folder that are topics of sources, or of a store's table."""
+    """Yield the messages of a file, of a folder's files that the sources read, or of a store's table."""
     if isinstance(source, Path) and is_message_folder(source) and sources is not None:
         return read_message_folder(source, sources)
     return read_message_file(source) if isinstance(source, Path) else source.messages()

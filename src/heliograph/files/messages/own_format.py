@@ -58,9 +58,10 @@ class OwnMessageCollector:
     """
 
     def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
-        """Begin with no message; `source`: what is read, for errors; `table`: whether messages are rows of a table.
+        """Begin without messages; `source` is named in errors, and `table` says whether messages are rows of a table.
 
-        Counted are messages used and refused; `reasons`: of the first refused; `broken`: where the file was cut off.
+        `used` and `refused` count messages. `reasons` says why the first ones were refused, and `broken` where the file
+        was cut off.
         """
         self.source, self._reader = source, HeliographMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
@@ -92,7 +93,7 @@ class OwnMessageCollector:
         """Return the events that were read, with notes on their times and on what was refused.
 
         Raises:
-            ValueError: none could be read; why the first could not.
+            ValueError: no event could be read. The error is that of the first one.
         """
         if self._table is None:
             raise InputError(self.reasons[0]) if self.reasons else fail(str(self.source), "at least one row", "none")
@@ -108,7 +109,7 @@ class OwnMessageCollector:
         return self._table
 
     def _add_message(self, message: FileMessage) -> None:
-        """Add the event of one message to the table, and one of the inputs that it brings."""
+        """Add the event of one message to the table, and an event of the inputs if the message holds inputs."""
         readings_and_arrivals = self._reader.read(message.where, message.content)
         if self._table is None:
             self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
@@ -142,10 +143,11 @@ class HeliographMessageReader:
     """
 
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
-        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns.
+        """Prepare to read messages in heliograph's own format; nothing is known yet of their times and columns.
 
-        `components`: names of each node's values; `numbers`: whether times are numbers and no dates, None before any;
-        `zero` and `rounded`: what large whole times count from, and the first that a double does not hold.
+        `components`: names of each node's values. `numbers`: whether times are numbers rather than dates, None before
+        the first. `zero`: the time from which large integer times are counted. `rounded`: the first time whose distance
+        from `zero` is no exact double. `least` and `most`: the range of the times.
         """
         self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
@@ -233,17 +235,17 @@ class HeliographMessageReader:
         return moment, True
 
     def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
-        """Return a time that is a number; raise ValueError where it `is_step` and not a whole number from 0.
+        """Return a time that is a number; a step (`is_step`) must be an integer from 0 on.
 
-        Where the first whole number is too large for a double (EXACT, 2^53), as of nanoseconds, all are counted from
-        that one, `self.zero`; `self.rounded` is the first time whose difference from it a double does not hold either.
+        If the first integer is too large for a double (EXACT, 2^53), such as nanoseconds, all times are counted from
+        it (`self.zero`). `self.rounded` is the first time whose difference from it is no exact double.
         """
         number = _parse_number(cell, name)
         if isinstance(cell, int):
             if self.zero is None:
                 self.zero = cell if abs(cell) >= EXACT else 0
             number = float(cell - self.zero)
-            if self.rounded is None and int(number) != cell - self.zero:  # the first that a double does not hold
+            if self.rounded is None and int(number) != cell - self.zero:  # the difference is no exact double
                 self.rounded = cell
         if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
@@ -256,10 +258,11 @@ class HeaderError(InputError):
 
 
 def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
-    """Return the values of one event, NaN where one did not arrive.
+    """Return the values of one event, with NaN for a value that did not arrive.
 
-    They stand in the field `values`, a list or a text, or each in a field of its name. Where the event is `numbered`
-    the last, how many messages were lost, may be missing in `values`, since the running count says it too.
+    They stand in the field `values`, as a list or a text, or each in a field of its own name. If the event is
+    `numbered`, its last value is the number of lost messages. This one may be missing in `values`, since the running
+    count also tells it.
     """
     if row.get(VALUES) not in (None, ""):
         cell, column, is_text = row[VALUES], f"{where}, column {VALUES!r}", isinstance(row[VALUES], str)
@@ -278,7 +281,7 @@ def _list_cell_items(cell: Any) -> list[Any]:
 
 
 def _parse_whole_number(cell: Any, name: str) -> int:
-    """Return a count with every digit; a float is accepted if it is an exact integer, below EXACT (2^53)."""
+    """Return a cell as an integer with every digit; a float must be an exact integer below EXACT (2^53)."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
         return check_63_bits(name, int(cell))
     if not isinstance(cell, int):

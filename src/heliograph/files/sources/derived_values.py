@@ -61,9 +61,10 @@ class Covariance:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Return the paths of the numbers that `of` takes: the diagonal, entries ij, ji, ii and jj, and any kind.
+        """Return the paths of the numbers that `of` takes: the diagonal, entries ij, ji, ii, jj, and the kind if any.
 
-        The message has the matrix, of `self.size` rows, as a list, row by row; `kind` says whether it is known.
+        The message holds the matrix (size, size) as a list, row by row, at `self.path`. The field `self.kind` says
+        whether it is known; None if there is no such field.
         """
         i, j = self.row, self.row if self.column is None else self.column
         indices = [*((k, k) for k in range(self.size)), (i, j), (j, i), (i, i), (j, j)]
@@ -71,16 +72,16 @@ class Covariance:
         return entries if self.kind is None else (*entries, self.kind)
 
     def of(self, *numbers: Any) -> Any:
-        """Return the entry ij of a covariance, of numbers or of arrays; NaN where it is unknown."""
-        # In the order of `parts`: the diagonal, entries ij and ji, and the variances ii and jj.
+        """Return the entry ij of a covariance, from numbers or arrays; it is NaN where it is unknown."""
+        # The numbers are in the order of `parts`: the diagonal, entries ij and ji, and the variances ii and jj.
         diagonal, (entry, mirror, row_variance, column_variance) = numbers[: self.size], numbers[self.size :][:4]
-        # As messages of ROS say it, nothing is known where the first entry is -1, or where all variances are 0.
+        # In messages of ROS, nothing is known if the first entry is -1 or if all variances are 0.
         known = np.asarray(diagonal[0]) != -1
         known &= np.any([np.asarray(variance) != 0 for variance in diagonal], axis=0)
-        # Entries ij and ji that differ by more than rounding (SYMMETRIC, in deviations) are no covariance.
+        # A covariance is symmetric: ij and ji may differ by rounding only, SYMMETRIC sqrt(ii jj).
         deviations = np.sqrt(np.abs(np.asarray(row_variance) * column_variance))
         known &= np.abs(np.asarray(entry) - mirror) <= SYMMETRIC * deviations
-        # The kind of the covariance, where the message has one: 0 is unknown.
+        # If the message has a kind of covariance, the kind 0 means unknown.
         for kind in numbers[self.size + 4 :]:
             known &= np.asarray(kind) != 0
         return np.where(known, entry, np.nan)
@@ -139,9 +140,9 @@ class Geodetic:
     metres: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse fields that are no dotted paths, of which the height alone may be None, and units that are none.
+        """Raise ValueError unless latitude, longitude and height are dotted paths; the height may be None.
 
-        `degrees` and `metres`: how many of these one unit of the message's numbers is, above 0 (TINY or more).
+        `degrees` and `metres` say how many degrees or metres one unit of the message's numbers is; at least TINY.
         """
         instance("Geodetic, plane", self.plane, LocalPlane, "a hg.models.LocalPlane")
         for name in ("latitude", "longitude", "height"):
@@ -173,16 +174,18 @@ class Geodetic:
         path: str = "position_covariance",
         kind: str | None = "position_covariance_type",
     ) -> "PlaneCovariance":
-        """Return an entry of the position's covariance in the plane's axes, from one in east, north, up of the fix.
+        """Return an entry of the position's covariance in the plane's axes; the message has it in the fix's axes.
+
+        The fix's axes are east, north and up at the position itself.
 
         Args:
-            row: of the plane, 0 east, 1 north, 2 up.
-            column: likewise; that of the row, a variance, unless given.
-            path: dotted path of the list of 9 numbers, row by row (default that of NavSatFix).
-            kind: as that of `Covariance` (default that of NavSatFix); None where there is none.
+            row: axis of the plane: 0 east, 1 north, 2 up.
+            column: likewise; by default the row, which gives a variance.
+            path: dotted path of the list of 9 numbers, row by row (by default that of NavSatFix).
+            kind: as in `Covariance` (by default that of NavSatFix); None if the message has no kind.
 
         Raises:
-            ValueError: a row or a column that is none of the plane.
+            ValueError: the row or the column is not 0, 1 or 2.
         """
         places = row, row if column is None else column
         if any(place not in (0, 1, 2) for place in places):
@@ -241,11 +244,11 @@ class PlaneCovariance:
         return [self.entry(row=row, column=column) for row in range(3) for column in range(3)]
 
     def of(self, *numbers: Any) -> Any:
-        """Return the entry of the covariance in the plane's axes, of numbers or arrays; NaN where any is unknown.
+        """Return the entry of the covariance in the plane's axes, from numbers or arrays; NaN if anything is unknown.
 
-        `self._entries`: the nine entries in east, north, up of the fix, each with the paths that it is read from.
+        `self._entries` are the nine entries in the fix's axes (east, north, up), each with the paths of its numbers.
         """
-        # The numbers of the position, then those of each entry of the covariance, row by row.
+        # `numbers` are those of the position, and then those of each entry of the covariance, row by row.
         begin = len(self.position.parts)
         latitude, longitude, _ = self.position.coordinates(*numbers[:begin])
         entries = []

@@ -35,10 +35,12 @@ class MissingFieldError(InputError):
 
 
 def decode_json(text: str | bytes, name: str) -> Any:
-    """Return the content of JSON, in which a bare nan or inf, as printf writes them, is null; `name`: for errors.
+    """Return the content of JSON; a bare nan or inf, as printf writes them, counts as null.
+
+    `name` is the text's place, for errors.
 
     Raises:
-        ValueError: no JSON, or a field that is there twice; one line.
+        ValueError: the text is not JSON, or a field occurs twice in an object.
     """
     content, doubled = _decode_json(text, name)
     if doubled:
@@ -47,13 +49,13 @@ def decode_json(text: str | bytes, name: str) -> Any:
 
 
 def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
-    """Return each item of a list of JSON, or of lists in it, else the one content, read as `decode_json` does.
+    """Return the items of a JSON text, read as `decode_json` does; nested lists are flattened.
 
     Returns:
-        Each item, and a field that is there twice within it, None if none is.
+        For each item the pair of its content and the name of a field that occurs twice in it, None if there is none.
 
     Raises:
-        ValueError: no JSON; one line.
+        ValueError: the text is not JSON.
     """
     content, doubled = _decode_json(text, name)
     return [(item, _name_doubled_field(item, doubled)) for item in _flatten_lists(content)]
@@ -72,7 +74,7 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
     doubled: list[tuple[dict[str, Any], str]] = []
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Return the fields of an object; if it has one twice, append both to `doubled`, the objects that have."""
+        """Return an object's fields as a dictionary; if one occurs twice, append (fields, its name) to `doubled`."""
         fields = dict(pairs)
         if len(fields) < len(pairs):
             names = [name for name, _ in pairs]
@@ -95,9 +97,9 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
 
 
 def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
-    """Return the name of a field that `content`, or an object in it, has twice; None if there is none.
+    """Return the name of a field that occurs twice in `content` or in an object inside it, or None.
 
-    `doubled`: the objects that have one, with its name, as they were found on decoding.
+    `doubled` holds the pairs (object, name of its doubled field) that were found while decoding.
     """
     if not doubled or not isinstance(content, dict | list):
         return None
@@ -166,9 +168,9 @@ def _make_attribute_getter(path: str) -> "attrgetter[Any]":
 
 
 def convert_number(value: Any, name: str, quoted: bool = False) -> float:
-    """Return a value as a double; NaN for null, for words of that meaning, and for what is not finite.
+    """Return a value as a double; it is NaN for null, for words such as "null" (NO_VALUE), and for infinities.
 
-    A text of a number is one only where it may be `quoted`. NO_VALUE matches words as "null"; `name`: for errors.
+    A number that is written as a text is only accepted if `quoted`. `name` is the value's place, for errors.
     """
     if value is None or value == "" or (isinstance(value, str) and NO_VALUE.fullmatch(value.strip())):
         return np.nan
@@ -184,12 +186,12 @@ def convert_number(value: Any, name: str, quoted: bool = False) -> float:
 
 
 def parse_number(text: str) -> int | float | str:
-    """Return the number that a text is, whole ones with every digit; a text that is none as it is.
+    """Return the number that a text holds, or the text itself if it is not a number.
 
-    A whole number that ends in .0 is a double, but where that would lose digits.
+    Integers keep every digit. An integer that ends in .0 becomes a double, unless this would lose digits.
     """
     digits = text.strip()
-    if "_" in digits:  # Python's own way to write a number, and nobody else's
+    if "_" in digits:  # only Python accepts such numbers
         return text
     whole, point, zeros = digits.partition(".")
     is_whole = point and not zeros.strip("0") and whole.lstrip("+-").isdecimal() and len(whole) <= DIGITS
@@ -238,12 +240,13 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
 
 
 def _read_stamp(value: Any, name: str) -> int | None:
-    """Return the nanoseconds since 1970 of a stamp of two whole numbers, a dictionary or an object; None of others.
+    """Return a stamp of seconds and nanoseconds as nanoseconds since 1970, or None if the value is no such stamp.
 
-    STAMPS are the pairs of names that seconds and nanoseconds have in ROS 1 and 2 and in Protocol Buffers.
+    A stamp is a dictionary or an object. STAMPS holds the pairs of names that its two integers have in ROS 1, in ROS 2
+    and in Protocol Buffers.
 
     Raises:
-        ValueError: a stamp of zero, which nobody has set; one line that begins with `name`.
+        ValueError: the stamp is zero, so that nobody has set it. The error begins with `name`.
     """
     is_map = isinstance(value, Mapping)
     for names in STAMPS:
@@ -256,11 +259,11 @@ def _read_stamp(value: Any, name: str) -> int | None:
 
 
 def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: str) -> int:
-    """Return the nanoseconds since 1970 of a finite number in a unit; raise ValueError where 64 bits do not hold it.
+    """Return a finite number of `unit` since 1970 as nanoseconds; raise ValueError if 64 bits do not hold it.
 
-    UNITS: nanoseconds of each unit. The error names a unit, if any, in which the number would be a time.
+    UNITS maps each unit to its nanoseconds. The error suggests a unit in which the number would be a time.
     """
-    # By the decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
+    # Compute with the decimal number that was meant: a double of seconds times 10^9 is off by up to 128 ns.
     decimal = int(value) if float(value).is_integer() else Decimal(repr(float(value)))
     stamp = round(decimal * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
@@ -271,17 +274,17 @@ def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "n
 
 
 def parse_arrival(value: Any, name: str) -> int:
-    """Return what a log says of an arrival, a date or seconds, also as a text, in nanoseconds since 1970."""
+    """Return a log's time of arrival, which is a date or seconds and may be a text, as nanoseconds since 1970."""
     if isinstance(value, np.datetime64):
         return int(value.astype("datetime64[ns]").astype(np.int64))
     return convert_time(value, "s", name, quoted=True)
 
 
 def parse_start(name: str, start: object) -> int:
-    """Return the date from which a clock counts in nanoseconds since 1970.
+    """Return the date from which a clock counts, as nanoseconds since 1970.
 
     Raises:
-        ValueError: no date with a zone; one line.
+        ValueError: `start` is not a date with a zone.
     """
     if not isinstance(start, str):
         raise fail(name, "a date of ISO 8601 with its zone, such as 2026-09-27T10:00:00Z", show_value(start))
@@ -289,7 +292,7 @@ def parse_start(name: str, start: object) -> int:
 
 
 def convert_count(value: Any, name: str, quoted: bool = False) -> int:
-    """Return a running count, which columns of numbers have as a float; a text of it only where it may be `quoted`."""
+    """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text."""
     if quoted and isinstance(value, str):
         value = parse_number(value)
     if isinstance(value, float) and value.is_integer():

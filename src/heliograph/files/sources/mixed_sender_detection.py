@@ -19,8 +19,8 @@ class SenderCounter:
     def __init__(self) -> None:
         """Begin with no message.
 
-        Counts are of each value by (topic, plant, node, field); `_names`: by field whether it names a sender; `_noted`:
-        number of messages; `_said`: what was warned of.
+        `_counts` counts how often each value came, by (topic, plant, node, field). `_names` says for each field whether
+        it names a sender. `_noted` counts messages, and `_said` holds what was warned of.
         """
         self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
         self._names: dict[str, bool] = {}
@@ -29,8 +29,9 @@ class SenderCounter:
     def note_fields(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
         """Count the fields of a message that was read as one of a node of a plant.
 
-        Only fields whose names may name a sender count: several values tell that senders are mixed, but more than MANY
-        name messages. Fields `asked` for by a source tell senders apart already, or are values.
+        Only fields that may name a sender are counted. If such a field has several values, senders are mixed. If it has
+        more than MANY values, it names messages instead. Fields that a source has `asked` for are left out: they tell
+        senders apart already, or they are values.
         """
         self._noted += 1
         for name, value in message.items() if isinstance(message, Mapping) else ():
@@ -64,9 +65,9 @@ class SenderCounter:
         return lines
 
     def _is_sender_name(self, field: str) -> bool:
-        """Return whether a word of a field's name, as of `entity_id` or `devEui`, says that it names a sender.
+        """Return whether a word in a field's name, as in `entity_id` or `devEui`, says that the field names a sender.
 
-        WORDS matches such words; `self._names` keeps the answers.
+        WORDS matches such words. `self._names` keeps the answers.
         """
         if field not in self._names:
             words = re.split(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])", field)

@@ -32,7 +32,7 @@ class Level:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the name that the word at `self.index` of the topic gives, by `self.names` where that has it."""
+        """Return the topic's level number `self.index`, replaced by its name in `self.names` if there is one."""
         levels = topic.split("/")
         if not -len(levels) <= self.index < len(levels):
             raise fail(where, f"a topic with a level {self.index}", repr(topic))
@@ -81,7 +81,7 @@ class Stamp:
     start: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse an offset, in seconds, that is no number, and a start of the clock's counting that is no date."""
+        """Raise ValueError unless the offset (seconds) is a number, and the clock's start is a date or None."""
         scalar("Stamp, offset", self.offset)
         if self.start is not None:
             parse_start("Stamp, start", self.start)
@@ -93,9 +93,9 @@ class Stamp:
         return start + round(self.offset * 10**9)
 
     def of(self, message: object, unit: TimeUnit, where: str, quoted: bool = False) -> int:
-        """Return the time in a message, in nanoseconds since 1970, or its step.
+        """Return the time in a message, in nanoseconds since 1970 or as a step.
 
-        `unit`: of a time that is a number; `where`: place of the message, for errors; `quoted`: whether it may be text.
+        `unit`: of a numeric time. `where`: the message's place, for errors. `quoted`: whether the time may be a text.
         """
         value, name = field_at(message, self.path, where), f"{where}, field {self.path!r}"
         if self.start is not None and isinstance(value, str) and looks_like_date(value):
@@ -123,9 +123,9 @@ class Count:
         return 0 if self.bits is None else 1 << self.bits
 
     def check(self, number: int, name: str) -> int:
-        """Return the count `number` of a message; raise ValueError, which calls it `name`, unless below the period.
+        """Return the running count `number`; raise ValueError, which calls it `name`, unless it is below the period.
 
-        The count begins at 0 again after `self.period` messages, 2^bits; 0 where it does not.
+        The count begins again at 0 after `self.period` = 2^bits messages. A period of 0 means that it never does.
         """
         if self.period and number >= self.period:
             got = f"{number}: of another modulus than bits={self.bits}"
@@ -191,7 +191,7 @@ class Source:
 
     @property
     def fields(self) -> list[str]:
-        """Return the dotted paths of all fields that a message needs: of values, names, time, count, and conditions."""
+        """Return the dotted paths of all fields that are read: values, names, time, count and conditions."""
         values = [field for path in self.paths for field in ((path,) if isinstance(path, str) else path.parts)]
         options = (self.node, self.plant, self.time, self.sequence)
         fields_of_options = [option.path for option in options if isinstance(option, Field | Stamp | Count)]
@@ -200,10 +200,10 @@ class Source:
     def check_valid(self, message: object, where: str) -> None:
         """Raise ValueError unless all flags of a message say that it can be trusted.
 
-        `self.valid`: by the path of a flag the values of it that say so.
+        `self.valid` maps the path of a flag to its values in such a message.
 
         Raises:
-            ValueError: a flag that does not, that is a text where a number is expected, or is not there.
+            ValueError: a flag has another value, or it is missing.
         """
         for field, allowed in self.valid.items():
             value = field_at(message, field, where)
@@ -309,7 +309,7 @@ def json_field(
 
 
 def _read_time_options(time: "Time", time_unit: "Unit", step: "Step") -> "tuple[Stamp | None, float | None]":
-    """Return stamp and seconds of a step of a source, None where it has none; ValueError if options contradict."""
+    """Return a source's stamp and its seconds of a step, each None if not given; raise if they contradict."""
     if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
         raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", show_value(time_unit))
     stamp = Stamp(time) if isinstance(time, str) else time
@@ -322,7 +322,7 @@ def _read_time_options(time: "Time", time_unit: "Unit", step: "Step") -> "tuple[
 
 
 def read_paths(value: object) -> tuple[str | Computed, ...]:
-    """Return one path (or what is computed from several, as a yaw) or a sequence of them as a tuple, checked."""
+    """Return paths as a tuple; the value is one path, one number computed from several, or a sequence of these."""
     items = [value] if isinstance(value, str | Computed) else value
     if not isinstance(items, Sequence) or not all(isinstance(path, str | Computed) for path in items):
         expected = "a dotted path, hg.files.Yaw, Covariance or east of a Geodetic, or a list of these"
@@ -331,7 +331,7 @@ def read_paths(value: object) -> tuple[str | Computed, ...]:
 
 
 def _parse_name_option(name: str, value: object) -> Any:
-    """Return what names a node or a plant (`name` says which); raise ValueError unless text, a Level or a Field."""
+    """Return a text, Level or Field that names a node or a plant (`name` says which), or raise ValueError."""
     if not isinstance(value, str | Level | Field):
         raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", show_value(value))
     return value
@@ -364,7 +364,7 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
 
 
 def _read_valid_flags(valid: object) -> Allowed:
-    """Return by path of each flag the values that say that a message can be trusted; true or 1 of a path alone."""
+    """Return {path of a flag: its values in a message that can be trusted}; a path alone has true or 1."""
     if isinstance(valid, str):
         return {valid: (True, 1)}
     if not isinstance(valid, Mapping | None):
@@ -373,7 +373,7 @@ def _read_valid_flags(valid: object) -> Allowed:
 
 
 def read_texts(name: str, value: object) -> tuple[str, ...]:
-    """Return one text or a sequence of them as a tuple, checked; `name`: the option, for errors."""
+    """Return a text or a sequence of texts as a tuple; `name` is the option's name, for errors."""
     items = [value] if isinstance(value, str) else value
     if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
         raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))

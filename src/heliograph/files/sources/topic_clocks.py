@@ -45,14 +45,17 @@ class TopicClocks:
         self._by_topic: dict[str, TopicClock] = {}
 
     def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
-        """Note the time of a message, in nanoseconds since 1970: its topic's clock counts it, and whether it is a date.
+        """Note the time of a message, in nanoseconds since 1970, on its topic's clock.
 
-        A time within a YEAR of 1970 is none of a date, but of a clock that counts from its own start.
+        A topic's clock holds the path of its time field, whether times are numbers, its first time, and two counts: of
+        all times, and of those more than a YEAR from 1970. A time within a YEAR of 1970 is no date, but one of a clock
+        that counts from its own start.
         """
         clock = self._by_topic.get(topic)
         if clock is None:
             path, value = _find_time_field(topic, content, sources)
-            clock = TopicClock(path, not (isinstance(value, str) and looks_like_date(value)), time)
+            is_date = isinstance(value, str) and looks_like_date(value)
+            clock = TopicClock(path, not is_date, time)
             self._by_topic[topic] = clock
         clock.count += 1
         clock.far_from_1970 += abs(time) >= YEAR
@@ -61,7 +64,7 @@ class TopicClocks:
         """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
         Raises:
-            ValueError: some count from their own start and others are dates; one line with the remedy.
+            ValueError: some topics count from their own start, and others have dates.
         """
         from_zero = [topic for topic, clock in self._by_topic.items() if clock.counts_from_own_start]
         dated = next((topic for topic in self._by_topic if topic not in from_zero), None)
@@ -75,7 +78,7 @@ class TopicClocks:
 
 
 def _find_time_field(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
-    """Return path and value of the first time field of some sources that the message has; ("", None) if none."""
+    """Return the path and value of the sources' first time field that the message has, or ("", None)."""
     for source in sources:
         if source.time is not None:
             with suppress(InputError):

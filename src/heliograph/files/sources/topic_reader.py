@@ -98,7 +98,7 @@ class TopicReader:
 
     @property
     def notes(self) -> list[str]:
-        """Return lines on conditions that left messages out, and on devices that never said whether they are online."""
+        """Return lines on messages that conditions left out, and on devices that never said whether they are online."""
         lines = []
         for counts, why in ((self.excluded, "left out by where="), (self.offline, "left out, of devices offline")):
             if counts:
@@ -111,14 +111,14 @@ class TopicReader:
 
     @property
     def periods(self) -> dict[str, int]:
-        """Return {node: after how many messages its count begins at 0 again}, of nodes whose count does."""
+        """Return {node: after how many messages its running count begins again at 0}; other nodes are absent."""
         mapped = [single for several in self._table.values() for single in several]
         counts = [(node, single.source.sequence) for single in mapped for node in single.places]
         return {node: count.period for node, count in counts if count is not None and count.period}
 
     @property
     def nodes_without_count(self) -> set[str]:
-        """Return the nodes whose messages carry no count, so that nothing is known of lost ones."""
+        """Return the nodes whose messages carry no running count, so that lost messages are not known."""
         mapped = [single for several in self._table.values() for single in several]
         counted = {node for single in mapped for node in single.places if single.source.sequence is not None}
         return {node for single in mapped for node in single.places} - counted
@@ -130,7 +130,7 @@ class TopicReader:
         return {name for source in mapped for path in source.fields for name in (path, path.split(".")[0])}
 
     def list_fields(self, topic: str) -> set[str]:
-        """Return the fields of a topic's messages that a source uses, by the first word of their paths."""
+        """Return the top-level fields of a topic's messages that sources use: the first words of their paths."""
         if topic not in self._fields_of_topic:
             fields = self._fields_of_topic.setdefault(topic, set())
             for source, *_ in self.of(topic):
@@ -142,7 +142,7 @@ class TopicReader:
         return self._fields_of_topic[topic]
 
     def of(self, topic: str) -> list[MappedSource]:
-        """Return the sources whose pattern, a topic or one with wildcards, a topic matches, with places of values."""
+        """Return the sources whose pattern a topic matches; a pattern is a topic, possibly with wildcards."""
         if topic not in self._sources_of_topic:
             matching = [items for pattern, items in self._table.items() if match_topic(topic, pattern)]
             self._sources_of_topic[topic] = [source for items in matching for source in items]
@@ -162,9 +162,9 @@ class TopicReader:
         return self.device_statuses.take_status_message(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
-        """Return a reading of a message for each source of its topic; [] of an unknown topic, which is counted.
+        """Return a reading of a message for each source of its topic; an unknown topic has none and is counted.
 
-        In the place of a reading stands why a source could not read it; one that a condition leaves out has none.
+        If a source cannot read the message, an Unread with the reason stands there. A condition may leave it out.
 
         Args:
             topic: the topic of the message.
@@ -183,14 +183,14 @@ class TopicReader:
         return results
 
     def date_copy_as_original(self, reading: Reading, arrival: int | None) -> Reading:
-        """Return a reading as it is; of a copy of the node's message before, with the time of that.
+        """Return a reading; if it is a copy of the node's last message, it gets the time of that message.
 
-        A copy has the same count and values, and comes within ten seconds: gateways and senders repeat messages, and
-        the time may be that of the reception. Where a node's count has always been the same it tells no copies.
+        Gateways and senders repeat messages, and a copy's time may be that of its reception. A copy has the same count
+        and values, and comes within ten seconds. A count that has never changed does not tell copies.
 
         Args:
             reading: what came.
-            arrival: nanoseconds since 1970 when it arrived; None where that is not known.
+            arrival: when it arrived, in nanoseconds since 1970; None if that is not known.
         """
         moment = reading.time if arrival is None else arrival
         has_no_seconds = self.time_counts_steps and self.step_seconds is None
@@ -241,7 +241,7 @@ class TopicReader:
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
     def _is_left_out(self, source: Source, topic: str, message: object, where: str) -> bool:
-        """Return whether a field's value that is not let in, or an offline device, leaves a message out; count it."""
+        """Return whether a message is left out, by a field's value or since its device is offline; count it if so."""
         for field, allowed in source.where.items():
             if field_at(message, field, where) not in allowed:
                 self.excluded[topic] += 1
@@ -279,7 +279,7 @@ class TopicReader:
         return Reading(plant, node, sequence, time, np.full(len(self.names[node]), np.nan), period)
 
     def _read_message_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
-        """Return a message's running count, None if the source has none, and whether its field is absent (count 0)."""
+        """Return a message's running count (None if the source has none), and whether its field is absent (count 0)."""
         if source.sequence is None:
             return None, False
         path = source.sequence.path
@@ -334,9 +334,9 @@ class TopicReader:
         return set(source.outputs) <= set(names) if source.outputs else len(names) == len(source.paths)
 
     def _check_kind_of_time(self, name: str, source: Source) -> None:
-        """Raise ValueError, which begins with `name`, unless a source's times are steps where the network counts steps.
+        """Raise ValueError, which begins with `name`, unless a source's times are of the network's kind, steps or not.
 
-        They are that if they are in steps, or moments of which each is of the nearest step.
+        Times are steps if the source counts steps, or if it says how many seconds a step has.
         """
         are_steps = source.step is not None or (source.time is not None and source.time_unit == "step")
         if self.time_counts_steps == are_steps:
@@ -351,7 +351,7 @@ class TopicReader:
         raise fail(f"{name}, time", expected, got)
 
     def _index_outputs(self, name: str, source: Source, node: str) -> np.ndarray:
-        """Return the indices of a source's outputs among the node's, in the order of its paths; `name`: for errors."""
+        """Return the index among the node's outputs for each path of a source; `name` is for errors."""
         known = self.names[node]
         outputs = source.outputs or known
         if len(outputs) != len(source.paths):
@@ -363,7 +363,7 @@ class TopicReader:
 
 
 def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -> tuple[str, str]:
-    """Return the plant of a message, "" for a single one, and its node."""
+    """Return the names of a message's plant and node; the plant is "" if there is only one."""
     source = mapped.source
     node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
     return "" if source.plant is None else source.plant.of(topic, message, where), node
@@ -380,7 +380,7 @@ def _describe_rest(count: int) -> str:
 
 
 def _read_value(message: object, path: str | Computed, where: str, quoted: bool) -> float:
-    """Return the number at a path, or what is computed of several; NaN if none arrived; `quoted`: it may be text."""
+    """Return the number at a path, or one computed from several; NaN if it is missing; `quoted`: it may be a text."""
     if isinstance(path, ZeroIfAbsent):  # a field that senders leave out where it is 0
         path_of_parent, _, name = path.path.rpartition(".")
         parent = field_at(message, path_of_parent, where)
@@ -388,7 +388,7 @@ def _read_value(message: object, path: str | Computed, where: str, quoted: bool)
     if not isinstance(path, str):
         return float(path.of(*(_read_value(message, field, where, quoted) for field in path.parts)))
     value = field_at(message, path, where)
-    if type(value) is float:  # names its place only where there may be something to say
+    if type(value) is float:  # the common case, without making the place's name for errors
         return value if np.isfinite(value) else np.nan
     return convert_number(value, f"{where}, field {path!r}", quoted)
 

@@ -30,12 +30,12 @@ BATCH = 4 * 2**20  # bytes of one request: a server may refuse more than ten mil
 
 
 def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
-    """Return the measurement's name and the columns of a table: lists, and `time` as datetime64[ns].
+    """Return the measurement's name and the columns of a table, as lists; `time` is datetime64[ns].
 
-    Several series, as of GROUP BY, are one table in the order of time, with their tags as columns.
+    Several series, as from GROUP BY, become one table sorted by time, with their tags as columns.
 
     Raises:
-        ValueError: the server is away or refuses, or nothing came; one line.
+        ValueError: the server does not answer or refuses, or nothing came.
     """
     query = address.query or f'SELECT * FROM "{_escape_name(address.table, chr(34))}"'
     match address.language:
@@ -49,7 +49,7 @@ def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
 
 
 def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:
-    """Return target and body of a request in Flux, which asks for CSV with the type of each column."""
+    """Return the URL's path and the body of a Flux request, which asks for CSV with the type of each column."""
     organisation = f"?{urlencode({'org': address.organisation})}" if address.organisation else ""
     dialect = {"header": True, "delimiter": ",", "annotations": ["datatype"]}
     body = {"query": address.query, "type": "flux", "dialect": dialect}
@@ -57,12 +57,12 @@ def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:
 
 
 def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str) -> None:
-    """Write the rows of a table as points of its moments (datetime64[ns]); what is not finite is left out.
+    """Write the rows of a table as points at `moments` (datetime64[ns]); numbers that are not finite are left out.
 
-    A point of the same moment and plant is replaced, so that what was interrupted is written anew by the same call.
+    A point of the same moment and plant is replaced, so that an interrupted call can simply be repeated.
 
     Raises:
-        ValueError: the server is away or refuses; one line that says how many rows are there.
+        ValueError: the server does not answer or refuses. The error says how many rows are written.
     """
     target = f"/write?{urlencode({'db': address.database, 'precision': 'ns'})}"
     done = 0
@@ -143,10 +143,10 @@ def _send_request(address: StoreAddress, method: str, target: str, body: bytes |
 
 
 def _make_headers(address: StoreAddress) -> dict[str, str]:
-    """Return the headers of a request: a user with a password, or a token alone; of Flux also the types of content."""
+    """Return the headers of a request: the user and password or the token, and for Flux also the content types."""
     user, password = address.user_and_password
     if address.language == "flux":
-        token = f"{user}:{password}" if user else password  # version 1 takes both as one
+        token = f"{user}:{password}" if user else password  # version 1 takes both as one token
         kinds = {"Content-Type": "application/json", "Accept": "application/csv"}
         return kinds | ({"Authorization": f"Token {token}"} if token else {})
     if user:
@@ -157,7 +157,7 @@ def _make_headers(address: StoreAddress) -> dict[str, str]:
 
 
 def _explain_refusal(content: bytes) -> str:
-    """Return why a server refuses, by its answer: of JSON its error or message, else all of it."""
+    """Return a server's reason for refusing: the error or message in its JSON answer, else the whole answer."""
     answer = content.decode(errors="replace")
     try:
         decoded = json.loads(answer)

@@ -45,10 +45,10 @@ def parse_influxql_response(address: StoreAddress, answer: bytes) -> Answer:
 
 
 def parse_sql_response(address: StoreAddress, answer: bytes) -> Answer:
-    """Return the table of an answer of version 3 to SQL, a list of rows, each an object of JSON.
+    """Return the database's name and the table in an answer of InfluxDB 3 to SQL, a JSON list of objects, one a row.
 
     Raises:
-        ValueError: no such answer, no rows; one line.
+        ValueError: the answer has another form or no rows.
     """
     try:
         rows = json.loads(answer)
@@ -61,14 +61,14 @@ def parse_sql_response(address: StoreAddress, answer: bytes) -> Answer:
 
 
 def parse_flux_response(address: StoreAddress, answer: bytes) -> Answer:
-    """Return the table of an answer to Flux: tables of CSV, each row of which has one field's value at one time.
+    """Return the measurement's name and the table in an answer to Flux, which consists of tables in CSV.
 
-    Values of one measurement, one time and the same tags are one row, as after `pivot`, which a query may do itself.
-    `_time` is the time, `_measurement` the name; `result`, `table`, `_start` and `_stop` tell how the answer was
-    made: left out.
+    Each row of the answer has one field's value at one time. Values of one measurement, one time and the same tags
+    are joined to one row, as `pivot` in the query would do. `_time` holds the time and `_measurement` the name. The
+    columns `result`, `table`, `_start` and `_stop` are left out.
 
     Raises:
-        ValueError: no such answer, an error in it, no rows; one line.
+        ValueError: the answer has another form, an error in it, or no rows.
     """
     try:
         measurement, rows = _join_flux_rows(address, _yield_flux_rows(answer.decode()))
@@ -115,7 +115,7 @@ def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[
     """Return the columns of a row with its tags, the words of InfluxDB that name its series.
 
     Raises:
-        ValueError: a tag of a column's name, with another value: one of the two would be lost.
+        ValueError: a tag and a column have the same name and different values, of which one would be lost.
     """
     shared_name = next((name for name in tags if name in columns and tags[name] != columns[name]), None)
     if shared_name is not None:

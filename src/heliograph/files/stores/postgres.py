@@ -80,7 +80,7 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
 
 
 def check_postgres(address: StoreAddress) -> None:
-    """Raise ValueError where no server answers there, or none for this user."""
+    """Raise ValueError if no server answers at the address, or if it refuses this user."""
     try:
         psycopg.connect(address.url, connect_timeout=10).close()
     except psycopg.Error as error:
@@ -88,15 +88,18 @@ def check_postgres(address: StoreAddress) -> None:
 
 
 def _convert_cells(column: np.ndarray) -> list[Any]:
-    """Return the cells of a column as the server reads them: dates to the microsecond, None (NULL) in place of NaN."""
+    """Return the cells of a column as the server reads them: dates to the microsecond, and None (NULL) for NaN."""
     if column.dtype.kind == "M":
         moments = np.datetime_as_string(column.astype("datetime64[us]")).tolist()
         return [f"{moment}Z" for moment in moments]
-    return [None if value != value else value for value in column.tolist()]  # NaN alone differs from itself
+    return [None if value != value else value for value in column.tolist()]  # only NaN differs from itself
 
 
 def _explain_error(address: StoreAddress, error: Exception) -> InputError:
-    """Return an error of one line: the first that the server said, and whether it is away or refuses what it got."""
+    """Return a one-line error with the first line of the server's message.
+
+    It says whether the server did not answer, or refused what it got.
+    """
     said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
     away = isinstance(error, psycopg.OperationalError)
     return fail(str(address), "a server that answers" if away else "what the server accepts", said)

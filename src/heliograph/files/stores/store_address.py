@@ -53,9 +53,10 @@ class StoreAddress:
 
     @property
     def user_and_password(self) -> tuple[str, str]:
-        """Return user and password, or token, of InfluxDB: those of the environment, else of the URL; "" for none.
+        """Return InfluxDB's user and password; the user is "" for a token, which is then the password.
 
-        USER and PASSWORD are the names of the environment's variables.
+        They come from the environment's variables USER and PASSWORD (names held here), or else from the URL. Both are
+        "" if there is none.
         """
         parts = urlsplit(self.url)
         user = os.environ.get(USER) or unquote(parts.username or "")

@@ -36,10 +36,12 @@ class StoreTable:
         return str(self.address)
 
     def rows(self, only: Mapping[str, str] | None) -> TableRows:
-        """Return the table's rows, of numbers and dates, numbered from 1; of the columns among `only`, None for all.
+        """Return the table's rows of numbers and dates, numbered from 1.
+
+        `only` holds the columns that are read; None for all.
 
         Raises:
-            ValueError: a column of text; one line.
+            ValueError: a column holds text.
         """
         columns = convert_to_columns(self.columns, str(self), only)
         count = len(next(iter(self.columns.values()), ()))
@@ -66,7 +68,7 @@ def query_store(address: StoreAddress) -> StoreTable:
     """Return the rows of a store's query or table.
 
     Raises:
-        ValueError: the server is away or refuses, no rows, neither a query nor a table; one line.
+        ValueError: the server does not answer or refuses, there are no rows, or the URL has neither query nor table.
         ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
     """
     if not address.query and not address.table:
@@ -80,10 +82,10 @@ def query_store(address: StoreAddress) -> StoreTable:
 
 
 def check_store(address: StoreAddress) -> None:
-    """Raise now what writing to a store would raise at once: no package, no server, a query in the URL.
+    """Raise an error now if writing to a store would fail at once.
 
     Raises:
-        ValueError: one line.
+        ValueError: the server does not answer, or the URL has a query.
         ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
     """
     if address.query:
@@ -147,18 +149,19 @@ def read_store(url: str) -> dict[str, np.ndarray]:
 def store_estimates(record: Record, url: str, plant: str = "", origin: np.datetime64 | None = None) -> None:
     """Write the estimates of a run to a table of InfluxDB or PostgreSQL: the columns of `write_estimates`.
 
-    Rows of the same times and plant are replaced, so that the same call twice leaves what one leaves. PostgreSQL
-    gets all or nothing, in one transaction, in a table that is made where there is none (columns `plant`, `time`, to
-    the microsecond, and the estimates'). InfluxDB gets points whose tag is the plant, in requests of four megabytes.
+    Rows of the same times and plant are replaced, so that a call can be repeated. PostgreSQL gets all rows in one
+    transaction. Its table is made if it is missing, with the columns `plant`, `time` (to the microsecond) and those of
+    the estimates. InfluxDB gets points whose tag is the plant, in requests of four megabytes.
 
     Args:
         record: the result of `run`.
-        url: as for `read_store`, with `?table=NAME`; "estimates" unless given.
-        plant: name of the plant (default none).
-        origin: date of time 0, where the times of the record are seconds since then (default: they are as they are).
+        url: as for `read_store`, with `?table=NAME`; the table is "estimates" by default.
+        plant: name of the plant; "" by default.
+        origin: date of time 0 if the record's times are seconds since then; None by default.
 
     Raises:
-        ValueError: the server is away or refuses, times without dates in InfluxDB, a query in the URL. One line.
+        ValueError: the server does not answer or refuses, InfluxDB would get times without dates, or the URL has a
+            query.
         ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
     """
     instance("record", record, Record, "a Record")

@@ -19,7 +19,7 @@ SEEN = 10_000  # characters in which a decimal comma is looked for
 
 
 def check_distinct(source: object, header: Sequence[object]) -> None:
-    """Raise ValueError where a column is there twice."""
+    """Raise ValueError if two columns have the same name."""
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
         raise fail(f"{source}, header", "distinct columns", f"{twice[0]!r} more than once")
@@ -56,9 +56,9 @@ def find_separator(header: Sequence[str]) -> str | None:
 
 
 def guess_names_in_header(line: str) -> set[str]:
-    """Return the names that the first line of a table may have, whatever separates them.
+    """Return the column names that the first line of a table may hold, whatever separates them.
 
-    COMMENTS are marks of a comment, # and %; such a line may have blanks between names.
+    COMMENTS holds the marks of a comment, # and %. In a comment, blanks may also separate names.
     """
     separators = r"[,;\t|\s]" if line.startswith(COMMENTS) else r"[,;\t|]"
     words = re.split(separators, line.lstrip("".join(COMMENTS) + " "))
@@ -72,7 +72,10 @@ def suggest_rewrite(path: Path, **how: object) -> str:
 
 
 def suggest_recoding(path: Path | None, line: str) -> str:
-    """Return the call that rewrites a table of another encoding, by one of its lines; "" if it cannot be read again."""
+    """Return the call that rewrites a table of another encoding, which is guessed from one line.
+
+    Without a path the table cannot be read again, and the answer is "".
+    """
     if path is None:
         return ""
     encoding = "utf-16-le" if "\0" in line else "latin-1"
@@ -82,8 +85,8 @@ def suggest_recoding(path: Path | None, line: str) -> str:
 
 
 def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:
-    """Return what a cell that is no number probably means, with the call that rewrites the table; "" if unknown."""
-    # 21.11.2026 and 11/21/2026: the day comes first where it cannot be a month, or between full stops.
+    """Return what a cell that is not a number probably means, and the call that rewrites the table; "" if unknown."""
+    # In 21.11.2026 and 11/21/2026, the day comes first if it cannot be a month, or if full stops separate the parts.
     if day := DAY_FIRST.fullmatch(cell):
         first = int(day[1]) > 12 or (day[2] == "." and int(day[3]) <= 12)
         remedy = "" if path is None else f": {suggest_rewrite(path, parse_dates=[name], dayfirst=first)}"
@@ -98,9 +101,9 @@ def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:
 
 
 def _suggest_separator(path: Path, mark: str) -> str:
-    """Return the call that rewrites a table whose separator is `mark`, from the file's first SEEN characters.
+    """Return the call that rewrites a table whose separator is `mark`.
 
-    Commas between digits are decimal commas there.
+    If the file's first SEEN characters have a comma between digits, it is a decimal comma.
     """
     with open_text(path) as file:
         start = file.read(SEEN)

@@ -50,11 +50,11 @@ class CsvReader:
     """
 
     def __init__(self, source: str, path: Path | None, marked: bool):
-        """Begin with no line and no header; `marked`: whether a name or a cell may begin with #, and is no comment."""
+        """Begin before the first line; `marked`: whether a line that begins with # may be a row and no comment."""
         self.source, self.path, self._marked = source, path, marked
         self.header: list[str] = []
         self.number = 0
-        self._open_lines: list[str] = []  # lines since one with a quote that is not closed
+        self._open_lines: list[str] = []  # lines from the one that opened a quote, while it is not closed
 
     @property
     def is_open(self) -> bool:
@@ -62,10 +62,12 @@ class CsvReader:
         return bool(self._open_lines)
 
     def add(self, line: str) -> list[CsvRow | InputError]:
-        """Return the rows that a line completes, or why one cannot be read; [] within a quoted cell of several lines.
+        """Return the rows that a line completes, or errors for rows that cannot be read.
+
+        There are none within a quoted cell of several lines.
 
         Raises:
-            ValueError: a header that names no columns, or one of them twice; one line.
+            ValueError: the header names no columns, or a column twice.
         """
         if not self._open_lines and '"' not in line:
             return self._make_row(line.rstrip("\r\n").split(","))
@@ -122,9 +124,9 @@ class CsvReader:
         return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
 
     def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
-        """Return why cells are no row of this table; None if they are.
+        """Return the error if the cells are no row of this table, or None if they are one.
 
-        `self._marked`: whether a row may begin with #; else such a line is a comment.
+        A line that begins with # is a comment, unless `self._marked` allows such rows.
         """
         line = ",".join(cells)
         if not is_valid_text(line):
@@ -142,7 +144,7 @@ def read_csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
     """Yield the rows of a file of CSV, or why one cannot be read; `marked` is as of `CsvReader`.
 
     Raises:
-        ValueError: a header that names no columns; a packed file that is damaged, from there on.
+        ValueError: the header names no columns, or a packed file is damaged (the rows before are yielded).
     """
     text = CsvReader(str(path), path, marked)
     with open_text(path) as file:
@@ -152,7 +154,7 @@ def read_csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
 
 
 def read_csv_header(path: Path) -> list[str]:
-    """Return the names of the columns of a CSV file; none of a file that is none."""
+    """Return the names of a CSV file's columns, or [] if the file cannot be read as CSV."""
     text = CsvReader(str(path), path, marked=True)
     try:
         with open_text(path) as file:
@@ -166,13 +168,13 @@ def read_csv_header(path: Path) -> list[str]:
 
 
 def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
-    """Return the number of a cell, NaN of one that is empty or says that there is no value.
+    """Return the number in a cell; it is NaN if the cell is empty or says that there is no value.
 
     Raises:
-        ValueError: no number; one line with what is probably meant.
+        ValueError: the cell holds no number. The error says what is probably meant.
     """
     try:
-        if "_" in cell:  # Python's own way to write a number, and nobody else's
+        if "_" in cell:  # only Python accepts such numbers
             raise ValueError
         return float(cell) if cell else float("nan")
     except ValueError:

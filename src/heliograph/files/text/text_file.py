@@ -33,14 +33,14 @@ def find_extension(path: Path) -> str:
 
 
 def _begins_as_table(path: Path) -> bool:
-    """Return whether the first line of a text names columns, and the second has as many cells, one of them a value."""
+    """Return whether a text begins like a table: the first line names columns, and the second has as many cells."""
     try:
         with open_text(path) as text:
             header, *rows = islice((line.strip() for line in text if line.strip()), 2)
     except (OSError, ValueError):
         return False
     names = header.split(",")
-    if header.startswith("#"):  # a comment, of which the reader of tables says what to do
+    if header.startswith("#"):  # a comment; the reader of tables will say what to do
         return len(names) > 1
     are_words = all(re.fullmatch(r"[^\W\d][^{}\[\]:]*", name.strip().strip('"')) for name in names)
     return len(names) > 1 and are_words and all(len(row.split(",")) == len(names) for row in rows)
@@ -50,7 +50,7 @@ def guess_encoding(start: bytes) -> str:
     """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter."""
     if start.startswith(WIDE):
         return "utf-16"
-    first_byte, second_byte = (*start[:2], 1, 1)[:2]  # 1, which is not NUL, of a text that is shorter
+    first_byte, second_byte = (*start[:2], 1, 1)[:2]  # a shorter text is filled up with 1, which is not NUL
     if 0 in (first_byte, second_byte) and first_byte != second_byte:
         return "utf-16-be" if first_byte == 0 else "utf-16-le"
     return "utf-8-sig"
@@ -63,14 +63,14 @@ def is_valid_text(line: str) -> bool:
 
 @contextmanager
 def open_text(path: Path) -> Iterator[TextIO]:
-    """Open a file of text in UTF-8 or UTF-16, packed or not; bytes that are no text are escaped.
+    """Open a text file in UTF-8 or UTF-16, packed or not; bytes that are no valid text are escaped or replaced.
 
     Raises:
-        CutOffError: a packed file that is damaged or cut off, from there on.
+        CutOffError: a packed file is damaged or was cut off; raised when reading reaches this place.
     """
     try:
         with path.open("rb") as file, _open_unpacked(file) as unpacked:
-            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))  # by as many bytes as the mark of UTF-16 has
+            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))  # look at as many bytes as UTF-16's mark has
             errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
             with TextIOWrapper(unpacked, newline="", encoding=encoding, errors=errors) as text:
                 yield text
@@ -111,9 +111,9 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
 
 
 def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
-    """Return `size` bytes, or those that are left; whether the file ends with them; the error of damage there, or None.
+    """Return three things: at most `size` bytes, whether the file ends with them, and an error or None.
 
-    DAMAGE are the errors of unpacking a file that is damaged or cut off.
+    The error is one of DAMAGE, which unpacking raises if the file is damaged or was cut off.
     """
     parts, length = list[bytes](), 0
     try:
@@ -132,9 +132,9 @@ def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
 
 
 def _make_decoder_to_utf8(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
-    """Return a function from the next bytes of a text, and whether these are the last, to bytes of UTF-8.
+    """Return a function (bytes, whether they are the last) -> bytes that converts a text to UTF-8 part by part.
 
-    What is no UTF-16 is passed on as it is, without the mark of UTF-8 before it.
+    UTF-16 is converted. Any other text is passed on as it is, without UTF-8's byte order mark.
     """
     encoding = guess_encoding(text.peek(len(WIDE[0])))
     if encoding != "utf-8-sig":
@@ -151,10 +151,10 @@ def split_lines(text: bytes) -> list[str]:
 
 
 def yield_until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
-    """Yield parts of a text, and at last why they end before its end, if they do.
+    """Yield parts of a text; if the text was cut off, yield the error as the last item.
 
     Raises:
-        CutOffError: nothing came before.
+        CutOffError: the text was cut off before its first part.
     """
     has_yielded = False
     try:

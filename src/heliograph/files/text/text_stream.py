@@ -28,13 +28,13 @@ class TextStream:
     """
 
     def __init__(self, source: str):
-        """Begin with no byte; `source`: where they come from, for errors."""
+        """Begin before the first byte; `source` says where the bytes come from, for errors."""
         self.source, self.broken = source, ""
-        self._start: bytes | None = b""  # bytes of which it is not known yet what they are
-        self._packed: bytes | None = None  # packed bytes that are not unpacked yet; None of what is not packed
-        self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)  # 16: of gzip
+        self._start: bytes | None = b""  # the first bytes, until the encoding is known; None from then on
+        self._packed: bytes | None = None  # packed bytes that are not unpacked yet; None if the text is not packed
+        self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)  # 16 means gzip
         self._in_member = False  # whether a packed file has begun and not ended
-        self._inside: TextStream | None = None  # of what was packed
+        self._inside: TextStream | None = None  # reads the unpacked bytes
         self._decode: codecs.IncrementalDecoder | None = None
 
     @property
@@ -43,13 +43,13 @@ class TextStream:
         return bool(self._packed) and not self.broken
 
     def feed(self, data: bytes, ended: bool = False) -> bytes:
-        """Return text that is complete with these bytes; `ended`: there will be no more.
+        """Return the text, as UTF-8, that these bytes complete; `ended`: no more bytes will come.
 
-        The first bytes, `self._start` until they are enough, say whether all is packed (`self._inside` reads that), in
-        UTF-16 (`self._decode`) or as it should be.
+        The first bytes are collected in `self._start` until they tell the encoding. Packed bytes are unpacked and read
+        by `self._inside`. UTF-16 is decoded by `self._decode`. Anything else is UTF-8 already.
 
         Raises:
-            ValueError: bytes that are those of no text.
+            ValueError: the bytes are no text.
         """
         if self._start is not None:
             self._start += data
@@ -69,9 +69,9 @@ class TextStream:
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
     def _begin_decoding(self, start: bytes) -> bytes:
-        """Choose how the bytes are read, by the first of them; return them without the mark of UTF-8.
+        """Choose how bytes are read, from the first of them; return these without UTF-8's byte order mark.
 
-        NO_TEXT: what files of other kinds begin with, and what they are; GZIP: what packed ones begin with.
+        NO_TEXT maps the first bytes of other kinds of files to the name of the kind. Packed files begin with GZIP.
         """
         for mark, kind in NO_TEXT.items():
             if start.startswith(mark):

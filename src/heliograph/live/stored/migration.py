@@ -63,7 +63,7 @@ def _find_mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
 
 
 def _list_numbers_by_path(tree: PyTree) -> dict[str, object]:
-    """Return {path of a tree's leaf: its numbers as nested lists}; of more than MOST numbers only how many they are."""
+    """Return {path of a tree's leaf: its numbers as nested lists, or their count if there are more than MOST}."""
     results: dict[str, object] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
@@ -84,13 +84,13 @@ class _ColumnCounter:
     """
 
     def __init__(self, covariances: bool):
-        """Begin at column 0; `covariances`: whether states hold covariances in place of their factors L and D."""
+        """Begin at column 0; `covariances`: whether states hold covariances instead of their factors L and D."""
         self._covariances = covariances
         self.filters: dict[str, dict[str, list[Any]]] = {}
         self.count = 0
 
     def number_parts(self, state: PyTree) -> dict[str, np.ndarray]:
-        """Return by path the column numbers of each array of a filter's state, in its shape, from `count` on."""
+        """Return {path of an array of a filter's state: its column numbers, in its shape}, from `count` on."""
         shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in split_by_path(state).items()}
         shapes = describe_old_layout(shapes) if self._covariances else shapes
         columns = {}
@@ -173,7 +173,7 @@ class PlantMigration:
             self._say(f"{what}: {line}")
 
     def _has_counterpart(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        """Return whether the filter of this name had a state before that can be read as its state now."""
+        """Return whether the stored state of the filter of this name can be read as its state now."""
         shapes_before = {path: shape for path, (shape, _, _) in self._old["filters"].get(name, {}).items()}
         shapes_now = {path: shape for path, (shape, _, _) in new.get(name, {}).items()}
         return can_read_layout(shapes_before, shapes_now)
@@ -181,7 +181,7 @@ class PlantMigration:
     def migrate(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
         """Return {name of a plant: its bytes as this network stores them}, from the bytes that are stored."""
         plants = {name: unpack_plant(name, self._translate_plant(body), self.fleet) for name, body in bodies.items()}
-        # All rows after the base are stepped with what the network is now.
+        # All rows after the base are stepped again, with the network as it is now.
         for plant in plants.values():
             plant.dirty = 1 if len(plant.rows.held) > 1 else None
         self.fleet.step(plants.values())
@@ -191,9 +191,9 @@ class PlantMigration:
         return results
 
     def migrate_outputs(self, rows: Float[np.ndarray, "row output"]) -> Float[np.ndarray, "row output"] | None:
-        """Return stored outputs with this network's columns; None where they are of other nodes or filters.
+        """Return stored outputs with this network's columns, or None if they are of other nodes or filters.
 
-        Before 0.3.0 outputs had no probabilities of modes: these become NaN.
+        Before 0.3.0, outputs had no probabilities of modes; these become NaN.
         """
         new_layout = json.loads(self.mine[DESCRIPTION])["layout"]
         if any(list(self._old[kind]) != list(new_layout[kind]) for kind in ("nodes", "filters")):
@@ -233,7 +233,7 @@ class PlantMigration:
         ).to_bytes()
 
     def _count_columns_before(self) -> int:
-        """Return how many columns the table of the other network, of which the state was saved, has.
+        """Return how many columns the table of the other network, whose state was saved, has.
 
         They are (state, outputs, inputs that hold, step number, measurements by node, inputs that came, time).
         """
@@ -241,15 +241,15 @@ class PlantMigration:
         return int(old["state"] + old["outputs"] + 2 * old["given"] + sum(old["nodes"].values()) + 2)
 
     def _select_rows(self, parts: PlantParts, index_here: Mapping[int, int]) -> list["_MovedRow"]:
-        """Return the rows that stay, in the order of their keys here; the row of a node that is gone goes with it.
+        """Return the rows that stay, in the order of their keys here; rows of nodes that are gone are left out.
 
-        First stands the base, or a row kept from before a leap and then the base: these stay in any case. `index_here`:
-        index of a node in this network, by that in the other one; -1 for the inputs.
+        The base always stays, and so does a row from before a leap, which stands before it. `index_here` maps a node's
+        index in the other network to its index in this one; -1 stands for the inputs.
         """
         joint, always_kept = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
         rows = []
         for i, (node, sequence) in enumerate(parts.keys.tolist()):
-            if i < always_kept or joint or node in index_here:  # joint: rows are of no single node
+            if i < always_kept or joint or node in index_here:  # joint rows are of several nodes
                 node_here = node if joint or node == BEFORE else index_here.get(node, BEFORE)
                 rows.append(_MovedRow(float(parts.table[i, -1]), node_here, sequence, i))
         return [*rows[:always_kept], *sorted(rows[always_kept:])]
@@ -257,13 +257,13 @@ class PlantMigration:
     def _translate_events(
         self, parts: PlantParts, rows: Sequence["_MovedRow"], index_here: Mapping[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the events of nodes and rows that stay: (row, node, count) of each, their times, and all their values.
+        """Return three arrays on the events that stay: their (row, node, count), their times, and all their values.
 
-        Shapes: (events, 3), (events,), and (numbers,), the values of one event after those of another. `rows` are the
-        rows that stay, `index_here` the index of a node in this network by that in the other one.
+        The shapes are (events, 3), (events,), and (numbers,), where events' values follow one another. `rows` are the
+        rows that stay. `index_here` maps a node's index in the other network to its index in this one.
         """
         row_here = {row.number_before: i for i, row in enumerate(rows)}
-        # An event of the inputs, node -1, has as many values as there are inputs; another as many as its node receives.
+        # An event of inputs (node -1) has as many values as there are inputs, any other as many as its node receives.
         received, stored = list(self._old["nodes"].values()), parts.events.tolist()
         sizes = [self._old["given"] if node < 0 else received[node] for _, node, _ in stored]
         values = np.split(parts.values, np.cumsum(sizes)[:-1]) if sizes else []
@@ -280,12 +280,12 @@ class PlantMigration:
 
         Args:
             table: rows of the other network, (row, column there).
-            index_here: index of a node in this network, by that in the other one; -1 for the inputs.
+            index_here: maps a node's index in the other network to its index in this one; -1 for the inputs.
         """
         old, pool = self._old, self.fleet.pool
         translated = np.zeros((len(table), pool.table.shape[1]))
         translated[:, pool.state] = self._translate_states(table)
-        # First columns there of the inputs held, of the step number, and of what was measured and given.
+        # The first columns there of the inputs that hold, of the step number, and of the measurements.
         held = old["state"] + old["outputs"]
         step = held + old["given"]
         measured = step + 1
@@ -314,9 +314,9 @@ class PlantMigration:
         return states
 
     def _translate_numbers(self, numbers_before: np.ndarray, index_here: Mapping[int, int]) -> np.ndarray:
-        """Return (row, measurements by node, inputs, time) in this network's order, NaN of nodes that were not there.
+        """Return (row, measurements by node, inputs, time) in this network's order; new nodes get NaN.
 
-        `numbers_before`: those of the other network (`_old`). `index_here`: a node's index here by that there.
+        `numbers_before` are those of the other network. `index_here` maps a node's index there to its index here.
         """
         network, measurement_count = self.fleet.network, self.fleet.program.received
         input_and_time_count = self._old["given"] + 1  # these come last in both, behind the measurements
@@ -379,14 +379,14 @@ def _list_changed_numbers(
     return [
         f"{name}{path}: {line}"
         for path in {**before, **after}
-        if not path.endswith(".factor")  # of a covariance, which is there too
+        if not path.endswith(".factor")  # the factor of a covariance that is also there
         and (same_version or (path in before and path in after))
         for line in _describe_changes(before.get(path), after.get(path))
     ]
 
 
 def _describe_changes(before: object, after: object) -> list[str]:
-    """Return lines on the change of a number or an array, entry by entry where the shape is the same; [] if none."""
+    """Return lines on the change of a number or array, entry by entry if the shape is the same; [] if it is equal."""
     if before == after:
         return []
     try:

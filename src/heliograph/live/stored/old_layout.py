@@ -22,7 +22,7 @@ Columns = Mapping[str, Mapping[str, Sequence[Any]]]  # by filter and path a part
 
 
 def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
-    """Return the parts of a state by the path of their attributes, in their order."""
+    """Return {path of a state's array, such as ".covariance": the array}, in the state's order."""
     return {
         jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]
     }
@@ -31,10 +31,10 @@ def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
 def can_read_layout(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`.
 
-    That is so if each part of `new` was there with its shape, or is a factor of a covariance that was there.
+    It can if each part of `new` is in `old` with the same shape, or is a factor of a covariance in `old`.
 
-    A part is known by its path, such as ".covariance" behind a stem; its factors are the parts LOWER (L below the
-    diagonal) and VARIANCES (D), of n (n - 1) / 2 and n numbers.
+    A part is known by its path: a stem and an ending such as ".covariance". A covariance's factors have the endings
+    LOWER (L below the diagonal, n (n - 1) / 2 numbers) and VARIANCES (D, n numbers).
     """
     shapes = {path: list(shape) for path, shape in old.items()}
     old_paths = _trace_paths(old, new)  # {new path of a part: its path in `old`, or the one that its factor would have}
@@ -45,9 +45,9 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
 
 
 def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states.
+    """Return the parts of a readable state under the paths `new`; shapes may have leading axes for several states.
 
-    A covariance of which only the factors are wanted, LOWER (L below the diagonal) and VARIANCES (D), is factorised.
+    A covariance is factorised if `new` has its factors instead: LOWER (L below the diagonal) and VARIANCES (D).
     """
     results, old_paths = dict(parts), _trace_paths(parts, new)
     for stem in _find_factored(parts, old_paths.values()):
@@ -56,9 +56,9 @@ def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[
 
 
 def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
-    """Return the layout that a state of the layout `new` had until version 0.3.0, in its order.
+    """Return the layout that a state of the layout `new` had before version 0.3.0, in its order.
 
-    Until then a covariance P stood where its factors stand now, L below the diagonal (LOWER) and D (VARIANCES).
+    A covariance P then stood in the place of its factors, L below the diagonal (LOWER) and D (VARIANCES).
     """
     results: dict[str, list[int]] = {}
     for path, shape in new.items():
@@ -122,19 +122,19 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
 def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFlag | None:
     """Add the columns of a filter's parts to `taken`, up to the first flag; return that flag, or None without one.
 
-    A flag is a boolean part. Old versions wrote its value, 0 or 1, where the number of its first column belongs, so
-    that its columns are lost. Parts of which the first columns are written as 0, 4, 1, 7, the third a flag with the
-    value 1, give the columns of the first two; the last, which begins behind the end of the second, has true columns,
-    and is taken as well.
+    A flag is a boolean part. Old versions wrote its value, 0 or 1, instead of the number of its first column, so that
+    its columns are lost. Example: the first columns of four parts are written as 0, 4, 1, 7, and the third is a flag
+    with the value 1. The columns of the first two are added. So are those of the last part, since it begins after the
+    end of the second.
 
     Args:
-        parts: of one filter, in their order.
-        end: end of the part before them, 0 if they are the filter's first.
-        taken: columns that are taken, to which those of the parts are added.
+        parts: the parts of one filter, in their order.
+        end: the end of the part before them, 0 if they are the filter's first.
+        taken: the columns that are taken; those of the parts are added.
     """
     for i, part in enumerate(parts):
         if _is_lost_flag(part, end, taken):
-            # A flag that comes first is of the memory of fusions, which stands behind all filters: so does its end.
+            # A flag that comes first belongs to the memory of fusions, which stands after all filters.
             end = end or sys.maxsize
             parts_after_flag = parts[i + 1 :]
             for later_part in parts_after_flag:
@@ -147,10 +147,10 @@ def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFl
 
 
 def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
-    """Return whether a part is a flag whose columns are lost, as its value, 0 or 1, stands for the first of them.
+    """Return whether a part is a flag whose columns are lost: its value, 0 or 1, stands for its first column.
 
-    No other part begins before the `end` of the part before it, or, if it is the filter's first (`end` is 0), at a
-    column that is `taken` by another filter.
+    Only such a part begins before the `end` of the previous part or, if it is the filter's first (`end` is 0), at a
+    column that another filter has `taken`.
     """
     if not part.columns:
         return False
@@ -160,13 +160,13 @@ def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
 
 
 def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the entries of L below its diagonal (..., n (n - 1) / 2), row by row, and of D (..., n), P = L D L'.
+    """Return the factors of P = L D L': L's entries below the diagonal (..., n (n - 1) / 2), row by row, and D (..., n).
 
-    By elimination of many covariances P (..., n, n) at once. A pivot of less than n eps of its variance is rounding,
-    and is set to that.
+    Many covariances P (..., n, n) are eliminated at once. A pivot below n eps times its variance is rounding, and is
+    set to this bound.
     """
     n = covariance.shape[-1]
-    # What remains of P once the columns before j are eliminated, and the diagonal of P itself.
+    # `remainder` is what is left of P after the columns before j are eliminated.
     remainder, diagonal_of_P = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
     L, D = np.zeros_like(remainder), np.zeros_like(diagonal_of_P)
     for j in range(n):
@@ -191,9 +191,9 @@ def _flatten_path(path: str) -> str:
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
-    """Return the paths, without '.covariance', of covariances in `old` of which `new` has the factors instead.
+    """Return the stems (paths without '.covariance') of covariances in `old` whose factors are in `new` instead.
 
-    LOWER and VARIANCES end the paths of its factors, L below the diagonal and D.
+    The paths of the factors end with LOWER (L below the diagonal) and VARIANCES (D).
     """
     before, now = set(old), set(new)
     stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]

@@ -113,11 +113,11 @@ def _pack_parts(head: dict[str, Any], *flat_arrays: Sequence[float] | np.ndarray
 
 
 def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
-    """Read a table of `size` numbers, most of them 0, from offset `at` of `data`; return it, and where it ends.
+    """Read a table of `size` numbers, most of them 0, from byte `at` of `data`; return it and the byte after it.
 
-    First stands a bit for each number, 1 where it is stored, then the `kept` numbers that are.
+    First there is a bit for each number, 1 if it is stored, and then the `kept` numbers that are stored.
     """
-    byte_count = (size + 7) // 8  # of `size` bits, rounded up
+    byte_count = (size + 7) // 8  # bytes that hold `size` bits
     values_begin = at + byte_count
     bits = np.frombuffer(data, np.uint8, byte_count, at)
     values = np.frombuffer(data, "<f8", kept, values_begin)
@@ -155,7 +155,7 @@ def _make_rows_with_events(parts: PlantParts, fleet: Fleet) -> list[HeldRow]:
         _make_held_row(fleet, numbers, node, sequence)
         for numbers, (node, sequence) in zip(parts.table, parts.keys.tolist(), strict=True)
     ]
-    # The values of all events stand one after another, as many of each as its node sends.
+    # The values of all events follow one another; each has as many as its node sends.
     begin = 0
     for time, (i, node, sequence) in zip(parts.times.tolist(), parts.events.tolist(), strict=True):
         end = begin + fleet.count_values(node)
@@ -170,9 +170,9 @@ def _pack_leap(leap: ClockLeap) -> dict[str, Any]:
 
 
 def _unpack_leap(packed: Any) -> ClockLeap:
-    """Return the leap in time that `_pack_leap` packed as a dict of its fields.
+    """Return the leap in time that `_pack_leap` packed as a dictionary of its fields.
 
-    A version until 0.3.0 wrote a list: its time, the arrival before it, and five numbers of each node.
+    Versions up to 0.3.0 wrote a list: its time, the arrival before it, and five numbers of each node.
     """
     if isinstance(packed, list):
         time, now, links = packed

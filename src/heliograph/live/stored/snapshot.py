@@ -55,7 +55,7 @@ def check_same_network(
         mine: identity of what is here.
         other: identity of what was saved.
         kept: names of entries that have to be the same even if changes are accepted.
-        accept: whether changes of other entries are accepted; where they are not and would do, the error advises it.
+        accept: whether changes of other entries are accepted. If they are not but would suffice, the error advises it.
     """
     differing = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
     may_be_accepted = not any(name in kept for name in differing)
@@ -71,10 +71,7 @@ HEAD = "head"
 
 
 def pack_snapshot(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return a head and arrays as bytes.
-
-    The head is JSON, under the name HEAD among the arrays of an NPZ file.
-    """
+    """Return a head and arrays as the bytes of an NPZ file; the head is JSON, stored as the array HEAD."""
     file = BytesIO()
     json_bytes = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
     np.savez(file, allow_pickle=False, **{HEAD: json_bytes, **arrays})

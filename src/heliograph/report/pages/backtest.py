@@ -39,9 +39,9 @@ class CoverageMiss:
         return self.score.coverage[self.level].value - CLAIMED[self.level]
 
     def describe(self) -> str:
-        """Return in words which interval held what share of what came, and what that says of the forecast.
+        """Return in words what share of the values an interval held, and what this says of the forecast.
 
-        `self.level`: index among the intervals of SHARES; `self.excess`: share held less the share that it claims.
+        `self.level` is the interval's index in SHARES, and `self.excess` the share that it held minus that it claims.
         """
         score, claim, share = self.score, SHARES[self.level], self.score.coverage[self.level]
         verdict = "too sure" if self.excess < 0 else "too cautious"
@@ -66,7 +66,7 @@ class FilterVerdict:
         return "are off" if any(miss.excess < 0 for miss in self.misses) else "are too cautious"
 
     def describe(self) -> str:
-        """Return what its forecasts are worth, with numbers, and with the interval that is furthest off."""
+        """Return a sentence on what the filter's forecasts are worth, with numbers and the interval furthest off."""
         if not self.misses:
             return f"{self.name}: all {self.compared} intervals held what they claim, as far as chance lets tell."
         worst = max(self.misses, key=lambda miss: abs(miss.excess))
@@ -90,9 +90,10 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
 
 
 def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
-    """Return the verdict on each filter by its intervals and what came, the largest share of misses first.
+    """Return the verdict on each filter's forecast intervals, the filter with the largest share of misses first.
 
-    An interval misses whose share held is more than FAR, 3, standard errors off the share that it claims (SHARES).
+    An interval claims to hold a share (SHARES) of what comes. It misses if the share that it held is more than FAR (3)
+    standard errors off.
     """
     verdicts = []
     for name in dict.fromkeys(f"{score.node}/{score.filter}" for score in found.scores):
@@ -179,9 +180,9 @@ def make_backtest_page(
 
 
 def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
-    """Return the result in a line: of two filters what the forecasts of each are worth, of more how many hold.
+    """Return the result in a line: what the forecasts of one or two filters are worth, or how many of more hold.
 
-    Verdicts come with the most doubtful first; the line has it last.
+    The most doubtful verdict comes first, and is last in the line.
     """
     if len(verdicts) > 2:
         count = sum(not verdict.misses for verdict in verdicts)
@@ -192,7 +193,7 @@ def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
     """Return all scores, a row for each forecast and horizon, with their standard errors."""
-    # Of the RMSE, a root, the standard error is that of the mean square over twice the root.
+    # The RMSE is a root, so its standard error is that of the mean square divided by twice the root.
     rows = [
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",
          round_to(s.rmse, s.mse.error / (2 * s.rmse) if s.rmse > 0 else np.nan),
@@ -209,7 +210,7 @@ def _list_all_numbers(found: "heliograph.forecasting.Backtest") -> dict[str, Jso
     """Return all numbers of the backtest for its summary."""
 
     def convert_to_json(value: object) -> Json:
-        """Return texts and whole numbers as they are, finite numbers as floats, None for all else."""
+        """Return texts and integers as they are, finite numbers as floats, and None for everything else."""
         if isinstance(value, str | int):
             return value
         return float(value) if isinstance(value, float) and np.isfinite(value) else None

@@ -93,7 +93,10 @@ def make_design_summary(results: DesignResults) -> dict[str, Json]:
 
 
 def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
-    """Return by file name the figures of the front (least error by total power), the powers, and any map of places."""
+    """Return figures by file name: the front (least error by total power), the powers, and the map if there is one.
+
+    `results.before` holds the powers of the network before the design.
+    """
     design = results.design
     figures = {"front": draw_pareto_front(results.front, {"this design": (design.total, design.error)})}
     figures["powers"] = draw_powers(results.before, compute_mean_powers(design))
@@ -175,7 +178,7 @@ def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> P
 
 
 def _make_headline(results: DesignResults) -> str:
-    """Return the title: by how much the design's error and total power are less, or more, than the network's now."""
+    """Return the title: how much less or more error and total power the design has than the network as it is."""
     design, power_now = results.design, sum(results.before.values())
     changes = []
     for what, designed, present in (("error", design.error, design.present), ("power", design.total, power_now)):
@@ -186,7 +189,7 @@ def _make_headline(results: DesignResults) -> str:
 
 
 def _make_result_section(results: DesignResults) -> Section:
-    """Return the error and power of the design, beside those of the network as it is, and its certificate.
+    """Return the section on the design's error and power, beside those of the present network, and its certificate.
 
     The certificate is a proven bound: no design has a smaller error.
     """
@@ -235,7 +238,7 @@ def _make_map_section(drawings: Mapping[str, bytes]) -> Section:
 def _make_changes_section(results: DesignResults) -> Section:
     """Return the section on what one more transmitter, relay or place would save."""
     unit = results.design.certificate.unit
-    # The search finds the error to about a thousandth: a saving is shown to two digits of that.
+    # The search finds the error to about a thousandth, so a saving is rounded to two digits of that.
     rows = [
         [visible(change.name), f"{change.value:.4g}", round_to(change.saved, 1e-3 * change.value)]
         for change in results.changes

@@ -53,7 +53,7 @@ class ExploredTable:
 
 
 def make_explorable_page_html(page: Page, tables: Sequence[ExploredTable]) -> str:
-    """Return the page with tables to explore before its sections, as HTML that loads nothing else."""
+    """Return the HTML of a page with tables to explore before its sections; it loads no other file."""
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (
         make_template_environment()

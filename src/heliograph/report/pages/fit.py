@@ -65,10 +65,10 @@ class FitResults:
 
 
 def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
-    """Return figures by file name: estimates; correlations of innovations before and after the fit; PITs.
+    """Return figures by file name: estimates, correlations of innovations before and after the fit, and PITs.
 
-    PITs, probability integral transforms of what was received, are uniform where the network is right. At most MOST
-    filters are in a figure.
+    PITs are probability integral transforms of what was received. They are uniform if the network is right. A figure
+    has at most MOST filters.
     """
     figures = {"estimates": _draw_estimates(learned)}
     with_tests = [change for change in learned.changes if change.before.test and change.after.test]
@@ -197,9 +197,9 @@ def _summarise_gain(learned: FitResults) -> str:
 
 
 def _list_key_figures(learned: FitResults) -> list[KeyFigures]:
-    """Return the numbers to remember: how many were learned, from how many rows, and the gain of the first filter.
+    """Return the key figures: how many numbers were learned, from how many rows, and the gain of the first filter.
 
-    A gain is how much the fit raises the log-likelihood of a row that it was not fitted to; None where there is none.
+    A gain is by how much the fit raises the log-likelihood of a held-out row, None if there are no such rows.
     """
     identified = [row for row in learned.fit.rows() if row.identified]
     keys = [

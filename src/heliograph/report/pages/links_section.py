@@ -66,14 +66,15 @@ def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Tab
 
 
 def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
-    """Return a link's cells in the table: name, when due, share arrived, longest gap, silences, what is stated, values.
+    """Return a link's cells in the table: name, when due, share arrived, longest gap, silences, statement, values.
 
-    `health.silences`: by node the rows in which it was silent past its timeout; a column only where there are any.
+    `health.silences` holds for each node the rows in which it was silent past its timeout. The table has a column of
+    silences only if there are any.
     """
     mean, deviation = _format_mean_and_deviation(link.values)
     name = visible(f"{link.node}: {link.component}")
     gap = "–" if link.due is None else str(link.longest_gap)
-    silence_cells: list[str] = []  # of a column that is there if any sender was silent past its timeout
+    silence_cells: list[str] = []  # no cell if no sender was silent past its timeout
     if health.silences:
         silences = health.silences.get(link.node)
         silence_cells = ["–" if silences is None else f"{len(silences.rows)}, up to {silences.lengths.max():g}"]
@@ -103,7 +104,7 @@ def _list_refused(health: Health) -> list[Table]:
 
 
 def _caption_deliveries(health: Health) -> str:
-    """Return the caption of the figure of deliveries: what its marks mean, of those marks that it has."""
+    """Return the caption of the figure of deliveries, which explains the marks that the figure has."""
     arrived = any(link.arrived.any() for link in health.links)
     lost = any(len(link.lost_times) for link in health.links)
     if arrived and lost:
@@ -121,9 +122,10 @@ def _format_share(link: Arrivals, form: str, unknown: str) -> str:
 
 
 def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
-    """Return mean and standard deviation of values, each to two digits of its standard error; "–" if unknown.
+    """Return the mean and the standard deviation of values, each to two digits of its standard error; "–" if unknown.
 
-    For N independent values of a normal law these are s / sqrt(N) of the mean and s / sqrt(2 N) of the deviation s.
+    For N independent normal values, the standard error of the mean is s / sqrt(N), and that of their deviation s is
+    s / sqrt(2 N).
     """
     if len(values) == 0:
         return "–", "–"
@@ -136,7 +138,7 @@ def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
 
 
 def describe_shared_links(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
-    """Return what nodes share as a sentence each; nothing where their links are independent."""
+    """Return a sentence for each state that nodes' links share; [] if all links are independent."""
     sentences = [
         f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
         for name, nodes in shared.items()

@@ -26,9 +26,9 @@ PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 
 def draw_predicted_figures(health: Health) -> dict[str, Figure]:
-    """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for.
+    """Return {file name: figure} of predictions by node and of residuals by filter; {} unless asked for.
 
-    At most MOST of each are drawn. A row is predicted from those before it; residuals are what was not predicted.
+    At most MOST of each are drawn. Each row is predicted from earlier rows. Residuals are what was not predicted.
     """
     nodes = _list_predicting_nodes(health)[:MOST]
     figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(nodes)}

@@ -61,11 +61,11 @@ def make_run_results(health: Health, network: str) -> ResultsContent:
 
 
 def make_results_of_plants(examined: Mapping[str, Health], network: str) -> ResultsContent:
-    """Return the results of several plants: an overview, the most doubted first, and beside it a folder for each."""
+    """Return the results of several plants: an overview, with the most doubted plants first, and a folder for each."""
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
     def write(folder: Path) -> None:
-        """Write the results of each plant of `examined` into a folder of its own, named as `folders` has it."""
+        """Write the results of each plant in `examined` into a folder of its own, whose name is in `folders`."""
         for plant, health in examined.items():
             subfolder = folder / folders[plant]
             subfolder.mkdir()
@@ -147,10 +147,10 @@ def _sort_nodes(record: Record) -> list[str]:
 
 @matplotlib.rc_context(LOOK)
 def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
-    """Draw a node's estimates with their bands of BAND deviations, one panel a state, and its forecasts behind them.
+    """Draw a node's estimates with bands of BAND deviations, in one panel for each state, and then its forecasts.
 
-    `record`: the rows to draw, all of `health` or a part; only that of all has forecasts. Of more filters than there
-    are COLOURS the first are drawn.
+    `record` holds the rows to draw. Forecasts are drawn only if these are all rows of `health`. There are at most as
+    many filters as COLOURS.
     """
     figure, grid = make_stacked_panels(len(record.states), 1.7, 0.8)
     names = list(record.estimates[node])[: len(COLOURS)]
@@ -201,7 +201,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
 
 
 def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
-    """Return the numbers to remember: rows, the share that arrived of what was due, and how many doubts there are."""
+    """Return the key figures: the number of rows, the share of due messages that arrived, and the number of doubts."""
     record = health.record
     shares = [link.share for link in health.links if link.due is not None]
     arrived = f"{np.mean(shares):.1%}" if shares else "–"
@@ -218,7 +218,7 @@ def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
 def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
     """Return the drawings that together have at most `limit` bytes, those named in FIRST before others.
 
-    One that does not fit is left out, and smaller ones behind it may fit. In a page, as text, all take 4/3 of that.
+    A drawing that does not fit is left out, and smaller ones after it may fit. As text in a page they take 4/3 of this.
     """
     fitting, total = dict[str, bytes](), 0
     for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):
@@ -331,7 +331,7 @@ def _describe_span(record: Record) -> str:
 
 
 def _list_doubts(doubts: list[str]) -> list[Points | Text]:
-    """Return the first DOUBTS (3) of the doubts, which come by weight, and a line on where the others are."""
+    """Return the first DOUBTS (3) of the doubts, the weightiest first, and a line on where the others are."""
     if not doubts:
         return [Text(["No doubts."])]
     first_doubts = Points([visible(line) for line in doubts[:DOUBTS]])
@@ -342,7 +342,7 @@ def _list_doubts(doubts: list[str]) -> list[Points | Text]:
 
 
 def _list_baseline_remarks(health: Health) -> list[Text | Points]:
-    """Return the doubts about filters that are there to be compared with (baselines): no doubts of the network."""
+    """Return the doubts about baselines, filters for comparison; they are no doubts about the network."""
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
@@ -355,9 +355,9 @@ def _list_filters_of_other_worlds(health: Health) -> list[Text | Points]:
 
 
 def _describe_overloads(record: Record) -> list[Text | Points]:
-    """Return how often the words (quantised measurements) that filters take will be overloaded, before any data.
+    """Return sentences on how often words (quantised measurements) will be overloaded, as computed before any data.
 
-    A word is overloaded where what it says lies beyond the ends of its range.
+    A word is overloaded if the measured value lies beyond the ends of its range.
     """
     lines = [
         visible(overload.describe(node, name))

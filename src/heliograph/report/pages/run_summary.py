@@ -51,7 +51,7 @@ def run_summary(health: Health) -> dict[str, Json]:
 
 
 def _list_refused(health: Health) -> list[Json]:
-    """Return what was refused, with a count and a reason: values by node, filter and component; messages by node."""
+    """Return refusals with counts and reasons: values by node, filter and component, and messages by node."""
     readings: list[Json] = [dict(vars(refusal)) for refusal in health.record.refusals]
     return readings + [
         {"node": node, "reason": reason, "count": count}
@@ -81,7 +81,7 @@ def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
 
 
 def _list_error_numbers(record: Record) -> dict[str, dict[str, Json]]:
-    """Return RMSE by state and NEES of each filter, by node and filter; nothing where the truth is not known."""
+    """Return {node: {filter: its RMSE by state, and its NEES}}, or {} if the truth is not known."""
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in compute_filter_errors(record):
         nees = None if np.isnan(of_filter.nees) else of_filter.nees
@@ -96,7 +96,7 @@ def _list_overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[s
 
 
 def _list_link_numbers(link: Arrivals) -> dict[str, Json]:
-    """Return by name what share of a component's messages arrived, its longest gap, and when it is due."""
+    """Return numbers on a component's messages: the share that arrived, the longest gap, and when they are due."""
     numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
     if link.period is not None:
         numbers["period"] = link.period

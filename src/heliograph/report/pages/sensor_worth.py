@@ -18,9 +18,10 @@ SPARE, ROOM = 0.05, 0.2  # share of the axis left free before all bars, and behi
 
 @matplotlib.rc_context(STYLE)
 def draw_worth(worth: SensorWorth, title: str) -> Figure:
-    """Draw a panel for each state with a bar for each case: its error over that of all nodes, on a logarithmic axis.
+    """Draw a panel for each state with a bar for each case: the case's error over the error with all nodes.
 
-    A bar to the right of 1 is of a larger error, as without a node; one to the left of a smaller one, as with one more.
+    The axis is logarithmic. A bar to the right of 1 is a larger error, such as without a node. A bar to the left is a
+    smaller error, such as with one more node.
 
     Args:
         worth: errors with all nodes and in each case, at least one.
@@ -63,7 +64,7 @@ def _draw_bars_of_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[fl
 def _scale_axis(axes: Axes, limits: tuple[float, float]) -> None:
     """Make the axis of factors logarithmic between these limits, with ticks at plain numbers.
 
-    Where the limits are less than NARROW, 4, times apart, ticks are evenly spaced: few powers would lie between.
+    If the limits' ratio is below NARROW (4), ticks are evenly spaced, since few powers would lie between them.
     """
     low, high = limits
     axes.set_xscale("log")
@@ -75,9 +76,9 @@ def _scale_axis(axes: Axes, limits: tuple[float, float]) -> None:
 
 
 def _find_limits(worth: SensorWorth) -> tuple[float, float]:
-    """Return the ends of the axis of all panels: a little beyond all bars, with room for their numbers.
+    """Return the ends of all panels' axes, a little beyond the bars and with room for their numbers.
 
-    Bars begin at 1 and end at a factor `increase`; SPARE and ROOM are shares of their span in logarithms.
+    A bar goes from 1 to the factor `increase`. SPARE and ROOM are shares of the bars' span, in logarithms.
     """
     increases = np.array([case.increase for case in worth.cases])
     ends_of_bars = np.append(increases[np.isfinite(increases) & (increases > 0)], 1.0)

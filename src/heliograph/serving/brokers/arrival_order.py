@@ -38,13 +38,13 @@ class ArrivalOrder:
     def __init__(self, source: str, steps: bool) -> None:
         """Begin without messages; the class says what the arguments are."""
         self._source, self._steps = source, steps
-        self._held = list[HeldPayload]()  # a heap
-        self._count, self._last = 0, float("-inf")  # of all payloads so far; moment of the newest
+        self._held = list[HeldPayload]()  # a heap, ordered by moment and then by count
+        self._count, self._last = 0, float("-inf")  # how many payloads came so far; the moment of the newest
 
     def add_messages(self, payloads: Sequence[Payload]) -> list[Payload]:
-        """Take messages; return the earliest of those that wait, as many as are more than HELD.
+        """Add messages to those that wait; return the earliest ones, so that at most HELD still wait.
 
-        A heap orders them by moment, and by their count where moments are equal.
+        A heap orders messages by moment, and by count if moments are equal.
         """
         results = list[Payload]()
         for payload in payloads:
@@ -58,8 +58,11 @@ class ArrivalOrder:
         return results
 
     def take_rest(self) -> list[Payload]:
-        """Return all messages that still wait, in order; refuse those whose clock was never set, if all still wait."""
-        if self._count == len(self._held):  # all are here, so that times can be compared with all others
+        """Return all messages that still wait, in order.
+
+        If no message was returned before, messages whose clock was never set are refused.
+        """
+        if self._count == len(self._held):  # all messages are here, so that their times can be compared
             self._refuse_unset_times()
         return [heappop(self._held).payload for _ in range(len(self._held))]
 
@@ -83,9 +86,10 @@ class ArrivalOrder:
                 self._held[self._held.index(entry)] = entry._replace(payload=error)
 
     def _find_moment(self, payload: Payload) -> float:
-        """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before.
+        """Return when a payload arrived, or if that is not known when it was measured.
 
-        In seconds since 1970, or as the number that it has.
+        The moment is in seconds since 1970, or the number that the message has. A payload that is no message gets the
+        moment of the previous payload.
         """
         message = payload.read if isinstance(payload, UnreadMessage) else payload
         if not isinstance(message, Message | NumberedMessage):

@@ -42,10 +42,10 @@ class Address:
         return f"{self.kind}{'+tls' if self.secure else ''}://{self.host}:{self.port}/{self.topic}"
 
     def tls(self) -> ssl.SSLContext | None:
-        """Return the TLS context, with the system's authorities or those of the file SSL_CERT_FILE; None if not secure.
+        """Return the TLS context, or None if the connection is not secure.
 
-        A client certificate is read from the files that HELIOGRAPH_BROKER_CERTIFICATE (here CERTIFICATE) and
-        HELIOGRAPH_BROKER_KEY (KEY) name.
+        Authorities are the system's, or those in the file SSL_CERT_FILE. A client certificate is read from the files
+        that the variables HELIOGRAPH_BROKER_CERTIFICATE (CERTIFICATE) and HELIOGRAPH_BROKER_KEY (KEY) name.
         """
         if not self.secure:
             return None
@@ -98,7 +98,7 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
 
 
 def _check_topic(topic: str) -> str:
-    """Return a topic if its words are valid in MQTT and NATS, whose topics have dots and wildcards; else ValueError."""
+    """Return a topic; raise ValueError if it has a character with a meaning in MQTT or NATS (dots, wildcards)."""
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)
     return topic

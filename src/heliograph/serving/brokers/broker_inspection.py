@@ -20,7 +20,7 @@ def listen(address: Address, seconds: float) -> dict[str, TopicStatistics]:
         seconds: how long to listen.
 
     Raises:
-        ValueError: no connection; one line that names the broker.
+        ValueError: there is no connection. The error names the broker.
     """
     topics: dict[str, TopicStatistics] = {}
     if address.kind == "opc.tcp":
@@ -55,7 +55,7 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, TopicStatis
     answered, refusals = threading.Event(), list[str]()
 
     def subscribe(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
-        """Ask for all topics ("#") once connected, or note why the broker refuses; set `answered` in any case."""
+        """Subscribe to all topics ("#") once connected, or note why the broker refuses; then set `answered`."""
         if code.is_failure:
             refusals.append(str(code))
         else:

@@ -72,13 +72,13 @@ class LineReader:
         self._order = None if path is None else ArrivalOrder(self.source, TIME_STEP not in network.inputs)
 
     def read(self, lines: Sequence[bytes]) -> list[Payload]:
-        """Return the messages of lines, which are not empty; those of a file may be held back until earlier ones came.
+        """Return the messages of non-empty lines; messages of a file may wait until earlier ones have come.
 
         Raises:
-            ValueError: a table whose header names no columns, or others than expected; one line.
+            ValueError: the header of a table names no columns, or other columns than expected.
         """
         payloads, rows = list[Payload](), list[str]()
-        # Whether it is a table is not known (None) until a line names columns; then all that follow are its rows.
+        # `_is_table` is None until a line names columns. Then all lines after it are rows of a table.
         for line in lines:
             if self._is_table is None:
                 self._is_table = self._table.names_columns(_decode_line(line)) or None
@@ -91,9 +91,9 @@ class LineReader:
         return payloads if self._order is None else self._order.add_messages(payloads)
 
     def end(self) -> list[Payload]:
-        """Return the messages that are left when no more lines come: of a table or an unfinished document.
+        """Return the messages that are left when no more lines come: of a table or of an unfinished document.
 
-        With those of a file that waited for earlier ones (`_order`).
+        Messages of a file that waited for earlier ones (in `_order`) are returned too.
         """
         if self._is_table:
             last = self._table.end()
@@ -126,7 +126,7 @@ class LineReader:
         with suppress(InputError):
             messages = parse_message_document(b"\n".join(lines), self.source)
             return [payload for message in messages for payload in self._interpret_message(message, None)]
-        # No document: each line is read and counted (`_number`) again, as none of a table.
+        # The lines are no document. Read each by itself, and count it (`_number`) again; it is no row of a table.
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()
         for line in lines:
@@ -161,9 +161,9 @@ class LineReader:
 
 
 def redirected_file(descriptor: int) -> Path | None:
-    """Return the path of the file that a descriptor reads, where the system says it; None of a pipe.
+    """Return the path of the file that a descriptor reads, or None for a pipe or if the system does not tell it.
 
-    Relative to the working directory if the file is below it.
+    The path is relative to the working directory if the file is below it.
     """
     with suppress(OSError):
         if stat.S_ISREG(os.fstat(descriptor).st_mode):

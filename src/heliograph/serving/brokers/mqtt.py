@@ -35,12 +35,12 @@ class Mqtt:
     """
 
     def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
-        """Connect to the broker at `address`, to read a part of the plants' messages and to write outputs.
+        """Connect to the broker at `address` in order to read a part of the plants' messages and to write outputs.
 
         Args:
-            address: of the broker, with the topic.
+            address: the broker's address, with the topic.
             part: which of the equal parts of the plants is read; all plants by default.
-            translator: translates messages of the sources' topics to our own; none by default.
+            translator: translates messages of the sources' topics to heliograph's own form; None by default.
         """
         self.address = address
         self._reader, self._writer = _Reader(address, part, translator), _Writer(address)
@@ -99,14 +99,14 @@ class Connection:
             LOG.warning("%s: the connection ended, %s; trying again", self.address, code)
 
     def failed(self, client: Client, data: object) -> None:
-        """Log why no connection came about: nobody answers at the address, or nobody whose certificate is trusted."""
+        """Log why there is no connection: nobody answers at the address, or the certificate is not trusted."""
         if self.open:
-            # The client calls this where it caught the exception.
+            # The client calls this method while it handles the exception.
             LOG.warning("%s: %s; trying again", self.address, explain_failure(sys.exc_info()[1]))
 
     def close(self) -> None:
         """End the connection, and its thread."""
-        with self.changed:  # wakes what waits for the broker or for room
+        with self.changed:  # wakes threads that wait for the broker or for room
             self.open = False
             self.changed.notify_all()
         self.client.disconnect()
@@ -125,7 +125,7 @@ class _Reader(Connection):
     """Connection that receives messages and holds them until `receive` takes them."""
 
     def __init__(self, address: Address, part: Part, translator: Translator | None):
-        """Connect, to read the messages of one part of the plants, and topics of the translator's sources, if any."""
+        """Connect, in order to read one part of the plants' messages, and the topics of the translator's sources."""
         super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
         self._topics_below = f"{part.number}/#" if part.of > 1 else "#"
         self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()
@@ -155,7 +155,7 @@ class _Reader(Connection):
     def _take_held(self) -> list[HeldMessage]:
         """Return at most MOST of the messages that are held, the oldest first.
 
-        The client's thread, which waits while too many are held, may then add others.
+        The client's thread waits while too many messages are held. It may then add others.
         """
         with self.changed:
             batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
@@ -165,7 +165,7 @@ class _Reader(Connection):
         return batch
 
     def _read_payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
-        """Return a message in our own form, below `_prefix`, as it is; of another topic what the sources read in it."""
+        """Return a message below `_prefix` as it is; for any other topic, return what the sources read in it."""
         if self._translator is None or message.topic.startswith(self._prefix):
             return [bytes(message.payload)]
         return self._translator.read(message.topic, bytes(message.payload), arrival, message.retain)
@@ -180,7 +180,7 @@ class _Reader(Connection):
                 self.client.ack(held.message.mid, held.message.qos)
 
     def _hold_message(self, client: Client, data: object, message: MQTTMessage) -> None:
-        """Hold a message, with its connection and time; while HELD are, block the client's thread: it reads no more."""
+        """Hold a message with its connection and time; while HELD are held, block the client's thread from reading."""
         with self.changed:
             self.changed.wait_for(lambda: len(self._held) < HELD or not self.open)
             self._held.append(HeldMessage(self._connection, message, datetime.now(UTC)))
@@ -200,7 +200,7 @@ class _Reader(Connection):
     def disconnected(
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
     ) -> None:
-        """Count the end of the connection: what was received before can no longer be acknowledged."""
+        """Count the end of the connection: messages that came in it can no longer be acknowledged."""
         super().disconnected(client, data, flags, code, more)
         self._connection += 1
 
@@ -209,17 +209,17 @@ class _Writer(Connection):
     """Connection that publishes outputs."""
 
     def __init__(self, address: Address):
-        """Connect to the broker in a session of no name; what the broker confirms is noted from now on."""
+        """Connect to the broker in a session without a name, and note from now on what the broker confirms."""
         super().__init__(address, "")
-        self._delivered: set[int] = set()  # numbers of what the broker has
+        self._delivered: set[int] = set()  # numbers of messages that the broker has confirmed
         self.client.on_publish = self._note_received
         self.start()
 
     def publish(self, outputs: Sequence[Output]) -> None:
-        """Publish outputs; return when the broker has all that have a number. A provisional estimate may be lost."""
+        """Publish outputs, and return when the broker has confirmed all numbered ones; provisional ones may be lost."""
         to_confirm = set()
         for output in outputs:
-            # With quality of service 0 a message is sent once, and nobody says whether it came.
+            # With quality of service 0, a message is sent once and not confirmed.
             quality = 0 if output.kind == "provisional" else AT_LEAST_ONCE
             message = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
             if output.number is not None:

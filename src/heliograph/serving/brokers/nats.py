@@ -59,7 +59,7 @@ class Nats:
     """
 
     def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
-        """Prepare to serve one part of the plants through the server at an address; the first call connects."""
+        """Prepare to serve one part of the plants through the server at `address`; the first call connects."""
         self.address, self.part, self._translator = address, part, translator
         self.topic = address.topic.replace("/", ".")
         self.stream = self.topic.replace(".", "-")
@@ -67,7 +67,7 @@ class Nats:
         self._client = Client()
         self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None
-        # Name of the consumer, how many messages it has sent, and the number in the stream of the last acknowledged.
+        # The consumer's name, how many of its messages were read, and the number of the last acknowledged message.
         self._name, self._read, self._acknowledged = "", 0, 0
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
 
@@ -98,10 +98,10 @@ class Nats:
         return messages
 
     def _has_gap(self, messages: Sequence[Msg]) -> bool:
-        """Return whether messages were lost on the way before the last of these; else count them as read.
+        """Return whether messages were lost on the way; if not, count these as read.
 
-        The consumer, the server's side of a reader, counts what it sends. After a gap a new reader (None) reads all
-        again from the last message that was acknowledged.
+        The consumer, which is the server's side of a reader, counts what it sends. After a gap the reader is dropped
+        (None), and a new one reads everything again from the last acknowledged message.
         """
         count = messages[-1].metadata.sequence.consumer
         if count != self._read + len(messages):
@@ -111,9 +111,9 @@ class Nats:
         return False
 
     def _read_payloads(self, message: Msg) -> Sequence[Payload]:
-        """Return a message in our own form as it is, and of another subject what the sources read in it.
+        """Return a message in heliograph's own form as it is; for other subjects, return what the sources read in it.
 
-        In sources a subject is written as a topic, with / in place of dots.
+        Sources write a subject as a topic, with / in place of dots.
         """
         if self._translator is None or message.subject.startswith(f"{self.topic}.in."):
             return [message.data]
@@ -238,9 +238,10 @@ class Nats:
         return self._reader
 
     def _configure_consumer(self) -> ConsumerConfig:
-        """Return settings of the consumer: this part's messages in order, from the first that was not acknowledged.
+        """Return the consumer's settings: it sends this part's messages in order, after the last acknowledged one.
 
-        Acknowledging one acknowledges all before it. The one process of all parts also reads the sources' subjects.
+        To acknowledge a message also acknowledges all before it. A process that serves all plants also reads the
+        sources' subjects.
         """
         return ConsumerConfig(
             durable_name=self._name,

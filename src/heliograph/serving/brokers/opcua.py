@@ -43,15 +43,15 @@ class Reporting(NamedTuple):
     interval: float
 
     def trigger(self, heartbeat: int | None = None) -> SendOnDelta:
-        """Return when a node sends, as the server does, for `hg.Node(..., trigger=...)`: at changes of the deadband.
+        """Return the trigger of a node, `hg.Node(..., trigger=...)`, that sends as the server does.
 
-        A step is a sampling interval of the server.
+        The server sends a value when it has changed by the deadband. A step is a sampling interval of the server.
 
         Args:
-            heartbeat: steps after which a value is sent in any case; None for never.
+            heartbeat: number of steps after which a value is sent in any case; None for never.
 
         Raises:
-            ValueError: a server that states no deadband.
+            ValueError: the server states no deadband.
         """
         if self.deadband <= 0:
             raise fail("deadband of the server", "a positive number", self.deadband)
@@ -127,12 +127,12 @@ class OpcUa:
     """
 
     def __init__(self, address: Address, translator: Translator, target: int = 1):
-        """Prepare to read a server's variables by a translator's sources; outputs go to file descriptor `target`."""
+        """Prepare to read the server's variables that the sources name; outputs go to the file descriptor `target`."""
         self.address, self._translator = address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(address))
         self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()  # messages of each change, not yet received
         self._client: Client | None = None
-        self._first: set[str] = set()  # variables of which the first value is still to come
+        self._first: set[str] = set()  # variables whose first value has not come yet
         self.reporting: dict[str, Reporting] = {}  # deadband and interval by variable
 
     async def receive(self) -> Batch | None:
@@ -159,9 +159,9 @@ class OpcUa:
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Put a change of a variable into the queue, as messages.
 
-        Its first value was there before: it counts as stored, as one that a broker had kept.
+        The first value of a variable existed before, so it counts as a message that a broker had stored.
 
-        `val`: the new value; `data`: its dates and its quality.
+        `val`: the new value. `data`: its dates and quality.
         """
         topic, body = _translate_change(node, val, data)
         was_stored = topic in self._first
@@ -226,7 +226,7 @@ class Listener:
             topic.kind = self.kinds[name]
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Note a change in the statistics of its topic; of a variable's first value, which may be old, no times."""
+        """Note a change in its topic's statistics, but not the times of a variable's first value, which may be old."""
         topic, body = _translate_change(node, val, data)
         is_first = topic not in self.topics
         note_payload(self.topics, topic, body, time.time_ns())
@@ -236,7 +236,7 @@ class Listener:
 
 def _make_client(where: Address) -> Client:
     """Return a client of the server at an address, with its user and password if it has any."""
-    # The client library warns of everything of which a server grants less than it asks for: not logged.
+    # The client library warns whenever a server grants less than it asks for; this is not logged.
     logging.getLogger("asyncua").setLevel(logging.ERROR)
     client = Client(str(where), timeout=WAIT)
     if where.user is not None:
@@ -274,9 +274,9 @@ async def _find_variables(client: Client) -> list[Node]:
 
 
 def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
-    """Return the topic of a variable's change, its identifier, and its message: JSON of the value and its dates.
+    """Return a variable's change as a topic (the variable's identifier) and a message, JSON of its value and dates.
 
-    A value of bad quality, or NaN or infinite, becomes null; what is no number a text.
+    A value of bad quality, NaN or infinity becomes null. A value that is no number becomes a text.
     """
     sample = data.monitored_item.Value
     has_good_quality = sample.StatusCode is None or sample.StatusCode.is_good()
@@ -293,7 +293,7 @@ def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple
 
 
 def _find_node(client: Client, name: str) -> Node:
-    """Return the server's node with the identifier `name`; raise ValueError at what is no identifier."""
+    """Return the server's node with the identifier `name`; raise ValueError if `name` is no identifier."""
     try:
         return client.get_node(name)
     except (UaError, ValueError):

@@ -46,12 +46,12 @@ class Pipe:
     """
 
     def __init__(self, source: int = 0, target: int = 1, reader: MessageReader | None = None):
-        """Prepare to read lines of the file `source` by a reader, and to write to `target`; nothing is read yet."""
+        """Prepare to read lines from the descriptor `source` by a reader, and to write to the descriptor `target`."""
         self.source, self.target, self._reader = source, target, reader
-        self._rest = b""  # the begin of a line that has not ended
-        self._skipping = False  # whether the rest of a line is left out that was too long
-        self._said = False  # whether it was warned of what could not be unpacked
-        self._newline: bytes | None = None  # what ends a line; known once something follows one
+        self._rest = b""  # the beginning of a line that has not ended
+        self._skipping = False  # whether the rest of a line is skipped, since the line is too long
+        self._said = False  # whether there was a warning of bytes that could not be unpacked
+        self._newline: bytes | None = None  # the bytes that end a line; None until they are known
         self._text = TextStream("standard input" if reader is None else reader.source)
 
     async def receive(self) -> Batch | None:
@@ -86,9 +86,10 @@ class Pipe:
             LOG.warning("%s", self._text.broken)
 
     def _read_available(self) -> bytes:
-        """Return the bytes that are there, at most READ; of a sender that is ahead (FULL or more) also what comes next.
+        """Return the bytes that are there, at most READ.
 
-        For that MORE milliseconds are waited each time.
+        If there are FULL bytes or more, the sender is ahead. Then wait up to MORE milliseconds for further bytes, again
+        and again.
         """
         data = next_bytes = os.read(self.source, READ)
         poll = select.poll()
@@ -137,10 +138,10 @@ class Pipe:
 
 @contextmanager
 def _set_nonblocking(file: int) -> Iterator[tuple[int, int | None]]:
-    """Yield a descriptor to write to, and the number of bytes that it takes without waiting; None for any number.
+    """Yield a descriptor to write to, and how many bytes it takes at once without waiting; None for any number.
 
-    A pipe is opened again, since whether it waits is a property that all who share an opened one have in common. Where
-    that fails, AT_ONCE bytes never wait in one that takes any.
+    Whether writing waits is a property of an open pipe, which all its users share. So the pipe is opened again, as one
+    that does not wait. If that fails, AT_ONCE bytes are written at a time: a pipe that is ready takes as many.
     """
     mode, reopened = os.fstat(file).st_mode, None
     if stat.S_ISFIFO(mode):

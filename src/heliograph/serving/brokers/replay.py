@@ -40,7 +40,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     """Read the events of a table of rows, in order, and the date of time 0.
 
     Each row's measurements become events. In continuous time an input holds from its event on, so the inputs of a row
-    are dated at the row before.
+    get the time of the previous row.
 
     Args:
         path: the file.
@@ -50,7 +50,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
         The events, and the date from which their times are counted (None if times are numbers or steps).
 
     Raises:
-        ValueError: what reading the file refuses.
+        ValueError: the file cannot be read as a recording.
     """
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
@@ -80,9 +80,9 @@ def events_of_recording(table: Recording, network: Network) -> tuple[list[Event]
 
 
 def check_time_steps(dt: np.ndarray, time: np.ndarray, numbers: np.ndarray, source: str) -> None:
-    """Raise ValueError where a time step is not the time since the row before, which is all that messages say.
+    """Raise ValueError if a time step is not the time since the previous row, which is all that messages can say.
 
-    The first row has none before it.
+    The step of the first row is not checked.
 
     Args:
         dt: the time steps of the rows.
@@ -164,14 +164,14 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
 
 
 def _find_loss_probabilities(loss: float, run: float) -> tuple[float, float]:
-    """Return P(loss | loss) and P(loss | no loss) of a two-state Markov chain of messages, lost or not.
+    """Return P(loss | loss) and P(loss | no loss) of a Markov chain of messages that are lost or not.
 
     Args:
-        loss: its stationary probability pi of a loss.
-        run: mean number of consecutive losses: P(loss | loss) = 1 - 1/run. With 1 losses are independent.
+        loss: the stationary probability pi of a loss.
+        run: mean number of consecutive losses, so that P(loss | loss) = 1 - 1/run. At 1, losses are independent.
 
     Raises:
-        ValueError: losses so frequent that their runs are longer.
+        ValueError: losses are so frequent that their runs must be longer.
     """
     if run == 1:
         return loss, loss
@@ -215,7 +215,7 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
 
 
 def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
-    """Yield each event as a message, a line of JSON, behind the time of its arrival.
+    """Yield for each event the time of its arrival and its message, a line of JSON.
 
     Args:
         events: the events, in order of arrival.
@@ -226,13 +226,13 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
         Pairs of the arrival time and the line of JSON.
     """
     for event in events:
-        arrival = event.time if event.arrival is None else event.arrival  # without one: at once
+        arrival = event.time if event.arrival is None else event.arrival  # an event without an arrival arrives at once
         fields = encode_event(event, plant, origin) | {"arrival": _format_time(arrival, origin)}
         yield arrival, json.dumps(fields)
 
 
 def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict[str, object]:
-    """Return an event as the fields of a message, without its arrival; NaN as null. `origin`: date of time 0."""
+    """Return an event as the fields of a message without its arrival; NaN becomes null. `origin`: date of time 0."""
     return ({"plant": plant} if plant else {}) | {
         "node": event.node,
         "sequence": int(event.sequence),
@@ -253,7 +253,7 @@ def _sort_events(events: list[Event]) -> list[Event]:
 
 
 def _format_time(time: float, origin: np.datetime64 | None) -> float | str:
-    """Return a time as messages have it: an ISO 8601 date in UTC where time 0 has one (`origin`), else the number."""
+    """Return a time as in messages: an ISO 8601 date in UTC if time 0 has a date (`origin`), else the number."""
     if origin is None:
         return float(time)
     nanoseconds = int(origin.astype("datetime64[ns]").astype(np.int64)) + round(time * 1e9)

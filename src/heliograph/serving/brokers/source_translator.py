@@ -42,18 +42,18 @@ class Translator:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
-        """Check a table of sources by topic against the network; `others`: nodes whose messages are left out."""
+        """Check a table of sources by topic against the network; messages of the nodes `others` are left out."""
         instance("network", network, Network, "a Network")
         if isinstance(others, str) or not isinstance(others, Collection):
             raise fail("nodes of other processes", "a list of names", show_value(others))
         self.sources = TopicReader(table, network, others)
         topics = self.sources.topics
-        # The only topic, if there is one, and it is no pattern (with the wildcards + or #).
+        # `_alone` is the only topic, if there is just one and it is no pattern (with the wildcards + or #).
         is_alone = len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/"))
         self._alone = topics[0] if is_alone else None
-        # Readings so far by plant and node; stored messages left out, since they have no date.
+        # How many readings came by plant and node, and how many stored messages without a date were left out.
         self._counts, self._stored = Counter[tuple[str, str]](), 0
-        # Values of the newest times of each plant and node without a count.
+        # For plants and nodes without a running count: the values of their newest times.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
 
     def read(
@@ -65,15 +65,15 @@ class Translator:
             topic: the topic.
             payload: JSON.
             arrival: when it arrived.
-            stored: whether the broker had stored it for new subscribers: it may be old, and have come before.
+            stored: whether the broker had stored it for new subscribers. It may then be old, and have come before.
         """
-        # The broker may deliver a copy of it again (`repeatable`), which then gets the same number.
+        # The broker may deliver a copy again (`repeatable`), which then gets the same number.
         return self._read_payload(topic, payload, arrival, stored, repeatable=True, where=topic)
 
     def topic_of(self, path: Path | None) -> str | None:
-        """Return the topic of messages that name none: one with their file's name, or the only one of the sources.
+        """Return the topic of messages that name no topic: that of their file's name, or else the sources' only topic.
 
-        None if there is neither.
+        It is None if there is neither.
 
         Args:
             path: the file; None of a pipe.
@@ -82,13 +82,13 @@ class Translator:
         return next((name for name in names if name in self.sources.topics), self._alone)
 
     def topic_of_rows(self, path: Path | None, header: Sequence[str]) -> str | None:
-        """Return the topic of the rows of a table; None of one that the sources do not know.
+        """Return the topic of the rows of a table, or None if the sources do not know the table.
 
         Args:
             path: the file; None of a pipe.
             header: the names of the columns.
         """
-        # The only topic is that of any file, if the table has the columns that it needs.
+        # A file of another name may have the sources' only topic, if it has the columns that this topic needs.
         topic = self.topic_of(path)
         if topic is None or (path is not None and topic in (path.name, make_default_topic(path))):
             return topic
@@ -116,8 +116,8 @@ class Translator:
         return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
 
     def left_out(self) -> list[str]:
-        """Return lines on messages that were not used, as of unknown topics, and on what is odd in those used."""
-        lines, unknown = [], +self.sources.unknown  # counts by topic; + leaves zeros out
+        """Return lines on messages that were not used, such as those of unknown topics, and on oddities in others."""
+        lines, unknown = [], +self.sources.unknown  # counts by topic; the sign + leaves out zeros
         if unknown:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
@@ -167,9 +167,9 @@ class Translator:
         return results
 
     def _watch_for_several_senders(self, topic: str, reading: Reading, content: object) -> None:
-        """Note the fields of a message, by which several senders of one node can be told apart, and warn of them.
+        """Note the fields of a message that may tell apart several senders of one node, and warn of several senders.
 
-        A warning comes at each power of two of the messages.
+        Warnings come when the number of messages is a power of two.
         """
         senders = self.sources.senders
         senders.note_fields(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
@@ -179,9 +179,9 @@ class Translator:
     def _explain_unread(
         self, topic: str, unread: Unread, known: datetime | None, repeatable: bool
     ) -> UnreadMessage | str:
-        """Return why a message could not be read: with its node, count and time where these were, else the text alone.
+        """Return why a message could not be read, together with its node, count and time if these could be read.
 
-        `known`: when it arrived, None where that is not known; `repeatable`: whether a copy of it may come again.
+        `known`: when it arrived, None if that is not known. `repeatable`: whether a copy of it may come again.
         """
         why = str(unread.error)
         if unread.counted is None:
@@ -227,41 +227,41 @@ class Translator:
         )
 
     def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
-        """Return when a reading was measured: a date, or a number of steps; without a time, when it arrived.
+        """Return when a reading was measured, as a date or a number of steps; without a time, return its arrival.
 
-        Raises ValueError, which names the topic, at a date of more than a year before a known arrival (`is_known`).
-        A reading's time is in nanoseconds since 1970, or counts steps.
+        A reading's time is in nanoseconds since 1970, or counts steps. ValueError, which names the topic, is raised if
+        a date is more than a year before a known arrival (`is_known`).
         """
         if reading.time is None:
             return arrival
         if self.sources.time_counts_steps and self.sources.step_seconds is None:
             return float(reading.time)
         time = convert_nanoseconds_to_date(reading.time)
-        is_unset = is_known and (arrival - time) // MICROSECOND * 1000 > YEAR  # a clock that was never set
+        is_unset = is_known and (arrival - time) // MICROSECOND * 1000 > YEAR  # then the clock was never set
         if is_unset:
             expected = f"a time that was set, near that of arrival, {arrival.isoformat()}"
             raise fail(f"{topic}, time", expected, time.isoformat())
         return time
 
     def _count_reading(self, reading: Reading, repeatable: bool) -> int:
-        """Return the reading's own count; without one, its number among those of its node and time, from 0.
+        """Return the reading's running count, or a number from 0 in its place.
 
-        Without a time either, its number among all of its node.
-        `repeatable`: whether a copy of it may come again, which gets the same number.
+        A reading without a count is numbered among the readings of its node and time. If it has no time either, it is
+        numbered among all readings of its node. `repeatable`: a copy of it may come again, and gets the same number.
         """
         if reading.sequence is not None:
             return reading.sequence
         name = reading.plant, reading.node
-        number = self._counts[name]  # of all readings of this node before
-        self._counts[name] += 1  # each counts, whether this number is used or not
+        number = self._counts[name]  # how many readings of this node came before
+        self._counts[name] += 1  # even if this number is not used
         if reading.time is not None:
             number = self._number_among_simultaneous(reading, repeatable)
         return number
 
     def _number_among_simultaneous(self, reading: Reading, repeatable: bool) -> int:
-        """Return the sequence number of a message without a count: how many of its node and time came before it.
+        """Return how many messages of the same node and time came before; this numbers a message without a count.
 
-        A copy of a message, which has the same values and may come where `repeatable`, gets the number of the message.
+        If `repeatable`, a message with the values of an earlier one is its copy, and gets the same number.
         """
         assert reading.time is not None
         values_so_far = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
@@ -278,7 +278,7 @@ def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
     """Return a date in UTC, cut to the microsecond, from nanoseconds since 1970.
 
     Raises:
-        ValueError: beyond the years that dates have.
+        ValueError: the year is beyond Python's dates.
     """
     try:
         return EPOCH + timedelta(microseconds=nanoseconds // 1000)
@@ -287,9 +287,9 @@ def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
 
 
 def _decode_json(payload: object, where: str) -> object:
-    """Return the content of a payload of JSON, at most LONGEST bytes; what is read already, as a row, as it is.
+    """Return the content of a JSON payload of at most LONGEST bytes; a payload that is read already stays as it is.
 
-    `where`: place that an error names.
+    `where` is the payload's place, for errors.
     """
     if not isinstance(payload, bytes | str):
         return payload

@@ -49,11 +49,11 @@ def availability_topic(topic: str) -> str:
 def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Iterator[StateMessage]:
     """Yield a message for each state of each filter of an estimate: value, deviation, dead, and time.
 
-    The topic is TOPIC/state/PLANT/NODE/FILTER/STATE. `value` and `deviation` are numbers, or null; `dead` is 1 where
-    the sender of the node is dead, else 0; `time` is of the estimate, in seconds since 1970 where it is a date.
+    The topic is TOPIC/state/PLANT/NODE/FILTER/STATE. `value` and `deviation` are numbers or null. `dead` is 1 if the
+    sender of the node is dead, else 0. `time` is that of the estimate; a date is in seconds since 1970.
 
     Args:
-        topic: the service's.
+        topic: the service's topic.
         states: names of the states.
         body: an estimate that a service published, as JSON.
     """
@@ -70,13 +70,13 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
 
 
 def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, prefix: str) -> Iterator[StateMessage]:
-    """Yield messages that make Home Assistant show a plant's states: sensors of value, deviation, and a dead sender.
+    """Yield messages that make Home Assistant show sensors of a plant's states: value, deviation, and dead sender.
 
     Args:
-        topic: the service's.
-        states: names of the states; a unit goes with the sensor.
+        topic: the service's topic.
+        states: names of the states; a unit in a name is told to the sensor.
         body: an estimate that a service published, as JSON.
-        prefix: the topic under which Home Assistant looks, "homeassistant" unless it is set otherwise.
+        prefix: the topic under which Home Assistant looks for sensors; "homeassistant" by default.
     """
     estimate = from_json(body)
     plant = str(estimate["plant"])
@@ -102,9 +102,9 @@ class _DiscoveredSensor(NamedTuple):
 
 
 def _list_sensors(place: _PublishedState, unit: str | None, has_sender: bool) -> list[_DiscoveredSensor]:
-    """Return the sensors of a state as Home Assistant has them: value, deviation, and whether its sender is dead.
+    """Return the sensors of a state for Home Assistant: its value, its deviation, and whether its sender is dead.
 
-    The last where the node has a sender that may be found dead (`has_sender`).
+    There is the last one only if the node has a sender that may be found dead (`has_sender`).
     """
     number = {"state_class": "measurement"} | ({"unit_of_measurement": unit} if unit else {})
     sensors = [
@@ -127,9 +127,9 @@ def _read_dead_senders(estimate: Mapping[str, Any]) -> dict[str, int]:
 def _iterate_states(
     topic: str, states: Sequence[str], estimate: Mapping[str, Any]
 ) -> Iterator[tuple[_PublishedState, int, Mapping[str, Any]]]:
-    """Yield each state of each filter and node in a published `estimate`: with its topic, its number, and the filter's.
+    """Yield (state with its topic, index of the state, message) for each node, filter and state of an estimate.
 
-    The last is the filter's part of the estimate, such as its mean. Topics have names as single words.
+    The message is the filter's part of the published estimate, such as its mean. In topics each name is one word.
     """
     plant = str(estimate["plant"])
     for node, filters in estimate["estimates"].items():

@@ -51,7 +51,7 @@ class StatePublishing:
     """
 
     def __init__(self, inner: Transport, topics: StateTopics, states: Sequence[str]):
-        """Hold the inner transport, and connect to the broker where the states of these names go."""
+        """Hold the inner transport, and connect to the broker to which the states of these names are published."""
         address = instance("topics", topics, StateTopics, "StateTopics").address
         if instance("topics, address", address, Address, "an Address").kind != "mqtt":
             raise fail("topics, address", "mqtt:// or mqtts://host:port/topic", str(address))
@@ -84,7 +84,8 @@ class _StateWriter(Connection):
     def __init__(self, topics: StateTopics, states: Sequence[str]):
         """Connect to the broker, to publish the states of these names; the last will says "offline"."""
         super().__init__(topics.address, "")
-        # Topics of which Home Assistant was told; the newest estimate by plant, to be published again; its lock.
+        # `_announced`: topics that Home Assistant knows. `_newest`: each plant's newest estimate, to publish it again;
+        # the lock guards it.
         self._topics, self._states, self._announced = topics, states, set[str]()
         self._newest, self._one_at_a_time = dict[str | None, bytes](), threading.Lock()
         self._available = availability_topic(topics.address.topic)
@@ -93,14 +94,14 @@ class _StateWriter(Connection):
         self.start()
 
     def publish(self, plant: str | None, body: bytes) -> None:
-        """Publish the states of an estimate of a plant, now and again with each new connection."""
+        """Publish the states of a plant's estimate now, and again whenever the connection is new."""
         with self._one_at_a_time:
             self._newest[plant] = body
             if self.client.is_connected():
                 self._publish(body)
 
     def _publish(self, body: bytes) -> None:
-        """Publish states, and before the first of a filter, with `discovery`, what Home Assistant has to know."""
+        """Publish an estimate's states; with `discovery`, first tell Home Assistant of sensors that are new to it."""
         topic = self._topics.address.topic
         if self._topics.discovery:
             for message in make_discovery_messages(topic, self._states, body, self._topics.discovery):
@@ -111,7 +112,7 @@ class _StateWriter(Connection):
             self.client.publish(message.topic, message.body, 0, retain=True)
 
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
-        """Say online, and publish everything again: the broker may have forgotten."""
+        """Publish "online" and everything else again, since the broker may have forgotten it."""
         super().connected(client, data, flags, code, more)
         client.publish(self._available, ONLINE, AT_LEAST_ONCE, retain=True)
         with self._one_at_a_time:
@@ -120,7 +121,7 @@ class _StateWriter(Connection):
                 self._publish(body)
 
     def close(self) -> None:
-        """Say offline, and end: the last will, which would say it, is only for connections that break."""
+        """Publish "offline" and end the connection; the last will says so only if a connection breaks."""
         if self.client.is_connected():
             self.client.publish(self._available, OFFLINE, AT_LEAST_ONCE, retain=True).wait_for_publish(2.0)
         super().close()

@@ -37,14 +37,14 @@ class TableLineReader:
     """
 
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
-        """Hold the network, and how its sources translate rows; a table without a path is read from standard input."""
+        """Hold the network and the translator of its sources; a table without a path comes from standard input."""
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
         self._reader: IndependentRowReader | TimeRowReader | None = None
 
     def names_columns(self, line: str) -> bool:
-        """Return whether a line is the first of a table: it names a column that the network or its sources know."""
+        """Return whether a line is a table's header: it names a column that the network or its sources know."""
         text = line.strip()
         if not text or text[0] in "[{" or not (names := guess_names_in_header(text)):
             return False
@@ -53,7 +53,7 @@ class TableLineReader:
         rows = RowReader(self._network, self._source, strict=False, ignore_unknown=False)
         known = {*OWN, TOPIC, PAYLOAD, *rows.names}
         fields = set() if self._translator is None else self._translator.sources.columns
-        # A single word is a table's only column if a comment sign stands before it; else it may be anything.
+        # A single word may be anything. It names a table's only column if a comment sign stands before it.
         is_header = len(names) > 1 or text.startswith(COMMENTS)
         return is_header and bool(names & (known | fields))
 
@@ -71,15 +71,16 @@ class TableLineReader:
         return rest + (self._reader.end() if isinstance(self._reader, TimeRowReader) else [])
 
     def _read_rows(self, rows: list[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows of text; the header, once it is read, chooses their reader. None before it."""
+        """Return the messages of rows of text, [] before the header; the header chooses the rows' reader."""
         if self._reader is None and self._text.header:
             self._reader = self._choose_reader(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
     def _choose_reader(self, header: list[str]) -> "IndependentRowReader | TimeRowReader":
-        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time.
+        """Return the reader of rows with these columns, of one of three kinds.
 
-        A row of time has the measurements of all nodes; an event is one node's, with its name and count.
+        They are events in heliograph's own form (of one node, with its name and count), rows that sources map, or rows
+        of times with the measurements of all nodes.
         """
         if {NODE, SEQUENCE} <= set(header):
             own = HeliographMessageReader(self._network, self._source, self._ignore, table=True)
@@ -102,7 +103,7 @@ class IndependentRowReader:
         self._decode = decode
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of all rows in order, and in the place of a row that cannot be read a text why."""
+        """Return the messages of all rows in order; a text with the reason replaces a row that cannot be read."""
         payloads = list[Payload]()
         for row in rows:
             payloads += [str(row)] if isinstance(row, InputError) else self._decode(row)
@@ -116,16 +117,16 @@ class TimeRowReader:
     """
 
     def __init__(self, network: Network, header: list[str], text: CsvReader, ignore_unknown: bool):
-        """Prepare to read rows of a table with these columns; `text`: where they come from, a file or another pipe."""
-        self._network, self._steps = network, TIME_STEP not in network.inputs  # the latter: time counts steps
+        """Prepare to read rows of a table with these columns; `text` reads them from a file or a pipe."""
+        self._network, self._steps = network, TIME_STEP not in network.inputs  # `_steps`: whether time counts steps
         self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
         self._columns = CsvColumnReader(text.source, text.path, self._rows.only, strict=False)
         self._columns.header = header
         self._given = [name for name in network.inputs if name != TIME_STEP]
         self._origin: np.datetime64 | None = None  # date of the first row, from which times are counted
-        self._before: float | None = None  # time of the row before
+        self._before: float | None = None  # time of the previous row
         self._is_file = text.path is not None
-        self._cells = list[RecordingRows]()  # those of a file, until it ends
+        self._cells = list[RecordingRows]()  # the rows of a file, until it ends
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
         """Return the messages of rows, as a replay of them has them, and why others cannot be read.
@@ -148,10 +149,10 @@ class TimeRowReader:
         return [*lines, *refused]
 
     def _check_time_steps(self, cells: RecordingRows, time: np.ndarray) -> None:
-        """Raise ValueError where a row's time step is not the time since the row before; `time`: times of the rows.
+        """Raise ValueError if a row's time step is not the time since the previous row; `time` holds the rows' times.
 
-        With the time of the row before them, if any, the first step can be checked too. The check uses neither step nor
-        number of that row before: those of the first row stand in their place.
+        If there was a row before these, the first step is checked too. The check does not use that row's own step and
+        number, so those of the first row stand in their place.
         """
         before = [] if self._before is None else [self._before]
         steps = cells.inputs[TIME_STEP]
@@ -163,7 +164,7 @@ class TimeRowReader:
         )
 
     def end(self) -> list[Payload]:
-        """Return the messages of the rows of a file, now that all have come, and why others have none.
+        """Return the messages of a file's rows, after all have come, and then why rows were refused.
 
         Messages are lines of JSON. Warnings about the rows are logged.
         """
@@ -181,7 +182,7 @@ class TimeRowReader:
     def _time_of_messages(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Return the times in the unit of messages: steps, numbers, or seconds since the first date.
 
-        `numbers`: those of the rows, from 1; a row is a step where time counts steps.
+        `numbers`: the rows' numbers, from 1. If time counts steps, each row is a step.
         """
         if self._steps:
             return np.asarray(numbers - 1.0)
@@ -192,9 +193,9 @@ class TimeRowReader:
 
 
 def read_own_event(reader: HeliographMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
-    """Return the messages of an event in our own form: its measurement, and its inputs if it has any.
+    """Return the messages of an event in heliograph's own form: its measurement, and its inputs if it has any.
 
-    Or why one cannot be read: as a text, or with its count and time where these are known.
+    If one cannot be read, its error stands there: as a text, or with its count and time if these are known.
     """
     try:
         readings_and_arrivals = reader.read(where, content)

@@ -72,14 +72,14 @@ FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
 def raise_if_cancelled() -> None:
-    """Raise the cancellation again if this task was cancelled: a client library may have caught it and gone on."""
+    """Raise CancelledError if this task was cancelled; a client library may have caught the first one and gone on."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
 
 
 def explain_failure(error: BaseException | None) -> str:
-    """Return in words why there is no connection, in words that hold no password."""
+    """Return in words why there is no connection; the words hold no password."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not trusted: {error.verify_message}"
     if isinstance(error, ssl.SSLError):
@@ -125,14 +125,14 @@ def encode_name(plant: str) -> str:
         plant: name of a plant.
     """
     text("plant", plant)
-    # `quote` leaves ._~ as they are, of which topics and subjects may make something else.
+    # `quote` keeps the characters . _ ~, which may have a meaning in topics and subjects.
     return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
 
 
 def topic_of(topic: str, output: Output) -> str:
-    """Return the topic of an output of the service at `topic`; of a message to a node, that node's input topic.
+    """Return the topic of an output of the service at `topic`; a message to a node goes to that node's input topic.
 
-    The services of neighbouring nodes are at topics that differ in the last word alone, the node's name.
+    The topics of neighbouring nodes' services differ only in the last word, which is the node's name.
     """
     if output.kind == "message":
         return "/".join([*topic.split("/")[:-1], encode_name(output.to), "in", encode_name(output.plant)])

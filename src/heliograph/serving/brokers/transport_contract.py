@@ -54,10 +54,10 @@ class _Examination:
     """One examination of a broker, which sends numbered messages and asserts each promise of its transport."""
 
     def __init__(self, broker: Broker, messages: int, patience: float):
-        """Hold the broker, how many messages are sent, and the seconds after which a missing one is lost."""
+        """Hold the broker, the number of messages to send, and the seconds after which a missing one counts as lost."""
         self.broker, self.messages, self.patience = broker, messages, patience
         self.silence = patience / 20  # seconds without a message after which we assume that there is none
-        self._numbers = count()  # of the messages, each of which has another
+        self._numbers = count()  # numbers the messages
 
     async def check_all(self) -> bool:
         """Check each promise in turn, with one service after another; return whether redelivery keeps the order."""
@@ -180,9 +180,9 @@ class _Examination:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
     def _make_bodies(self, total: int) -> list[bytes]:
-        """Return bodies of messages, each with a number that none had before; the first has a text of LONG bytes.
+        """Return bodies of messages with new numbers; the first one has a text of LONG bytes.
 
-        The name of that text is a letter of two bytes, so that a transport that changes the encoding is found out.
+        The name of the text is a letter of two bytes in UTF-8. It reveals a transport that changes the encoding.
         """
         texts = [b"x" * LONG, *[b""] * (total - 1)][:total]
         return [b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), text) for text in texts]

@@ -25,9 +25,9 @@ class LastAnswers(Generic[T]):
         self._last: OrderedDict[str, T] = OrderedDict()
 
     def ask(self, question: str = "") -> T:
-        """Return the answer now; if a batch holds the lock for longer than PATIENCE, the last one given, or `begin`.
+        """Return the answer to a question; if a batch holds the lock longer than PATIENCE, return the last answer.
 
-        Of so many questions (`most`), those asked last, the answers are kept.
+        `begin` is the answer to a question that was never answered. The answers to the last `most` questions are kept.
         """
         if self.lock.acquire(timeout=PATIENCE):
             try:

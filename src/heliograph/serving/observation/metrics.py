@@ -33,11 +33,11 @@ class ServiceMetrics(Collector):
     """Collector of the metrics of a watch: by node and filter, and by plant where there are few, else of the worst."""
 
     def __init__(self, watch: ServiceWatch):
-        """Register these metrics of the watched service, and write their text once, before the first batch."""
+        """Register the metrics of the watched service, and write their text once before the first batch."""
         self.watch = watch
         watch.registry.register(self)
         text = partial(generate_latest, watch.registry)
-        # The last text, for when a batch takes long.
+        # This keeps the last text, which is given while a batch takes long.
         self._texts = LastAnswers(watch.lock, lambda _: text(), text())
 
     def collect(self) -> Iterable[Metric]:
@@ -81,7 +81,7 @@ def _collect_plants(watch: ServiceWatch) -> Iterable[Metric]:
 
 
 def _collect_crossings(watch: ServiceWatch) -> Metric:
-    """Return the metric of thresholds that may be crossed, of the SHOWN plants in which that is most probable."""
+    """Return the metric of thresholds that may be crossed, for the SHOWN plants in which this is most probable."""
     what = "Probability that a level of --threshold is passed by so far ahead."
     labels = ["plant", "node", "filter", "threshold", "ahead"]
     crossings = GaugeMetricFamily("heliograph_plant_passing", what, labels=labels)
@@ -120,7 +120,7 @@ def _collect_links(watch: ServiceWatch) -> Iterable[Metric]:
 
 
 def _collect_dead_senders(watch: ServiceWatch) -> Metric:
-    """Return the metric of the dead senders by node: in how many plants the node's sender is silent for too long."""
+    """Return the metric of dead senders: for each node, in how many plants its sender has been silent too long."""
     what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance, or is past its timeout."
     dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
     for node, count in watch.dead_senders().items():
@@ -129,7 +129,7 @@ def _collect_dead_senders(watch: ServiceWatch) -> Metric:
 
 
 def _collect_remarks(watch: ServiceWatch) -> Metric:
-    """Return the metric of gates that gave in, by node and filter: refused values are believed after all."""
+    """Return the metric of gates that gave in, by node and filter: a filter then accepts what it refused for long."""
     what = "Times that a gate gave in: it took up what it had refused for long."
     gave_in = CounterMetricFamily("heliograph_gave_in", what, labels=["node", "filter"])
     for key, count in watch.remarks().items():
@@ -138,7 +138,7 @@ def _collect_remarks(watch: ServiceWatch) -> Metric:
 
 
 def _collect_fusion_doubts(watch: ServiceWatch) -> Metric:
-    """Return the metric of fusions in doubt: those without a test of their own, by the tests of what they fuse."""
+    """Return the metric of doubted fusions: a fusion without its own test is judged by the filters that it fuses."""
     what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
     for row in watch.judge_fusions(watch.nis):
@@ -147,9 +147,9 @@ def _collect_fusion_doubts(watch: ServiceWatch) -> Metric:
 
 
 def _collect_nis(watch: ServiceWatch) -> Iterable[Metric]:
-    """Return the metrics of each filter's NIS (normalised innovation squared) over its expectation, and of its band.
+    """Return three metrics of each filter: the ratio of its NIS to the expected NIS, and the two ends of its band.
 
-    The ratio should be 1; an honest filter's is between the ends of the band.
+    NIS is the normalised innovation squared. The ratio should be near 1, and lies in the band if the filter is honest.
     """
     labels = ["node", "filter"]
     ratio = GaugeMetricFamily(
@@ -164,9 +164,9 @@ def _collect_nis(watch: ServiceWatch) -> Iterable[Metric]:
 
 
 def _collect_outputs(watch: ServiceWatch) -> Iterable[Metric]:
-    """Return the metrics in OUTPUTS (as mean weight, bias) of each received number of filters that weigh these.
+    """Return the metrics in OUTPUTS, such as mean weight and bias, of each number that weighing filters receive.
 
-    Without a number where there are too few rows.
+    A metric is left out if there are too few rows for it.
     """
     metrics = {
         name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])

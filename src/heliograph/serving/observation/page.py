@@ -113,8 +113,8 @@ def make_application(
     overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))
 
     def page(request: Request) -> Response:
-        """Answer with the page, the first view in place of its first "null"; all others come from /events."""
-        # Without a "<" no name in the view can end the HTML element that it stands in.
+        """Answer with the page, where the first view replaces the first "null"; later views come from /events."""
+        # "<" is escaped, so that no name in the view can end the HTML element around it.
         first = json.dumps(watch.make_page_data(request.query_params.get("plant"))).replace("<", "\\u003c")
         return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
@@ -131,7 +131,7 @@ def make_application(
         return Response(overview.ask(), media_type="text/html", headers=POLICY)
 
     def health(_: Request) -> Response:
-        """Answer 503 if a batch has been taken for more than STUCK seconds, else ok: no more, so it needs no token."""
+        """Answer 503 if a batch has taken more than STUCK seconds so far, else "ok"; this tells no secret to guard."""
         busy = watch.busy()
         if busy > STUCK:
             return PlainTextResponse(f"a batch has been taken for {busy:.0f} s", 503)
@@ -144,10 +144,10 @@ def make_application(
 
 
 def _make_middleware(token: str | None, hosts: Sequence[str]) -> list[Middleware]:
-    """Return what each request passes: the check of the token, and before it, where it is needed, that of the host.
+    """Return the checks of each request: of its host, if that is needed, and then of its token.
 
-    The host is what a request says that it asks for: it must be a name of this machine, or one of `hosts`. So a page of
-    elsewhere whose name was made to lead here does not get in. With a token alone, no `hosts`, the token sees to that.
+    A request names the host that it asks for. It must be a name of this machine or one of `hosts`, so that a foreign
+    page whose name was made to lead here cannot get in. With a token and no `hosts`, the token ensures this.
     """
     middleware = [Middleware(TokenMiddleware, token)]
     if token is None or hosts:

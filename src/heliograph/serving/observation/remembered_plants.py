@@ -44,11 +44,11 @@ class RememberedPlants:
     """
 
     def __init__(self, names: Mapping[tuple[str, str], Sequence[str]]):
-        """Begin with no plant; `names`: those of the received numbers by node and filter.
+        """Begin without plants; `names` holds the names of the received numbers by (node, filter).
 
-        Each table is by plant, that with the newest message last.
+        Each table below is by plant, and the plant with the newest message is last.
         """
-        self.count, self._names = 0, names  # the former: of points so far
+        self.count, self._names = 0, names  # `count`: how many points of charts came so far
         self.points: OrderedDict[str, deque[ChartPoint]] = OrderedDict()
         self.outputs: OrderedDict[str, RecentInnovations] = OrderedDict()
         self.tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
@@ -89,9 +89,9 @@ class RememberedPlants:
                 self.dead_senders[plant] = dead
 
     def keep_crossings(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
-        """Keep the probabilities that a plant's thresholds are crossed; `horizons`: its newest forecast, as sent.
+        """Keep the probabilities that a plant's thresholds are crossed; `horizons` is its newest forecast, as sent.
 
-        They take the place of those before, which are dropped where the forecast has none.
+        They replace the earlier ones. If the forecast has none, the earlier ones are dropped.
         """
         crossings = dict[tuple[str, ...], Mapping[str, float]]()  # by node, filter, threshold, how far ahead
         for horizon in horizons:
@@ -104,11 +104,11 @@ class RememberedPlants:
             _move_to_newest(self.crossings, plant, dict).update(crossings)
 
     def list_crossings(self, most: int) -> list[tuple[tuple[str, ...], float]]:
-        """Return ((plant, node, filter, threshold, how far ahead), probability that it is crossed by then).
+        """Return pairs ((plant, node, filter, threshold, how far ahead), probability that it is crossed by then).
 
-        Of `most` plants at most, those in which a crossing is most probable.
+        They are of at most `most` plants, those in which a crossing is most probable.
         """
-        # Of the probabilities of a crossing "by" is that of one at any time up to then.
+        # Among the probabilities, "by" is that of a crossing at any time up to the horizon.
         largest = {plant: max(p["by"] for p in crossings.values()) for plant, crossings in self.crossings.items()}
         most_probable = sorted(largest, key=lambda plant: -largest[plant])[:most]
         return [((plant, *key), p["by"]) for plant in most_probable for key, p in self.crossings[plant].items()]
@@ -126,7 +126,7 @@ class BatchHistograms:
         self._committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=registry)
 
     def observe(self, batch: BatchTimes) -> None:
-        """Add the times of one batch to the histograms: seconds in all, of the commit, and its oldest message's age."""
+        """Add a batch's times to the histograms: in all, for the commit, and its oldest message's age, in s."""
         self._took.observe(batch.took)
         self._committed.observe(batch.committed)
         self._lag.observe(batch.lag)
@@ -143,9 +143,9 @@ def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], 
 
 
 def _means_and_deviations(message: Mapping[str, Any]) -> dict[str, object]:
-    """Return a filter's means, standard deviations, claim, and modes' probabilities if any, from its estimate as sent.
+    """Return a filter's means, standard deviations, claim, and probabilities of modes if any, from its message.
 
-    The deviations are null where the filter claims no covariance.
+    The deviations are None if the filter claims no covariance.
     """
     covariance = message["covariance"]  # rows, or null
     deviations = covariance and [_deviation_of(row[i]) for i, row in enumerate(covariance)]

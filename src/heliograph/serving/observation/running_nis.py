@@ -31,9 +31,10 @@ class RunningNis:
     numbers: int = 0
 
     def add(self, squared: float, received: int) -> None:
-        """Add the NIS (normalised innovation squared) of one row, of so many received numbers, its degrees of freedom.
+        """Add the NIS (normalised innovation squared) of one row with `received` numbers, its degrees of freedom m.
 
-        Older rows count less with each: total, and its mean and variance if the NIS are chi-squared (m, 2 m each).
+        Earlier rows are weighted by w = 1 - 1/MEMORY again. `total` is the weighted sum of NIS. If each NIS is
+        chi-squared (mean m, variance 2 m), `mean` and `variance` are those of the total.
         """
         weight = 1 - 1 / MEMORY
         self.total = weight * self.total + squared
@@ -49,8 +50,8 @@ class RunningNis:
     def band(self) -> tuple[float, float]:
         """Return the interval that contains the ratio with probability 1 - DOUBT if the covariance is right.
 
-        The ratio is the weighted sum of NIS over its expectation. Its law is taken for the gamma law of mean 1 and of
-        the variance of that ratio.
+        The ratio is the weighted sum of NIS over its expectation. Its distribution is approximated by the gamma
+        distribution of mean 1 and of the same variance, `variance` / `mean`^2. Without rows, every ratio is allowed.
         """
         if not self.mean:
             return 0.0, float("inf")
@@ -59,24 +60,25 @@ class RunningNis:
         return float(low), float(high)
 
     def explain_doubt(self) -> str | None:
-        """Return why the claimed covariance is doubtful, in words; None if it is not, or too few numbers have come."""
+        """Return in words why the claimed covariance is doubtful, or None if it is not or too few numbers came."""
         low, high = self.band()
         if self.numbers < FEWEST:
             return None
         if self.ratio > high:
             return f"its squared innovations are {self.ratio:.1f} times what its covariance says (at most {high:.1f})"
-        if self.ratio < low and self.claim != "upper":  # an upper bound may be larger than what happens
-            # No sign of safety: noises may be stated too large, or an error change slowly, which the filter follows.
+        if self.ratio < low and self.claim != "upper":  # an upper bound may be too large
+            # Too small a ratio is no sign of safety: noises are stated too large, or an error changes slowly.
             small = f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
             return f"{small}: noises are stated too large, or an error changes slowly; `heliograph run --report` tells"
         return None
 
 
 def read_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
-    """Return the normalised innovation squared (NIS) of what a filter used, and of how many numbers it is.
+    """Return the normalised innovation squared (NIS) of the numbers that a filter used, and how many they are.
 
-    Of a filter that weighs what it receives (its `outputs`: innovation, variance, weight) these are the numbers of
-    weight 1/2 or more, each squared over its variance: outliers that it left out do not count against it.
+    A filter that weighs what it receives has `outputs`: innovation, variance and weight of each number. Its NIS is the
+    sum of innovation^2 / variance over the numbers of weight 1/2 or more, so that outliers do not count. It is None if
+    there are no such numbers.
     """
     outputs = message.get("outputs")
     if message.get("nis") is None or not outputs:

@@ -144,8 +144,8 @@ class ServiceWatch:
     def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
         """Add the NIS (normalised innovation squared) of a plant's newest estimates to the running tests of claims.
 
-        And the outputs of filters that weigh to the recent ones: each to those of the plant, and to those of all
-        plants. `estimates`: messages by node and filter.
+        The outputs of filters that weigh what they receive are added to the recent innovations. Both go to the plant's
+        own statistics and to those of all plants. `estimates` holds messages by node and filter.
         """
         tests_of_plant, outputs_of_plant = self._memory.tests_of(plant), self._memory.outputs_of(plant)
         for node, filters in estimates.items():
@@ -159,11 +159,11 @@ class ServiceWatch:
                         outputs.add(node, name, message["outputs"])
 
     def crossings(self, most: int) -> list[tuple[tuple[str, ...], float]]:
-        """Return ((plant, node, filter, threshold, how far ahead), probability that it is crossed by then).
+        """Return pairs ((plant, node, filter, threshold, how far ahead), probability that it is crossed by then).
 
-        Of `most` plants at most, those in which a crossing is most probable.
+        They are of at most `most` plants, those in which a crossing is most probable.
         """
-        with self._noting:  # so that nothing is recorded meanwhile
+        with self._noting:  # nothing is recorded meanwhile
             return self._memory.list_crossings(most)
 
     def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
@@ -190,7 +190,7 @@ class ServiceWatch:
     def list_worst_plants(self) -> list[PlantTroubles]:
         """Return the plants with something wrong, the worst first: doubted filters, dead senders, refused messages.
 
-        Refusals are counted anew of those plants alone that had a message since the last look (`touched`).
+        Refusals are counted again only for plants that had a message since the last look (`touched`).
         """
         refused = dict[str, str]()
         for name, plant in self._iterate_plants(self._overview.touched):
@@ -213,14 +213,14 @@ class ServiceWatch:
         return 0.0 if begun is None else monotonic() - begun
 
     def dead_senders(self) -> Mapping[str, int]:
-        """Return the number of plants that have a dead sender, one silent for too long, by node, over all services."""
+        """Return for each node in how many plants its sender is dead (silent for too long), over all services."""
         total = Counter[str]()
         for service in self.services:
-            total.update(service.dead_senders())  # adds, and holds zeros
+            total.update(service.dead_senders())  # adds the counts, and keeps zeros
         return total
 
     def remarks(self) -> Mapping[tuple[str, str], int]:
-        """Return how often filters changed a state as users should know, by node and filter, over all services."""
+        """Return how often filters made a remark, such as that a gate gave in, by (node, filter), over all services."""
         total = Counter[tuple[str, str]]()
         for service in self.services:
             total.update(service.remarks())
@@ -271,9 +271,9 @@ class ServiceWatch:
         }
 
     def _ask_services(self, plant: str) -> ServiceAnswers:
-        """Return the names of the services' plants, the counts of messages of one plant, and of what is wrong in all.
+        """Return the names of all plants, the message counts of one plant, and how many plants have something wrong.
 
-        Asked between two batches. The counts are by node, over all services that have the plant.
+        The services are asked between two batches. The counts are by node, over all services that have the plant.
         """
         plants = list(self.plants())
         return ServiceAnswers(
@@ -284,10 +284,10 @@ class ServiceWatch:
         )
 
     def judge_fusions(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
-        """Return a row for each fusion without a NIS test of its own: in doubt if that of any estimate it fuses is.
+        """Return a row for each fusion without its own NIS test; it is doubted if any estimate that it fuses is.
 
-        NIS: normalised innovation squared; a fusion takes the estimates of several filters (`parts`) and no data.
-        `by` names the estimates that are in doubt, else all that were tested.
+        A fusion takes the estimates of several filters (`parts`) and no data, so it has no NIS (normalised innovation
+        squared). "by" names the doubted estimates, or if there are none all that were tested.
         """
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():

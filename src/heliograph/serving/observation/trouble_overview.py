@@ -42,7 +42,11 @@ class PlantTroubles(NamedTuple):
 
     @property
     def describe(self) -> list[str]:
-        """Return what is wrong with the plant, a line each: dead senders, doubted filters, refused messages."""
+        """Return lines on what is wrong with the plant: dead senders, doubted filters, refused messages.
+
+        `dead` holds nodes whose sender is dead, and `doubts` the filters with the ratio of their squared innovations to
+        its expectation. `refused` is a line on refused messages, "" if there are none.
+        """
         lines = [f"{node}: its sender is dead" for node in self.dead]
         for doubt in self.doubts:
             interval = f"({doubt.low:.2g} to {doubt.high:.2g})"
@@ -88,13 +92,13 @@ class TroubleOverview:
 
 
 def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[FilterDoubt]:
-    """Return the doubted filters of a plant, the most doubted first; `tests`: of their claims, by node and filter.
+    """Return the doubted filters of a plant, the most doubted first; `tests` holds their tests by node and filter.
 
-    A filter is doubted if the ratio of its squared innovations to what its covariance says is outside of its band.
+    A filter is doubted if the ratio of its squared innovations to what its covariance says is outside its band.
     """
     doubts = []
     for (node, name), test in tests.items():
-        # The ratio, of deviation sqrt(variance) / mean, is within NEAR deviations of 1: clearly inside of its band.
+        # The ratio's standard deviation is sqrt(variance) / mean. Within NEAR of these of 1, it is clearly in its band.
         if test.numbers < FEWEST or (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance:
             continue
         low, high = test.band()
@@ -127,7 +131,7 @@ that were refused.{more}</p></header>
 
 
 def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[PlantTroubles], most: int) -> str:
-    """Return the page of all plants in HTML, those with something wrong first, of `most` rows at most."""
+    """Return the HTML page of all plants, those with something wrong first, with at most `most` rows."""
     plants_in_trouble = {item.plant for item in wrong}
     rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]
     rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in plants_in_trouble]

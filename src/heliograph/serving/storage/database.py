@@ -18,11 +18,11 @@ def open_database(location: str) -> Engine:
     """Open the database of a store, at a path (SQLite) or a URL (PostgreSQL).
 
     Raises:
-        ValueError: no path, or the URL of another kind of database; the message contains no password.
+        ValueError: `location` is no path, or the URL of another kind of database. The message contains no password.
     """
     engine = create_engine(read_location(location))
     if engine.dialect.name == "sqlite":
-        # Each commit on the disk, and transactions that lock the database from their beginning on.
+        # Each commit is on the disk when it returns, and a transaction locks the database from its beginning.
         event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_immediate)
     return engine
@@ -47,10 +47,10 @@ def read_location(location: str) -> URL:
 
 
 def is_server_away(error: SQLAlchemyError) -> bool:
-    """Return whether an error means that a server does not answer, or ends its connections: it may answer later.
+    """Return whether an error means that a server does not answer now, but may answer later.
 
-    One that answers and refuses, as for a wrong password, would refuse again; but not for a reason that passes
-    (PASSING), as starting up. SQLite has no server.
+    A server that refuses, such as for a wrong password, would refuse again, unless the reason will pass (PASSING), such
+    as that it is starting. SQLite has no server.
     """
     if not isinstance(error, DBAPIError) or isinstance(error.orig, sqlite3.Error):
         return False
@@ -62,9 +62,9 @@ def is_server_away(error: SQLAlchemyError) -> bool:
 
 def _configure_sqlite(connection: Any, _: object) -> None:
     """Configure SQLite: each commit is on the disk before it returns, and readers do not wait for writers."""
-    connection.isolation_level = None  # transactions begin where the engine says so
-    connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can still be printed
-    # WAL: readers do not wait; FULL: on the disk; busy_timeout: milliseconds to wait for another writer.
+    connection.isolation_level = None  # transactions begin when the engine says so
+    connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # for damaged names
+    # WAL: readers do not wait. FULL: commits are on the disk. busy_timeout: milliseconds to wait for another writer.
     for pragma in (*PAGES, "journal_mode=WAL", "synchronous=FULL", "busy_timeout=30000"):
         connection.execute(f"PRAGMA {pragma}")
 

@@ -36,10 +36,10 @@ class Leases:
     """
 
     def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
-        """Make the tables of leases where the database has none.
+        """Make the tables of leases if the database has none.
 
         Args:
-            engine: of the database.
+            engine: the engine of the database.
             process: name of this process.
             parts: number of parts of the plants.
             term: seconds of a lease.
@@ -67,7 +67,7 @@ class Leases:
 
     @contextmanager
     def _raise_if_away(self) -> Iterator[None]:
-        """Raise AwayError, of one line, in place of an error by which the database does not answer; others as is."""
+        """Within the `with` block, raise a one-line AwayError if the database does not answer; pass on other errors."""
         try:
             yield
         except SQLAlchemyError as error:
@@ -82,15 +82,16 @@ class Leases:
             connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
 
     def leave(self) -> None:
-        """Release all parts of this process to others, and its name, so that it counts for no share."""
+        """Release all parts of this process, and its name, so that it no longer counts in the others' shares."""
         with self._raise_if_away(), self.engine.begin() as connection:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
 
     def _report_and_count_fair_share(self, connection: Connection, now: float) -> int:
-        """Report that this process is alive, forget the dead, and return how many parts this one should have.
+        """Report that this process is alive, forget dead processes, and return how many parts this one should have.
 
-        The dead have not reported for longer than the term. The remainder goes to the first processes by name.
+        A dead process has not reported for longer than the term. If the parts do not divide evenly, the first processes
+        by name get one more.
         """
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
         insert = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
@@ -103,7 +104,7 @@ class Leases:
         """Lease the part of this number until `now` + term if it is ours or free; return whether it is ours now."""
         lease = {"process": self.process, "until": now + self.term}
         insert = self._insert(PARTS).values(number=number, **lease)
-        # A row that is there is changed only where its lease is over or ours; else nothing is returned.
+        # An existing row is changed only if its lease is over or ours. Otherwise nothing is returned.
         is_free_or_own = (PARTS.c.until < now) | (PARTS.c.process == self.process)
         upsert = insert.on_conflict_do_update(index_elements=["number"], set_=lease, where=is_free_or_own)
         return connection.execute(upsert.returning(PARTS.c.number)).first() is not None

@@ -94,15 +94,15 @@ class Store:
             raise InputError(f"{error}; to begin anew, name another{more}") from None
 
     def _open_state(self, mine: Identity | None, opened: "Store | None", carrier: PlantMigration | None) -> None:
-        """Read the identity and check that the state can be used; find damage, and carry plants over where asked to.
+        """Read the identity, check that the state can be used, find damaged plants, and carry plants over if asked to.
 
         Args:
             mine: identity of the network, with the layout of this version; None opens any.
             opened: a store open on the same location, which has already looked for damage.
-            carrier: carries the plants of another network over; None refuses these.
+            carrier: converts the plants of another network; None refuses them.
 
         Raises:
-            ValueError: a state that cannot be used.
+            ValueError: the state cannot be used.
         """
         self.identity = self._read_identity(mine)
         self._check_layout(carrier is not None or mine is None)
@@ -115,13 +115,13 @@ class Store:
 
     def _check_network(self, mine: Identity) -> None:
         """Raise ValueError, which names what differs, if the store's state is of another network than `mine`."""
-        # Without the descriptions, whose numbers the other parts have as hashes.
+        # Leave out the descriptions: the other parts hold hashes of their numbers.
         here, there = ({key: part for key, part in one.items() if key != DESCRIPTION} for one in (mine, self.identity))
         if here == there:
             return
         try:
             differs = list_changes(mine, self.identity)
-        except (KeyError, ValueError, TypeError, AttributeError):  # without its numbers, or with damaged ones
+        except (KeyError, ValueError, TypeError, AttributeError):  # the numbers are missing or damaged
             differs = []
         if differs:
             more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
@@ -134,7 +134,7 @@ class Store:
         """Turn errors of the database into one line that names the store and says what was `expected` of it."""
         try:
             yield
-        except UnicodeError:  # of a damaged one: the database's own complaint cites it
+        except UnicodeError:  # the database's message quotes a damaged name
             raise self._make_unreadable_error("bytes that are no text") from None
         except SQLAlchemyError as error:
             said = getattr(error, "orig", None) or type(error).__name__
@@ -172,7 +172,7 @@ class Store:
             raise self._make_unreadable_error("no network that it is of") from None
 
     def _check_layout(self, carried: bool) -> None:
-        """Raise ValueError at a store of another layout, unless its plants are `carried` over and its layout can be."""
+        """Raise ValueError if the store has another layout, unless its plants are `carried` over and can be."""
         layout, release = self.identity.get(LAYOUT_KEY), self.identity.get("heliograph", "an unknown release")
         if layout == LAYOUT or (carried and layout in CARRIED):
             return
@@ -181,7 +181,7 @@ class Store:
                    f"layout {layout}, of heliograph {release}{why}")  # fmt: skip
 
     def _find_damaged(self) -> dict[str, DamagedRow]:
-        """Return the plants' rows that are not as their checksums say, by name; raise if all of the file is damaged."""
+        """Return by name the plants' rows that do not match their checksums; raise if the whole file is damaged."""
         results: dict[str, DamagedRow] = {}
         with self._engine.connect() as connection:
             if self._engine.dialect.name == "sqlite":
@@ -228,11 +228,11 @@ class Store:
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 
     def begin_anew(self, names: Iterable[str]) -> None:
-        """Remove the plants of these names, damaged or not: each begins anew with its next message."""
+        """Remove the plants of these names, damaged or not; each begins anew with its next message."""
         with self._name_store_in_errors("a database that takes a commit"), self._engine.begin() as connection:
             for name in names:
                 damage = self.damaged.pop(name, None)
-                # A damaged name may be no text that any name could equal: its row is found by its checksum.
+                # A damaged name may equal no given name. Its row is found by its checksum instead.
                 has_lost_name = damage is not None and not damage.named
                 is_plant = PLANTS.c.checksum == damage.checksum if damage and has_lost_name else PLANTS.c.name == name
                 if not connection.execute(delete(PLANTS).where(is_plant)).rowcount:
@@ -282,16 +282,16 @@ class Store:
         return outputs
 
     def unpublished(self) -> list[Output]:
-        """Return outputs with numbers above the last published one: committed here, and perhaps not published."""
+        """Return the outputs that were committed after the last one known as published; some may not be published."""
         published = self.number(PUBLISHED.format(self.process))
         entries = self.entries(published, self.process)
         return [entry for entry in entries if entry.number is not None and entry.number > published]
 
     def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
-        """Return the outputs in the journal from the batch that ends after number `after` on, of one process or all.
+        """Return the journal's outputs from the first batch that ends after number `after` on, of one process or all.
 
         Raises:
-            ValueError: a damaged entry.
+            ValueError: an entry is damaged.
         """
         select_batches = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
         outputs = list[Output]()
@@ -305,7 +305,7 @@ class Store:
         return outputs
 
     def number(self, name: str) -> int:
-        """Return the stored count of this name, as of published outputs; 0 where none was stored."""
+        """Return the stored count of this name, such as that of published outputs; 0 if none was stored."""
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
         return 0 if row is None else self._check_count(*row)
@@ -325,7 +325,7 @@ class Store:
                 self._upsert(connection, NUMBERS, rows)
 
     def _check_count(self, name: str, value: int, written: int) -> int:
-        """Return a stored count; raise ValueError if `written` is not the checksum of it."""
+        """Return a stored count `value`; raise ValueError if `written` is not its checksum."""
         if not is_row_undamaged(written, name, value):
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
         return value
@@ -353,7 +353,7 @@ class Store:
         self.identity = mine
 
     def begin_from(self, location: str, mine: Identity, carrier: PlantMigration | None = None) -> None:
-        """Copy the plants of another store, which stays, into this empty one; `carrier` fits them to this network."""
+        """Copy the plants of another store into this empty one; `carrier` converts them to this network."""
         other = Store(location, mine if carrier is None else None, begun=True)
         name_store = self._name_store_in_errors(f"a database that takes the plants of {other.name}")
         with name_store, self._engine.begin() as here, other._engine.connect() as there:
@@ -381,11 +381,11 @@ class Store:
         self._engine.dispose()
 
     def _add_to_count(self, connection: Connection, name: str, more: int) -> int:
-        """Add `more` to a stored count, which locks it until the commit; return the new value, its checksum renewed."""
+        """Add `more` to a stored count, renew its checksum, and return it; the count is locked until the commit."""
         insert = self._insert(NUMBERS).values(add_checksum(NUMBERS, name, more))
         upsert = insert.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(upsert.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
-        # A count that was there has the checksum of what it was before.
+        # If the count existed, its checksum is still that of the old value: check that, and renew it.
         if written != checksum(name, value):
             value = self._check_count(name, value - more, written) + more
             is_count = NUMBERS.c.name == name

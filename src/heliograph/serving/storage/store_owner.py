@@ -88,11 +88,11 @@ def _lock_file(path: str, process: str) -> Iterator[None]:
 
 @contextmanager
 def _lock_session(engine: Engine, process: str) -> Iterator[None]:
-    """Hold an advisory lock of PostgreSQL, one for each `process` name, for the life of a session; raise if taken.
+    """Hold PostgreSQL's advisory lock for the name `process` within the `with` block; raise if it is taken.
 
-    The session is named after this process, so that others are told who has the lock.
+    The session is named after this machine's process, so that others are told who has the lock.
     """
-    key = crc32(process.encode()) >> 1  # 31 bits: the server takes signed numbers of 32
+    key = crc32(process.encode()) >> 1  # 31 bits, since the server takes signed numbers of 32 bits
     with engine.connect() as connection:
         session_name = f"heliograph {name_of_process()}"[:63]
         connection.execute(text("SELECT set_config('application_name', :name, false)"), {"name": session_name})

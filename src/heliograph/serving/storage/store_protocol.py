@@ -64,10 +64,10 @@ class StoreProtocol(Protocol):
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Commit plants, which must have the versions that they were read with, and outputs.
+        """Commit plants and outputs, and return the outputs of the `entries` with their numbers.
 
-        Returns the outputs of the `entries` with their numbers. `malformed`: how many messages could not be read.
-        `published` is the number of the last output that was published, None if that has not changed.
+        Plants must have the versions with which they were read. `malformed`: how many messages could not be read.
+        `published`: the number of the last published output, None if it has not changed.
 
         Raises:
             ConflictError: another process has committed one of the plants.
@@ -97,7 +97,7 @@ class StoreProtocol(Protocol):
 
 
 def identity(fleet: Fleet) -> Identity:
-    """Return what a store must agree with to continue this fleet: its network, compiled program and options.
+    """Return the identity that a store must have to continue this fleet: its network, compiled program and options.
 
     Args:
         fleet: the fleet whose plants the store keeps.
@@ -153,9 +153,9 @@ class InMemoryStore:
 
 
 def describe_damaged_plants(plants: Mapping[str, DamagedRow]) -> str:
-    """Return a sentence for users on damaged plants: the options that begin LISTED of them anew, and if a name is lost.
+    """Return a sentence for users on damaged plants, with the options that begin the first LISTED of them anew.
 
-    `named`: whether a plant's name is as it was written.
+    It also says whether a plant has lost its name (`named` is False).
     """
     options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"

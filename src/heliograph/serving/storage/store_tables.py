@@ -27,10 +27,10 @@ def checksum(name: str | int, *values: str | int | bytes) -> int:
 
 
 def is_row_undamaged(written: object, name: object, *values: object) -> bool:
-    """Return whether a row has the checksum `written` with it; a damaged row may contain anything."""
+    """Return whether a row matches its stored checksum `written`; a damaged row may contain anything."""
     if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
         return False
-    return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
+    return written == checksum(name, *values)  # type: ignore[arg-type]  # checked above
 
 
 def is_name_undamaged(written: object, name: object) -> bool:
@@ -39,7 +39,7 @@ def is_name_undamaged(written: object, name: object) -> bool:
 
 
 def _checksum_row(name: str | int, values: Sequence[str | int | bytes]) -> int:
-    """Return the CRC-32 of a row's name and columns, each behind its length, so that none runs into the next."""
+    """Return the CRC-32 of a row's name and values; each value's length stands before it, to mark where it begins."""
     checksum = crc32(f"{name}".encode())
     for value in values:
         data = value if isinstance(value, bytes) else f"{value}".encode()
@@ -54,7 +54,7 @@ def add_checksum(table: Table, *values: Any) -> dict[str, object]:
 
 
 def select_plants(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
-    """Return rows with these columns of the stored plants of these names, which are asked for AT_ONCE by AT_ONCE."""
+    """Return rows with these columns of the stored plants of these names; a query asks for AT_ONCE names at most."""
     results: list[Any] = []
     for i in range(0, len(names), AT_ONCE):
         results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
