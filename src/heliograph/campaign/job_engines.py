@@ -72,7 +72,7 @@ def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job
     count = len(waiting)
 
     def take_jobs(worker: _WorkerProcess) -> None:
-        """Take jobs from `waiting`, and put each with the worker's reply into `finished`, until none waits or it stops."""
+        """Take jobs from `waiting` and put each with its reply into `finished` until none waits or the worker stops."""
         while not worker.stopped:
             try:
                 job = waiting.popleft()

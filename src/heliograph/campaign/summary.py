@@ -113,7 +113,7 @@ def compute_scores(store: Path, campaign: Campaign) -> list[Score]:
 
 
 def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
-    """Return two means over time, (2, run, node, filter): of squared errors summed over states, and of NEES per dimension.
+    """Return two means over time, (2, run, node, filter): of squared errors summed over states, and of NEES per state.
 
     The error is NaN if a filter claims a variance that is not finite in this run.
     """

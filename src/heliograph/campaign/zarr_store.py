@@ -257,7 +257,7 @@ def write_claims(path: Path, setting: int, claims: Claims) -> None:
 
 
 def _sync_files(folder: Path, start: str) -> None:
-    """Flush files whose names begin with `start`, and their folder, to the disk, so that they outlast a loss of power."""
+    """Flush files whose names begin with `start`, and their folder, to the disk, to outlast a loss of power."""
     for file in folder.glob(f"{start}*"):
         sync(file)
     sync(folder)

@@ -80,7 +80,7 @@ def backtest(
         )
 
     def make_results(found: "heliograph.forecasting.Backtest") -> "ResultsContent":
-        """Return the content of the results folder; the network is fitted again after each `refit` rows, 0 for never."""
+        """Return the content of the results folder; the network is fitted anew each `refit` rows, 0 for never."""
         from heliograph.report.pages.backtest import make_backtest_results
 
         return make_backtest_results(found, network, refit)

@@ -89,7 +89,7 @@ def write_plant_estimates(
     lag: float | None,
     options: ReadingOptions,
 ) -> list[str]:
-    """Write a plant's estimates, and beside them those that use everything up to `lag` later; return lines on the latter.
+    """Write a plant's estimates, and beside them those that use what came up to `lag` later; return lines on these.
 
     `lag` is in the unit of time; None writes no such estimates.
     """

@@ -182,7 +182,7 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
-    """Return a line on the errors of each filter, if the truth is known: RMSE by state, and NEES (1 if its claim holds)."""
+    """Return a line on the errors of each filter, if the truth is known: RMSE by state, and NEES (1: claim holds)."""
     from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 
     lines = []

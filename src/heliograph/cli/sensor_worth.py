@@ -81,7 +81,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 
 
 def _check_figure_writable(figure: Path) -> None:
-    """Raise the error of writing the figure before the work: matplotlib is missing, or the format or folder is wrong."""
+    """Raise the error of writing the figure before the work: no matplotlib, or a wrong format or folder."""
     from heliograph.disk.atomic_files import check_writable
     from heliograph.numerics.process.optional_packages import check_installed
 
@@ -130,7 +130,7 @@ def _parse_inputs(names: Sequence[str], words: Sequence[str], steps: int) -> "np
 
 
 def describe_worth(worth: "SensorWorth", steps: int, runs: int) -> Iterator[str]:
-    """Yield the lines of the table: a title, the states, a line for each case, and the best addition if there are several.
+    """Yield the lines of the table: a title, the states, a line for each case, and the best addition if any.
 
     Args:
         worth: what `compute_worth` returned.

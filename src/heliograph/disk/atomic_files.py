@@ -61,7 +61,7 @@ def lock_folder(folder: Path) -> Iterator[bool]:
 
 
 def _open_locked(path: Path) -> int | None:
-    """Return the handle of the lock file at `path` after making and locking it; None if somebody else holds the lock."""
+    """Return the handle of the lock file at `path` after making and locking it; None if another holds the lock."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock_handle(handle):

@@ -173,7 +173,7 @@ def _explain_angles(filter: AbstractFilter) -> list[str]:
 
 
 def _explain_entries(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:
-    """Return a line for each entry of an array, such as "z[0]: position", with its note; "z: not used" if it is empty."""
+    """Return a line for each entry of an array, such as "z[0]: position", with its note, or "z: not used"."""
     if not names:
         return [f"{array}: not used"]
     return [f"{array}[{i}]: {name}{note}" for i, (name, note) in enumerate(zip(names, notes, strict=True))]

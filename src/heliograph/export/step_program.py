@@ -136,7 +136,7 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
 
 
 def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
-    """Return the first result that always equals result `number`, after every part and at the start, or `number` itself.
+    """Return the first result that always equals result `number` (after every part and at the start), or `number`.
 
     results[n].same is the number of the first result of a part that always equals result n. `named` holds the numbers
     at the start.

@@ -249,7 +249,7 @@ class EventTable:
         return lateness
 
     def delays(self, step: float | None = None) -> dict[str, Delays]:
-        """Return for each node the probabilities of its delays in steps, with intervals; nodes without delays are absent.
+        """Return for each node the probabilities of its delays in steps, with intervals; others are absent.
 
         Args:
             step: seconds of a step; by default the table's, or else the median time between a node's measurements.

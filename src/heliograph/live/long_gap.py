@@ -151,8 +151,8 @@ def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[Factor
 def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
     """Return the state `count` steps after the last of the states `passed`, which are PROBED steps apart.
 
-    A number that changed by as much in the last quarter of the states as in the quarter before goes on at this rate. All
-    other numbers stay. STEADY is the relative difference up to which two changes count as equal.
+    A number that changed by as much in the last quarter of the states as in the quarter before goes on at this rate.
+    All other numbers stay. STEADY is the relative difference up to which two changes count as equal.
     """
     quarter = len(passed) // 4
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))

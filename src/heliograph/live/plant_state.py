@@ -202,7 +202,7 @@ class PlantState:
         return True
 
     def _count_withdrawn(self, rows: Sequence[HeldRow], leap: ClockLeap, names: Sequence[str]) -> None:
-        """Count the events of a leap's rows as withdrawn, by node; `names` are those of the nodes, then of the inputs."""
+        """Count the events of a leap's rows as withdrawn, by node; `names` are of the nodes, then of the inputs."""
         counts: dict[str, int] = {}
         for row in rows:
             for node, _running_count, _time in row.events:

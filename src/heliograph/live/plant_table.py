@@ -76,7 +76,7 @@ class SlotTable:
         row[-1] = time
 
     def predict_outputs(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
-        """Return the outputs (row, outputs) that are predicted from the rows in the slots `before`, without measurements.
+        """Return the outputs (row, outputs) predicted from the rows in the slots `before`, without measurements.
 
         The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
         number is at most `last`, the last step for which the network is defined.

@@ -137,7 +137,7 @@ def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: 
     A lost transmission on an event only delays the next heartbeat, so that each `heartbeat` steps have at least one.
     """
     if isinstance(trigger, Periodic):
-        # They are due in the steps phase, phase + period, ...; count those up to `final`, less those before the silence.
+        # They are due in the steps phase, phase + period, ...; count those up to `final` less those before the silence.
         period, phase = int(trigger.period), int(trigger.phase)
         return (final - phase) // period - (final - silent - phase) // period
     first_due = int(last is None and silent > 0 and trigger.needs_reference)
@@ -155,7 +155,7 @@ def find_silence_rules(network: Network) -> dict[str, SilenceRule]:
 def count_values_before_losses(network: Network, deciding: Mapping[str, AbstractTrigger]) -> dict[int, int]:
     """Return {index of a node whose losses are known: how many of its numbers are values, before those on losses}.
 
-    Losses are known if messages are numbered. `deciding` holds by node the triggers of senders that decide when to send.
+    Losses are known if messages are numbered. `deciding` holds by node the triggers of senders that decide.
     """
     return {
         network.names.index(name): node.received - trigger.side_information(len(node.outputs))

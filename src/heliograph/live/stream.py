@@ -219,7 +219,7 @@ class Stream:
     def _describe_remark(self) -> list[str]:
         """Return a line with the filter's remark on its state if it is new, such as that a gate gave in; else [].
 
-        `remark.times` says how often the filter has made this remark so far, and `_remarked` how often at the last call.
+        `remark.times` says how often the filter has made this remark so far, and `_remarked` how often before.
         """
         remark = self.filter.remark(self._compiled.state.unflatten(self._stepper.state))
         is_new = remark.times > self._remarked
@@ -267,7 +267,7 @@ class Stream:
         stepper.accept()
 
     def _name_faulty_function(self, u: np.ndarray) -> str:
-        """Return "; " and the function of the filter's model that gives NaN or infinity for inputs u, or "" if none does."""
+        """Return "; " and the function of the filter's model that is not finite for inputs u, or "" if none is."""
         before = self.filter.estimate(self._compiled.state.unflatten(self._stepper.state))
         fault = describe_non_finite_function(self.filter, before, u, self.steps)
         return f"; {fault}" if fault else ""

@@ -65,7 +65,7 @@ class RepeatWatch:
 
     @staticmethod
     def for_node(node: object) -> "RepeatWatch | None":
-        """Return the watch for a node's readings; None if it refuses stuck values, or if its sender decides when to send."""
+        """Return the watch for a node's readings; None if it refuses stuck values, or if its sender decides."""
         if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
             return None
         refuses = node.limits is not None and node.limits.stuck is not None
@@ -147,7 +147,7 @@ class RepeatWatch:
             readings: how many readings there were, including the run.
             equal: how many readings were equal to the previous one, including the run.
         """
-        # Outside the run, e = equal - (length - 1) of o = readings - length pairs are equal. Estimate (e + 1) / (o + 2).
+        # Outside the run, e = equal - (length - 1) of o = readings - length pairs are equal: take (e + 1) / (o + 2).
         by_count = (equal - (length - 1) + 1) / (readings - length + 2)
         p = max(self._bound_repeat_probability(output, step), by_count)
         # The least count c with p^(c - 1) < SELDOM, but at least LEAST. There is none if p is 1 up to SURE.

@@ -230,7 +230,7 @@ class Timeline:
         return make_forecast_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
-        """Return the slot (table row) of the state at `now` and its time; the state is predicted if nothing came then."""
+        """Return the slot (table row) of the state at `now` and its time; it is predicted if nothing came then."""
         newest, by_steps = self._plant.rows.held[-1], self._program.dt is None
         newest_time, newest_node, _ = newest.key  # the node is BEFORE in the row before all events
         now = np.floor(min(self.now, self._fleet.end_step)) if by_steps else self.now

@@ -197,7 +197,7 @@ class Arrivals:
 
     @property
     def longest_gap(self) -> int | None:
-        """Return the largest number of due messages in a row that did not arrive, or None if it is not known what was due."""
+        """Return the largest number of due messages in a row that did not arrive, or None if that is unknown."""
         if self.due_slots is None:
             return None
         # As if a message had come before the first and after the last.
@@ -282,7 +282,7 @@ class _DeclaredSending(NamedTuple):
 
 
 def _read_declared_sending(receiver: Any) -> _DeclaredSending:
-    """Return what the network says of a node's messages: their period, whether they may be lost, and which shares arrive.
+    """Return what the network says of a node's messages: their period, if they may be lost, and which shares arrive.
 
     The period is in steps, None if none is declared. There is a share for each received number, None if they are not
     constant.

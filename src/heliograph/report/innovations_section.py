@@ -146,7 +146,7 @@ def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
 
 
 def _make_outputs_table(health: Health) -> list[Table]:
-    """Return the table of outputs: bias, size, and how many values weighing filters doubted; [] if there is no output."""
+    """Return the table of outputs: bias, size, and how many values weighing filters doubted; [] without outputs."""
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit, less that of the law of its noise. **Size**: mean square of the "
@@ -199,8 +199,8 @@ def _make_declared_table(health: Health) -> list[Table]:
 def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
     """Return a row of cells for each class of messages that declare about the same variance.
 
-    The cells are the range of variances, the number of values, the size (mean squared innovation over its variance, with
-    its interval), and the scale (the best factor of the declared variances, with its interval; "–" without one).
+    The cells are the range of variances, the number of values, the size (mean squared innovation over its variance,
+    with its interval), and the scale (the best factor of the declared variances, with its interval; "–" without one).
     """
     rows = []
     for one in judgement.classes:

@@ -46,7 +46,7 @@ class ForecastPublisher:
         """Check thresholds and horizons against the network; raise ValueError if they do not fit."""
         check_threshold_names(fleet.network, thresholds)
         self._thresholds = thresholds
-        # `self.horizons` are in the unit of time: steps, or seconds if time is continuous.
+        # `self.horizons` are in the unit of time: steps, or that of dt if time is continuous.
         self._fleet, self._continuous = fleet, fleet.program.dt is not None
         if isinstance(horizons, int):
             if self._continuous:

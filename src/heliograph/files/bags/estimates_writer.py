@@ -290,7 +290,7 @@ def _select_pose_and_covariance(
 
 
 def _convert_angles_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return the quaternion (x, y, z, w) of a rotation by yaw about z, pitch about the new y, and roll about the new x."""
+    """Return the quaternion (x, y, z, w) of a turn by yaw about z, pitch about the new y, and roll about the new x."""
     # Sines and cosines of half the angles.
     (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
     return (

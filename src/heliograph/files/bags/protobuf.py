@@ -87,7 +87,7 @@ class ProtobufSchema:
 
     @staticmethod
     def of(data: bytes) -> "ProtobufSchema":
-        """Return the schema in an encoded FileDescriptorSet (files that define types); raise ValueError for other data."""
+        """Return the schema in an encoded FileDescriptorSet (files of types); raise ValueError for other data."""
         schema = ProtobufSchema({}, {})
         # Field numbers in descriptor.proto: the set has 1 (file); a file has 2 (package), 4 (message types),
         # 5 (enumerations) and 12 (syntax).

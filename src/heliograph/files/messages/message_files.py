@@ -116,7 +116,7 @@ def find_arrival_time(logged: Mapping[str, Any]) -> Any:
 
 
 def _is_moment(value: object) -> bool:
-    """Return whether a value, possibly a text, is a date with a zone, or seconds since 1970 within YEARS (2001 to 2286)."""
+    """Return whether a value, possibly a text, is a date with a zone, or seconds since 1970 in YEARS, 2001 to 2286."""
     number = parse_number(value) if isinstance(value, str) else value
     if isinstance(number, str):
         try:
@@ -141,7 +141,7 @@ def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
 
 
 def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a JSON file, which is one document or has a message on each line; errors replace bad ones."""
+    """Yield the messages of a JSON file, one document or a message on each line; errors replace bad messages."""
     with open_text(path) as file:
         if find_extension(path) == ".json":  # try it as one document, and else read it line by line
             text = file.read()

@@ -160,7 +160,7 @@ def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
 
 
 def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the factors of P = L D L': L's entries below the diagonal (..., n (n - 1) / 2), row by row, and D (..., n).
+    """Return the factors of P = L D L': L's entries below the diagonal (..., n (n - 1) / 2), by row, and D (..., n).
 
     Many covariances P (..., n, n) are eliminated at once. A pivot below n eps times its variance is rounding, and is
     set to this bound.
