@@ -78,8 +78,9 @@ def sum_neighbouring_words(
     size = tables.shape[1]
 
     def weigh_bits_above(block: jax.Array) -> jax.Array:
-        """Return the likelihood of the bits above a block (those that name it) for each combination of error rates,
-        times the combination's probability.
+        """Return the weighted likelihood of the bits that name a block, for each combination of error rates.
+
+        The weight is the combination's probability.
 
         Closed over: `pairs`, likelihoods of the bits, `weights`; `start`, the first word's number; `size` of a block.
         """
