@@ -134,8 +134,8 @@ class _JaxEvaluation:
     def _evaluate_loop(self, loop: Loop) -> None:
         """Evaluate a loop by JAX's loop, and note its results.
 
-        The carry of JAX's loop is a pair: the carried numbers that are needed, and the arrays of the buffers that the
-        body fills. Values that are computed in a turn hold in that turn alone: `self.values` is the outer one again
+        The carry of JAX's loop is a pair: numbers, one for each parameter whose place is in `carried`, and arrays, one
+        for each buffer that the body fills (`filled`). Values that are computed in a turn hold in that turn alone: `self.values` is the outer one again
         behind the loop.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
@@ -143,11 +143,7 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
-            """Set `self.values` and `self.memory` to what they are when a turn of the loop begins.
-
-            They hold what is known outside the loop, and the carry. The carry is a pair: numbers, one for each
-            parameter whose place is in `carried`, and arrays, one for each buffer in `filled`.
-            """
+            """Set `self.values` and `self.memory` to what is known outside the loop, and to the carry of this turn."""
             numbers, arrays = carry
             self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
             self.values |= zip((loop.parameters[k] for k in carried), numbers, strict=True)

@@ -174,10 +174,7 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
 
     def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
-        """Take one Riccati step: return the covariance of (x, e_relays) after a slot, and the receiver's best gain.
-
-        `side` is the system that the receiver sees in the slot.
-        """
+        """Take one Riccati step: return the covariance of (x, e_relays) after a slot, and the receiver's best gain."""
         joint = predict(covariance, side)  # with the measurement, before the correction
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
