@@ -135,8 +135,8 @@ class _JaxEvaluation:
         """Evaluate a loop by JAX's loop, and note its results.
 
         The carry of JAX's loop is a pair: numbers, one for each parameter whose place is in `carried`, and arrays, one
-        for each buffer that the body fills (`filled`). Values that are computed in a turn hold in that turn alone: `self.values` is the outer one again
-        behind the loop.
+        for each buffer that the body fills (`filled`). Values that are computed in a turn hold in that turn alone:
+        `self.values` is the outer one again behind the loop.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
         carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # their places in loop.parameters
