@@ -19,9 +19,10 @@ def test_signatures_are_short_enough_to_read():
     shown = {}
     for place, name in PUBLIC:
         try:
-            shown[f"{place}.{name}"] = str(inspect.signature(getattr(import_module(place), name)))
+            signature = str(inspect.signature(getattr(import_module(place), name)))
         except (TypeError, ValueError):  # no callable, or one of another library without a signature
             continue
+        shown[f"{place}.{name}"] = signature.replace("pathlib._local.", "pathlib.")  # so Python 3.13 alone
     assert len(shown) > 200
     long = {name: len(text) for name, text in shown.items() if len(text) >= LONGEST}
     assert not long, "\n".join(f"{name}: {size}" for name, size in sorted(long.items()))

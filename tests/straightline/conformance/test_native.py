@@ -82,10 +82,16 @@ def primitives() -> set[str]:
 
 
 def operations(jaxpr: Any) -> set[str]:
-    """The operations of a traced program and of those inside it."""
+    """The operations of a traced program and of those inside it, also in the definition of one (JAX from 0.12 on)."""
     names = set()
     for equation in jaxpr.eqns:
         names.add(equation.primitive.name)
+        defined = equation.params.get("_prim") if equation.primitive.name == "call_hi_primitive" else None
+        if defined is not None:
+            avals = jax.tree.unflatten(defined.in_tree, [v.aval for v in equation.invars])
+            shapes = jax.tree.map(lambda aval: jax.ShapeDtypeStruct(aval.shape, aval.dtype), avals)
+            with jax.enable_x64(True):
+                names |= operations(jax.make_jaxpr(defined.expand)(*shapes).jaxpr)
         for param in equation.params.values():
             for inner in param if isinstance(param, tuple | list) else (param,):
                 inner = getattr(inner, "jaxpr", inner)
