@@ -124,10 +124,8 @@ def _count_months(origin: Origin, horizon: object) -> int | None:
         return int(horizon.astype(np.int64)) * size * MONTHS[unit] if unit in MONTHS else None
     if not isinstance(horizon, datetime | np.datetime64):
         return None
-    seconds = _convert_to_seconds(origin, horizon)  # raises if the date is not after the data
-    assert seconds is not None
-    date, end = check_dates("horizons", [horizon]), _find_end_of_data(origin, horizon)
-    return int((date[0].astype("datetime64[M]") - end.astype("datetime64[M]")).astype(int))
+    date, end = _read_date_ahead(origin, horizon)
+    return int((date.astype("datetime64[M]") - end.astype("datetime64[M]")).astype(int))
 
 
 def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
@@ -176,14 +174,21 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
         return _convert_span_to_seconds(horizon)
     if not isinstance(horizon, datetime | np.datetime64):
         return None
-    end = _find_end_of_data(origin, horizon)
+    date, end = _read_date_ahead(origin, horizon)
     # As Python's integers: 64 bits of nanoseconds hold dates of six centuries, but spans of three.
-    ahead = int(check_dates("horizons", [horizon])[0].astype(np.int64)) - int(
-        end.astype("datetime64[ns]").astype(np.int64)
-    )
-    if ahead <= 0:
+    return (int(date.astype(np.int64)) - int(end.astype(np.int64))) / SECOND
+
+
+def _read_date_ahead(origin: Origin, horizon: datetime | np.datetime64) -> tuple[np.datetime64, np.datetime64]:
+    """Return a date ahead and the date at which the data end, both in nanoseconds.
+
+    Raises:
+        ValueError: a date that is missing or not after the data, or that 64 bits of nanoseconds cannot say.
+    """
+    date, end = check_dates("horizons", [horizon])[0], _find_end_of_data(origin, horizon).astype("datetime64[ns]")
+    if not date > end:  # nor is NaT
         raise fail("horizons", f"dates after the data, which end at {end}", show_value(horizon))
-    return ahead / SECOND
+    return date, end
 
 
 def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:

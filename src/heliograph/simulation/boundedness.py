@@ -32,7 +32,7 @@ from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.transmission.joint_links import JointLinks, join_links
+from heliograph.simulation.transmission.joint_links import JointLinks, find_joint_links
 
 CERTAIN = 1e-13  # of a row's second moment: a variance of its gain that is rounding
 
@@ -88,11 +88,11 @@ def certify_boundedness(network: Network) -> Boundedness:
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
     chosen = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.chosen_by_value]
-    found = _judge_links(network, a, q, join_links(network, len(a), counts_all=False))
+    found = _judge_links(network, a, q, find_joint_links(network, len(a), counts_all=False))
     if not chosen or found.verdict == "certified":
         return found
     # The other nodes certify nothing. What grows though all nodes sent everything grows in any case.
-    complete = _judge_links(network, a, q, join_links(network, len(a), counts_all=True))
+    complete = _judge_links(network, a, q, find_joint_links(network, len(a), counts_all=True))
     if complete.verdict == "impossible":
         return complete
     unjudged = f"what nodes {chosen} show is not counted, as values decide what of it is used"

@@ -38,7 +38,7 @@ class JointLinks(NamedTuple):
     sensor_noise: Float[np.ndarray, "m m"]
 
 
-def join_links(network: Network, states: int, counts_all: bool) -> JointLinks:
+def find_joint_links(network: Network, states: int, counts_all: bool) -> JointLinks:
     """Return the joint model of all nodes' links: sensors stacked, channels in parallel, modes that occur.
 
     Args:
