@@ -129,7 +129,7 @@ from .simulation.simulate import (
     monte_carlo as monte_carlo,
     simulate as simulate,
 )
-from .simulation.filter_recording import (
+from .simulation.recordings.filter_recording import (
     run as run,
 )
 from .simulation.likelihood import (

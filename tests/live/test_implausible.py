@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.implausible_data import step_plausibly
 from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.recordings.implausible_data import step_plausibly
 from tests.live.worlds import FADING, PLANT, SENSOR, events, forgetful, moving
 
 ABSURD = [1e16, -1e20, 3.4e38, 1e155, -1e308]

@@ -9,9 +9,9 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.relays.design import local_error_design, receiver_behind_relays, relay_schedules
-from heliograph.simulation.filter_recording import run
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.recordings.filter_recording import run
 from heliograph.simulation.results.error_sums import Statistics, error_statistics
 from heliograph.simulation.simulate import monte_carlo
 from tests.relays.relay_problems import example, unusual

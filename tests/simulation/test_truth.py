@@ -6,8 +6,8 @@ import pytest
 import heliograph as hg
 from heliograph.cli.run import run as command
 from heliograph.report import examine, run_summary
+from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 from heliograph.report.pages.run import make_errors_table
-from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3, outputs=["range"])

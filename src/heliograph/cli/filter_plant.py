@@ -134,7 +134,7 @@ def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
 
     Only filters that weigh values by how likely they are can doubt them.
     """
-    from heliograph.report.sensor_output_health import summarise_weighed_outputs
+    from heliograph.report.diagnosis.sensor_output_health import summarise_weighed_outputs
 
     return [str(output) for output in summarise_weighed_outputs(network, record)]
 

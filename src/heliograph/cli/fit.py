@@ -172,7 +172,7 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     each row is a message of one node.
     """
     from heliograph.learning.packet_losses.packet_fates import fates_of_measurements, fates_of_sequence
-    from heliograph.report.arrivals import list_arrivals
+    from heliograph.report.diagnosis.arrivals import list_arrivals
 
     fates = fates_of_measurements(recording.measurements)
     for arrivals in list_arrivals(network, recording.time, recording.measurements):

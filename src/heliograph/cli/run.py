@@ -183,7 +183,7 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
     """Return a line on the errors of each filter, if the truth is known: RMSE by state, and NEES (1: claim holds)."""
-    from heliograph.report.sensor_output_health import compute_filter_errors, round_to
+    from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 
     lines = []
     for errors in compute_filter_errors(record):
@@ -262,7 +262,7 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     """Examine the records of all plants and write the report, a page for each plant and one of all."""
     from dataclasses import replace
 
-    from heliograph.report.recording_diagnosis import Health, examine
+    from heliograph.report.diagnosis.recording_diagnosis import Health, examine
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:

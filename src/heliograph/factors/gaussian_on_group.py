@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import Gaussian, from_columns
-from heliograph.numerics.manifold import Manifold
+from heliograph.numerics.angles.manifold import Manifold
 
 
 def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:

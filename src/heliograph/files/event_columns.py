@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.files.sources.message_reading import Unread
 from heliograph.live.event import VERDICTS, Verdict
-from heliograph.live.link_counts import GAP
+from heliograph.live.health.link_counts import GAP
 from heliograph.model.checks.refusal_reasons import Reason, RefusedError
 from heliograph.numerics.check import fail
 from heliograph.numerics.times.timestamp_order import SECOND, YEAR, find_unset_stamps

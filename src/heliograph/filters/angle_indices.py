@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 
 
 class FilterAngles(NamedTuple):

@@ -23,7 +23,7 @@ from heliograph.model.checks.plant_inputs import check_time_step, do_inputs_spoi
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premises.premise import NOTHING, Premise, StaticPremise, believes
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lazy_exports import refuse_attribute

@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.numerics.angle import TURN, Angles
+from heliograph.numerics.angles.angle import TURN, Angles
 from heliograph.numerics.linalg import (
     NEGATIVE_TOLERANCE,
     rounding,

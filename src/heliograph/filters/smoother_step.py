@@ -14,8 +14,8 @@ from heliograph.factors.factored_gaussian import BackwardGain, Gaussian, conditi
 from heliograph.factors.gaussian_on_group import settle, unsettle
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
-from heliograph.numerics.angle import Angles, wrap_angles
-from heliograph.numerics.manifold import Manifold
+from heliograph.numerics.angles.angle import Angles, wrap_angles
+from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 

@@ -25,14 +25,14 @@ from heliograph.forecasting.scores import (
     select_law,
 )
 from heliograph.model.forecast_origin import Origin
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, items
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.filter_recording import run
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.recordings.filter_recording import run
 from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:  # an extra

@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.filters.truncation import PlacedLimits
 from heliograph.forecasting.forecast_result import Prediction
 from heliograph.model.estimate import Claim
-from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
 

@@ -14,7 +14,7 @@ from heliograph.forecasting.forecast_result import Array, Forecast
 from heliograph.forecasting.one_step_predictions import predict_record, predict_rows
 from heliograph.forecasting.residual_figure import ResidualQuantiles, compare_with_normal_quantiles, draw_residuals
 from heliograph.forecasting.start_states import find_origin
-from heliograph.numerics.angle import Angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_near
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float

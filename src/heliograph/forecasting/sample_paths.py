@@ -18,10 +18,10 @@ from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, transit
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
+from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.float64 import compile_in_float64
-from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Bool
 from heliograph.random_affine.memories_of_channels import memories

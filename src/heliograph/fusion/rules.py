@@ -21,7 +21,7 @@ from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, gains_of
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.plant import AnyPlant, read_manifold
-from heliograph.numerics.angle import wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import wrap_angles, wrap_near
 from heliograph.numerics.check import (
     array,
     fail,

@@ -3,6 +3,6 @@
 from .event import (
     Event as Event,
 )
-from .link_counts import (
+from .health.link_counts import (
     LinkCounts as LinkCounts,
 )

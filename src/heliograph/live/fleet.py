@@ -9,18 +9,18 @@ import numpy as np
 
 from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
-from heliograph.live.link_counts import ScreenedEvent
+from heliograph.live.health.link_counts import ScreenedEvent
+from heliograph.live.health.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
+from heliograph.live.health.stuck_sensor_watch import RepeatWatch
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.plant_state import FinalisedPlant, PlantState
 from heliograph.live.plant_table import SlotTable, cut_chain_into_legs, group_by_turn
-from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
 from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, list_columns_of_blocks
-from heliograph.live.stuck_sensor_watch import RepeatWatch
 from heliograph.model.checks.refusal_reasons import count_by_reason
 from heliograph.model.over_time import steps_covered
-from heliograph.model.reading_limits import ReadingLimits
-from heliograph.model.repeated_readings import Repeats
-from heliograph.model.timeouts import name_timeout_unit
+from heliograph.model.readings.reading_limits import ReadingLimits
+from heliograph.model.readings.repeated_readings import Repeats
+from heliograph.model.readings.timeouts import name_timeout_unit
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, CheckedEvent
-from heliograph.live.link_counts import LinkCounts
+from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
 
 

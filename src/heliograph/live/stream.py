@@ -10,17 +10,17 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import RARE, compile_once, find_deciding_sender
-from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
+from heliograph.live.health.sender_status import LossChain, SenderStatus, SilenceRule
+from heliograph.live.health.stuck_sensor_watch import RepeatWatch
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
 from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
-from heliograph.live.stuck_sensor_watch import RepeatWatch
 from heliograph.model.checks.non_finite_results import describe_non_finite_function
 from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.checks.refusal_reasons import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.forecast_origin import Origin
-from heliograph.model.reading_limits import LimitsLike, ScreenedReadings, make_limits
-from heliograph.model.repeated_readings import Repeats, StuckLike
+from heliograph.model.readings.reading_limits import LimitsLike, ScreenedReadings, make_limits
+from heliograph.model.readings.repeated_readings import Repeats, StuckLike
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike

@@ -10,12 +10,12 @@ import numpy as np
 from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.fleet_warnings import FleetRepeatWatch, RemarkWatch
 from heliograph.live.forecast_start_of_row import estimates_by_name, judged_estimates_by_name, make_forecast_origin
-from heliograph.live.implausible_events import AngleWatch, CandidateEvent, JudgementReader
-from heliograph.live.link_counts import LinkCounts
+from heliograph.live.health.fleet_warnings import FleetRepeatWatch, RemarkWatch
+from heliograph.live.health.implausible_events import AngleWatch, CandidateEvent, JudgementReader
+from heliograph.live.health.link_counts import LinkCounts
+from heliograph.live.health.sender_status import SenderStatus
 from heliograph.live.network_step_program import shared_program
-from heliograph.live.sender_status import SenderStatus
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant

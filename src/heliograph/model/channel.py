@@ -19,9 +19,9 @@ from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.model.turn_invariance import check_turn_invariance
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
+from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import check_count, fail, instance, scalar
-from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps

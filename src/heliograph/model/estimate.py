@@ -6,9 +6,9 @@ from typing import Any, Literal, TypeVar
 import equinox as eqx
 import numpy as np
 
+from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_value, standard_deviations
 from heliograph.numerics.linalg import find_not_finite
-from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.outlier_noise import has_bounded_noise

@@ -13,7 +13,7 @@ from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.types import PyTree
 
 if TYPE_CHECKING:
-    from heliograph.model.repeated_readings import Repeats
+    from heliograph.model.readings.repeated_readings import Repeats
 
 Moments: TypeAlias = "float | np.datetime64 | np.ndarray"
 

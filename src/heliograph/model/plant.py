@@ -10,13 +10,13 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.diffuse_start import DiffuseStart
-from heliograph.model.limit_arguments import StateLimits, StateLimitsLike, read_state_limits
 from heliograph.model.over_time import OverTime, first
+from heliograph.model.readings.limit_arguments import StateLimits, StateLimitsLike, read_state_limits
 from heliograph.model.turn_invariance import check_turn_invariance
-from heliograph.numerics.angle import Angles, angles_at, read_angles
+from heliograph.numerics.angles.angle import Angles, angles_at, read_angles
+from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import array, covariance, error_text, fail, function, instance, items, name_list, names
 from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names

@@ -21,7 +21,7 @@ from heliograph.model.input_dependent_sensor import (
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, MatrixOfInputs, NoiseFunction
 from heliograph.model.turn_invariance import SOME_INPUTS
-from heliograph.numerics.angle import Angles, angles_at, read_angles
+from heliograph.numerics.angles.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
     array,

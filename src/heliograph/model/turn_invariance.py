@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compute_once
-from heliograph.numerics.angle import TURN
+from heliograph.numerics.angles.angle import TURN
+from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.random_affine.noise import Vector
 

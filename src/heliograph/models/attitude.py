@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.angles.rotation_vectors import matrix_of, quaternion_of, rotation_vector_of, turn
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.numpy_or_jax import is_traced
-from heliograph.numerics.rotation_vectors import matrix_of, quaternion_of, rotation_vector_of, turn
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.limit_arguments import StateLimitsLike
 from heliograph.model.plant import TIME_STEP, LinearPlant
+from heliograph.model.readings.limit_arguments import StateLimitsLike
 from heliograph.numerics.check import array, covariance, fail, name_list, names, scalar
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.numpy_or_jax import is_traced, library

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.limit_arguments import StateLimitsLike
 from heliograph.model.plant import Plant, check_shape
+from heliograph.model.readings.limit_arguments import StateLimitsLike
 from heliograph.models.continuous_time import ContinuousSystem, Drift, Number, Square, Start, append_time_step
 from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar
 from heliograph.numerics.module import Module

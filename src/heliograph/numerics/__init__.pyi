@@ -1,14 +1,14 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .angle import Angles as Angles
-from .angle import TURN as TURN
-from .angle import angles_at as angles_at
-from .angle import continue_angles as continue_angles
-from .angle import find_wraps as find_wraps
-from .angle import insert_gaps as insert_gaps
-from .angle import read_angles as read_angles
-from .angle import wrap_angles as wrap_angles
-from .angle import wrap_near as wrap_near
+from .angles.angle import Angles as Angles
+from .angles.angle import TURN as TURN
+from .angles.angle import angles_at as angles_at
+from .angles.angle import continue_angles as continue_angles
+from .angles.angle import find_wraps as find_wraps
+from .angles.angle import insert_gaps as insert_gaps
+from .angles.angle import read_angles as read_angles
+from .angles.angle import wrap_angles as wrap_angles
+from .angles.angle import wrap_near as wrap_near
 from .caching import cache_arrays as cache_arrays
 from .caching import cache_by_object as cache_by_object
 from .caching import share_by_object as share_by_object
@@ -98,7 +98,7 @@ from .linalg import squared_distance_terms as squared_distance_terms
 from .linalg import symmetric as symmetric
 from .linalg import symmetrize as symmetrize
 from .linalg import whiten as whiten
-from .manifold import Manifold as Manifold
+from .angles.manifold import Manifold as Manifold
 from .masked_arrays import fill_masked as fill_masked
 from .masked_arrays import is_absent as is_absent
 from .module import LINES as LINES
@@ -139,10 +139,10 @@ from .process.stop_signals import STOPPING as STOPPING
 from .process.stop_signals import handle_stop_signals as handle_stop_signals
 from .process.stop_signals import hold_signals as hold_signals
 from .random_keys import seed_key as seed_key
-from .rotation_vectors import matrix_of as matrix_of
-from .rotation_vectors import quaternion_of as quaternion_of
-from .rotation_vectors import rotation_vector_of as rotation_vector_of
-from .rotation_vectors import turn as turn
+from .angles.rotation_vectors import matrix_of as matrix_of
+from .angles.rotation_vectors import quaternion_of as quaternion_of
+from .angles.rotation_vectors import rotation_vector_of as rotation_vector_of
+from .angles.rotation_vectors import turn as turn
 from .times.data_row_checks import check_rows as check_rows
 from .times.dates import MISSING as MISSING
 from .times.dates import UNITS as UNITS

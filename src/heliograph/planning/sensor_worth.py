@@ -12,7 +12,7 @@ from heliograph.learning.told_numbers import find_told_filter
 from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.sensor import is_linear
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, items, table
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float

@@ -12,7 +12,7 @@ from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.relays import RECEIVER, SENSOR
 from heliograph.model.sensor import AnySensor, is_linear
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.lapack import spectral_radius

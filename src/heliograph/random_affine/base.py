@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail, items, show_value
 from heliograph.numerics.module import Module, are_same, readable, unwritten

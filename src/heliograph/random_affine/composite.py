@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.numpy_or_jax import library, plain
 from heliograph.numerics.types import ArrayLike, Float, PyTree

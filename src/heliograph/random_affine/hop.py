@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts

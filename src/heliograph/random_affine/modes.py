@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import array, check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import library, stack_parts

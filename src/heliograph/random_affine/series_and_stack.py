@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.numpy_or_jax import stack_parts

@@ -1,10 +1,10 @@
 """Public names of the room, which needs the extra `report`; the package loads them when first used."""
 
-from .recording_diagnosis import (
+from .diagnosis.recording_diagnosis import (
     FilterHealth as FilterHealth,
     examine as examine,
 )
-from .arrivals import (
+from .diagnosis.arrivals import (
     Arrivals as Arrivals,
 )
 from .pages.run import (

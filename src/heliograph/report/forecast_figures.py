@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 
 from heliograph.disk.quoted_text import visible
 from heliograph.numerics.times.dates import format_times
+from heliograph.report.diagnosis.sensor_output_health import round_to
 from heliograph.report.figures import COLOURS, MUTED
 from heliograph.report.pages.page import Table, Text
-from heliograph.report.sensor_output_health import round_to
 from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:

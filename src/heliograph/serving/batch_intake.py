@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap, make_first_leap
 from heliograph.live.event import INPUTS, CheckedEvent, Verdict
 from heliograph.live.fleet import Fleet
-from heliograph.live.implausible_events import CandidateEvent, JudgementReader
-from heliograph.live.link_counts import LinkCounts
+from heliograph.live.health.implausible_events import CandidateEvent, JudgementReader
+from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.plant_state import PlantState, WithdrawnEvent
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.fleet_warnings import FleetRepeatWatch, RemarkWatch
-from heliograph.live.implausible_events import AngleWatch
+from heliograph.live.health.fleet_warnings import FleetRepeatWatch, RemarkWatch
+from heliograph.live.health.implausible_events import AngleWatch
 from heliograph.live.network_step_program import NetworkProgram as NetworkProgram
 from heliograph.live.plant_state import FinalisedPlant, PlantState, WithdrawnEvent
 from heliograph.live.sorted_rows import HeldRow

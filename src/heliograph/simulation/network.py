@@ -18,10 +18,10 @@ from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.readings.repeated_readings import Repeats
 from heliograph.model.relays import RECEIVER, RelayNetwork
-from heliograph.model.repeated_readings import Repeats
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
@@ -61,7 +61,7 @@ from heliograph.simulation.node import (
     check_states,
     get_parts_of_reception,
 )
-from heliograph.simulation.screened_recording import ScreenedRecording, screen_recording
+from heliograph.simulation.recordings.screened_recording import ScreenedRecording, screen_recording
 from heliograph.simulation.sender_checks import check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter

@@ -13,14 +13,14 @@ from heliograph.model.channel_side_information import name_received_values
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.reading_limits import LimitsLike, ReadingLimits, make_limits
+from heliograph.model.readings.reading_limits import LimitsLike, ReadingLimits, make_limits
+from heliograph.model.readings.repeated_readings import StuckLike
 from heliograph.model.relays import RelayNetwork
-from heliograph.model.repeated_readings import StuckLike
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.model.words.encoder import Words
 from heliograph.model.words.word_channel import FLAG, find_carried_components
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import TINY, fail, scalar, table
 from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable

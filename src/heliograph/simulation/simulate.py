@@ -25,6 +25,13 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node
 from heliograph.simulation.precomputed_filters import can_precompute, precompute_filters
+from heliograph.simulation.recordings.smoothed import (
+    NetworkSmoother,
+    ReducedRuns,
+    finish_result,
+    reduce_run,
+    select_smoothed_part,
+)
 from heliograph.simulation.results.non_finite_warnings import warn_of_non_finite_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
@@ -44,7 +51,6 @@ from heliograph.simulation.runs.memory import NeededMemory, check_memory, count_
 from heliograph.simulation.runs.native import simulate_natively
 from heliograph.simulation.runs.xla_runs import apply_to_each_run, list_used_leaves, simulate_trajectories
 from heliograph.simulation.simulation_step import World
-from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, finish_result, reduce_run, select_smoothed_part
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 

@@ -9,7 +9,7 @@ from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.run_over_data import check_data
 from heliograph.filters.smoother_step import SmootherStep
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float

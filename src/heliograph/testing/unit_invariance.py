@@ -18,9 +18,9 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.random_affine.series_and_stack import Series
-from heliograph.simulation.filter_recording import run
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.recordings.filter_recording import run
 from heliograph.simulation.simulate import monte_carlo
 from heliograph.testing.change_of_units import Units, rescale_channel, rescale_filter, rescale_plant, rescale_sensor
 

@@ -214,7 +214,7 @@ def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
     for name in ("d", "m"):
         net = hg.simulation.freeze(net, name, arrivals(net, name, 6, 0), last=3)
     record = hg.monte_carlo(net, 11, 1, 4)
-    monkeypatch.setattr("heliograph.simulation.scan_recording.ROWS", 4)
+    monkeypatch.setattr("heliograph.simulation.recordings.scan_recording.ROWS", 4)
     reports = {f: {n: item.values[0] for n, item in record.reports[f].items()} for f in ("d", "m")}
     again = hg.run(net, {n: z[0] for n, z in record.measurements.items()}, reports=reports)
     for node in net.names:

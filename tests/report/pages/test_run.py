@@ -11,8 +11,8 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.report import Arrivals, FilterHealth, examine, run_figures, run_page, run_summary
+from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 from heliograph.report.pages.run import make_errors_table
-from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 from heliograph.simulation.results.whiteness import MemoryTest
 from tests.losing import Tied
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.report.recording_diagnosis import examine
+from heliograph.report.diagnosis.recording_diagnosis import examine
 
 Q, WHITE, DECLARED, MEMORY = 1e-4, 0.0302, 4.84, 300.0
 START = np.array([5.0, 5.0, 0.5, 0.5])

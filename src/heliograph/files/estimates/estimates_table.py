@@ -9,8 +9,8 @@ import numpy as np
 
 from heliograph.files.table import TIME, write_table
 from heliograph.model.estimate import Estimate, mask_sound_estimates
+from heliograph.numerics.angles.rotation_vectors import quaternion_of
 from heliograph.numerics.check import fail, instance, show_value
-from heliograph.numerics.rotation_vectors import quaternion_of
 from heliograph.numerics.types import units_in
 from heliograph.simulation.results.record import Record
 

@@ -34,7 +34,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step
 from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.angle import wrap_near
+from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.types import ArrayLike, Float

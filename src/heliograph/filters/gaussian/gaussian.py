@@ -28,7 +28,7 @@ from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step, first, stack_over_time
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import Angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_near
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float

@@ -35,7 +35,7 @@ from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, read_first_plant
 from heliograph.model.premises.premise import believes
-from heliograph.numerics.angle import Angles, wrap_angles
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal

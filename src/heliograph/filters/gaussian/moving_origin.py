@@ -18,7 +18,7 @@ from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
 from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, wrap_angles
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.compensated_arithmetic import Compensated, compensate, split_sum
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike

@@ -25,7 +25,7 @@ from heliograph.filters.remark import Remark
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.angle import wrap_near
+from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Float
 

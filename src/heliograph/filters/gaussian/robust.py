@@ -31,7 +31,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import Angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_near
 from heliograph.numerics.check import TINY, check_count, scalar
 from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.types import ArrayLike, Float

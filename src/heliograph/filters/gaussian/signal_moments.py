@@ -24,7 +24,7 @@ from heliograph.filters.gaussian.moment_transforms import AbstractTransform, lin
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, continue_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, continue_angles, wrap_near
 from heliograph.numerics.linalg import contract, diagonal
 from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array

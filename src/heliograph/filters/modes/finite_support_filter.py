@@ -41,7 +41,7 @@ from heliograph.model.over_time import OverTime, at, first, list_models_by_step,
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
-from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import is_traced, stack_parts

@@ -32,7 +32,7 @@ from heliograph.filters.smoother_step import EarlierState, SmootherStep
 from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
 from heliograph.model.estimate import Estimate
 from heliograph.model.plant import AbstractPlant
-from heliograph.numerics.angle import wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import wrap_angles, wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import Float

@@ -63,7 +63,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 

@@ -43,7 +43,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles, wrap_angles
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.check import check_count
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.memories_of_channels import memories

@@ -19,7 +19,7 @@ from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.types import Array, Int, PyTree
 
 ENOUGH = 200  # particles; of 100 a row takes 80 us in lanes and half of it otherwise, of 300 90 and three times that

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from heliograph.filters.particles.moments import FirstSums
 from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.angle import Angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_near
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.angle import Angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_near
 
 
 class ExpectedMixture(NamedTuple):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.particles.moments import FirstSums, StateSums, second_sums
 from heliograph.filters.particles.resampling import effective_number
-from heliograph.numerics.angle import Angles, wrap_angles
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Bool, Float, Int
 

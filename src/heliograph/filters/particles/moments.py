@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.types import Array, PyTree
 
 

@@ -53,7 +53,7 @@ from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.types import Array, Float
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.modes.arrival_patterns import pattern_of
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.angle import Angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.module import Module

@@ -25,7 +25,7 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, list_models_by_step, steps_covered, unstack, vary_over_steps
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int

@@ -26,7 +26,7 @@ from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.words.word_filter import ReceivedWords, WordFilter
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.types import ArrayLike, Float
 
 LEADING = 3  # bits; two leave one lock-in in 20,000 runs at 5 % of bits flipped, one leaves half of all

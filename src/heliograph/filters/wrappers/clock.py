@@ -28,7 +28,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import wrap_near
+from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int

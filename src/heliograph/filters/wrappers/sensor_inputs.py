@@ -23,7 +23,7 @@ from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -27,7 +27,7 @@ from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import library

@@ -17,7 +17,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
-from heliograph.numerics.angle import wrap_near
+from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Array, PyTree

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.live.clock_leap import ClockLeap
 from heliograph.live.fleet import Fleet
-from heliograph.live.link_counts import LinkCounts
+from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.plant_state import PlantState, RowBeforeLeap
 from heliograph.live.sorted_rows import HeldRow
 

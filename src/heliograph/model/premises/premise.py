@@ -17,7 +17,7 @@ from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 
 if TYPE_CHECKING:  # what few filters believe is loaded where it is made
-    from heliograph.model.reading_limits import ReadingLimits
+    from heliograph.model.readings.reading_limits import ReadingLimits
     from heliograph.model.relays import RelayNetwork
     from heliograph.model.trigger import AbstractTrigger
     from heliograph.model.words.encoder import Words

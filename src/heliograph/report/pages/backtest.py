@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.report.diagnosis.sensor_output_health import round_to
 from heliograph.report.figures import COLOURS, MUTED, STYLE, make_stacked_panels, place_legend_above
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table
 from heliograph.report.results_folder import Json, ResultsContent
-from heliograph.report.sensor_output_health import round_to
 
 if TYPE_CHECKING:
     import heliograph

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 import heliograph
 from heliograph.disk.quoted_text import quote_for_figure, visible
-from heliograph.numerics.angle import find_wraps, insert_gaps
+from heliograph.numerics.angles.angle import find_wraps, insert_gaps
+from heliograph.report.diagnosis.recording_diagnosis import Health
 from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
 from heliograph.report.innovations_section import (
     BAND,
@@ -20,7 +21,6 @@ from heliograph.report.innovations_section import (
     name_undrawn_figures,
 )
 from heliograph.report.pages.page import Picture, Section, Text
-from heliograph.report.recording_diagnosis import Health
 
 PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoted_text import visible
 from heliograph.numerics.check import instance
 from heliograph.numerics.times.dates import format_times
+from heliograph.report.diagnosis.recording_diagnosis import Health
+from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
 from heliograph.report.forecast_figures import draw_forecasts, make_forecast_tables
 from heliograph.report.innovations_section import (
@@ -42,9 +44,7 @@ from heliograph.report.pages.page import (
 from heliograph.report.pages.predictions import draw_predicted_figures, make_predicted_sections
 from heliograph.report.pages.run_summary import run_summary
 from heliograph.report.position_map import draw_position_map, find_coordinates
-from heliograph.report.recording_diagnosis import Health
 from heliograph.report.results_folder import Json, ResultsContent, write_into_folder
-from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 

@@ -9,7 +9,7 @@ from prometheus_client.registry import Collector
 
 from heliograph.live.event import VERDICTS
 from heliograph.model.checks.refusal_reasons import OF_NODES
-from heliograph.report.sensor_output_health import summarise_output
+from heliograph.report.diagnosis.sensor_output_health import summarise_output
 from heliograph.serving.observation.answers_between_batches import LastAnswers
 from heliograph.serving.observation.service_watch import ServiceWatch
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from prometheus_client import CollectorRegistry, Histogram
 
-from heliograph.report.sensor_output_health import RecentInnovations
+from heliograph.report.diagnosis.sensor_output_health import RecentInnovations
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis
 from heliograph.serving.observed_service import BatchTimes
 

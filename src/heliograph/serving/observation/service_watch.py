@@ -16,7 +16,7 @@ from heliograph.model.checks.refusal_reasons import OF_NODES, WORDS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
-from heliograph.report.sensor_output_health import RecentInnovations, make_output_row
+from heliograph.report.diagnosis.sensor_output_health import RecentInnovations, make_output_row
 from heliograph.serving.count_totals import FIELDS, CountTotals, list_counts_of_link
 from heliograph.serving.observation.answers_between_batches import LastAnswers
 from heliograph.serving.observation.remembered_plants import PLANTS, BatchHistograms, RememberedPlants

@@ -16,7 +16,7 @@ from heliograph.fusion.quantizer import widen_by_quantization
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure_key
-from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.fusion_centre import (

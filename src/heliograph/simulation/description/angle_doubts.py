@@ -12,7 +12,7 @@ from heliograph.filters.gaussian.moment_transforms import Cubature
 from heliograph.filters.gaussian.unscented import Unscented
 from heliograph.model.over_time import first
 from heliograph.model.sensor import is_linear
-from heliograph.numerics.angle import TURN
+from heliograph.numerics.angles.angle import TURN
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float

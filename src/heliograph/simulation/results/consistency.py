@@ -11,7 +11,7 @@ import scipy
 from heliograph.engine.choice import compile_on_call
 from heliograph.model.plant import AnyPlant, read_manifold
 from heliograph.model.sensor import AnySensor, angles_of_outputs
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar, standard_deviations
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable

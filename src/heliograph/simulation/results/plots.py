@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.disk.colours_of_figures import COLOURS
 from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.angle import find_wraps, insert_gaps
+from heliograph.numerics.angles.angle import find_wraps, insert_gaps
 from heliograph.numerics.check import check_count, fail
 
 FAR = 10.0  # times the best filter's error: from there an axis is logarithmic

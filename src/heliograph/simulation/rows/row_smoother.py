@@ -24,9 +24,9 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
-from heliograph.simulation.implausible_data import read_refusal_reasons
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.recordings.implausible_data import read_refusal_reasons
 from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.rows.row_step import NetworkStep
 

@@ -18,9 +18,9 @@ from heliograph.numerics.trees.program_text import write_program_text
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.description.filter_remarks import find_remarking_filters, yield_remarks
-from heliograph.simulation.implausible_data import step_plausibly
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters, initial_states
+from heliograph.simulation.recordings.implausible_data import step_plausibly
 from heliograph.simulation.rows.output_columns import find_filter_columns
 from heliograph.simulation.rows.row_history import RowHistory
 

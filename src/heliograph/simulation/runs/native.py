@@ -20,6 +20,7 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
+from heliograph.simulation.recordings.smoothed import NetworkSmoother, SmoothingPlan, finish_result, reduce_run
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import LANES, Progress
@@ -27,7 +28,6 @@ from heliograph.simulation.runs.memory import NeededMemory, check_memory
 from heliograph.simulation.runs.native_lanes import NativeProgram, NativeRuns
 from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
 from heliograph.simulation.simulation_step import World
-from heliograph.simulation.smoothed import NetworkSmoother, SmoothingPlan, finish_result, reduce_run
 from straightline import Unsupported, accumulate
 
 PROGRAMS = 64  # whose code is held at once

@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.engine.choice import get_thread_pool
 from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.recordings.smoothed import ReducedRuns
 from heliograph.simulation.runs.lanes import (
     LANES,
     Progress,
@@ -16,7 +17,6 @@ from heliograph.simulation.runs.lanes import (
     count_runs_by_batch,
     split_into_chunks,
 )
-from heliograph.simulation.smoothed import ReducedRuns
 
 
 class NativeProgram(NamedTuple):

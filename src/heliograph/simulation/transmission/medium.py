@@ -23,7 +23,7 @@ from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, SenderState
 from heliograph.model.words.encoder import WordReader, Words
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import condition_on_memories

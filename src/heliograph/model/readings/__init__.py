@@ -1,0 +1,1 @@
+"""What a node believes of its readings: limits, codes of failure, repetitions, and timeouts."""

@@ -1,0 +1,171 @@
+"""Limits of a sensor's range, codes by which a sensor reports that it failed, and readings that are stuck."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.model.channel import Channel
+from heliograph.model.checks.refusal_reasons import Reason, number_of_reason
+from heliograph.model.readings.limit_arguments import read_intervals, read_numbers
+from heliograph.model.readings.repeated_readings import Repeats, StuckLike, count_repeats, find_stuck_counts
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int
+
+ROUNDING = 4 * float(np.finfo(np.float64).eps)  # of a product and of the factor in it, relative
+
+SINGLE = float(np.finfo(np.float32).eps) / 2  # of a number in single precision, relative
+
+FIRST = Repeats()  # before the first reading
+
+LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | ReadingLimits | None")
+
+
+def make_limits(
+    received: int,
+    limits: LimitsLike,
+    invalid: ArrayLike,
+    stuck: StuckLike = None,
+    sensor: AnySensor | None = None,
+    channel: Channel | None = None,
+) -> "ReadingLimits | None":
+    """Return the limits of so many received numbers; those of another node as they are; None where there are none.
+
+    `stuck` of True is by the noise and resolution of the sensor, behind the channel.
+    """
+    codes, counts = read_numbers("invalid values", invalid), find_stuck_counts(received, stuck, sensor, channel)
+    if isinstance(limits, ReadingLimits):
+        if len(limits.low) != received or codes.size or counts is not None:
+            more = " and further codes" * bool(codes.size) + " and stuck=" * (counts is not None)
+            got = f"those of {len(limits.low)}{more}"
+            raise fail("limits of another node", f"those of {received} received numbers, codes and stuck included", got)
+        return limits
+    if limits is None and codes.size == 0 and counts is None:
+        return None
+    return ReadingLimits(received, limits, invalid, counts)
+
+
+class ScreenedReadings(NamedTuple):
+    """Readings without those that count as missing.
+
+    Args:
+        values: the readings (time, m), NaN where one counts as missing.
+        refused: the number of each one's reason (`model.checks.refusal_reasons`), 0 where it is kept (time, m).
+        repeats: runs of equal readings that end with the last ones.
+    """
+
+    values: Float[np.ndarray, "time m"]
+    refused: Int[np.ndarray, "time m"]
+    repeats: Repeats
+
+    def by(self, reason: Reason) -> Bool[np.ndarray, "time m"]:
+        """Return True for each that is refused for this reason (time, m)."""
+        return np.asarray(self.refused == number_of_reason(reason))
+
+
+class ReadingLimits(Module):
+    """Received numbers that count as missing: below `low` or above `high`, equal to a code, or repeated for too long.
+
+    A number is equal to a code up to the rounding of a product, since sensors send whole numbers that are scaled, or if
+    it is the code in single precision, in which many sensors send.
+
+    Args:
+        received: length m of a measurement.
+        limits: lowest and highest valid number of each component; None for no limits. Stored as low and high (m,), with
+            -inf and inf where there is none.
+        invalid: codes (codes,) that are no measurements.
+        stuck: after how many equal readings in a row one counts as missing (m,), infinite for those that may repeat;
+            None where all may.
+    """
+
+    low: Float[np.ndarray, " m"]
+    high: Float[np.ndarray, " m"]
+    invalid: Float[np.ndarray, " codes"]
+    stuck: Float[np.ndarray, " m"] | None
+
+    def __init__(
+        self,
+        received: int,
+        limits: LimitsLike = None,
+        invalid: ArrayLike = (),
+        stuck: Float[np.ndarray, " m"] | None = None,
+    ):
+        """Check and hold which of `received` numbers count as missing; the class says what the arguments are."""
+        intervals = read_intervals(limits, received)
+        self.low, self.high = intervals[:, 0], intervals[:, 1]
+        codes = read_numbers("invalid values", invalid)
+        if codes.ndim > 1 or not np.all(np.isfinite(codes)):
+            raise fail("invalid values", "a finite number or several", show_value(invalid))
+        self.invalid, self.stuck = np.atleast_1d(codes), stuck
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a number may count as missing for its value, which tells of the state as a code does not."""
+        limited = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
+        return limited or self.stuck is not None
+
+    def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
+        """Return the readings without those that count as missing, from runs of equal readings before them (`before`).
+
+        A reading is missing if it is beyond the limits, or is a code; neither ends a run of equal readings.
+        `self.stuck`: the number of equal readings in a row from which a component counts as missing; None if runs are
+        not counted.
+        """
+        refused = self.find_refusal_reasons(z)
+        values = np.where(refused > 0, np.nan, z)
+        if self.stuck is None:
+            return ScreenedReadings(values, refused, before)
+        counts, repeats = count_repeats(values, before)
+        is_stuck = counts >= self.stuck
+        refused = np.where(is_stuck, number_of_reason("stuck"), refused)
+        return ScreenedReadings(np.where(is_stuck, np.nan, values), refused, repeats)
+
+    def find_refusal_reasons(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
+        """Return the number of the reason for which each value by itself counts as missing, or 0 if it does not.
+
+        A code is a value of `self.invalid`, such as -999, that stands for no reading; it counts as a code even beyond
+        the limits (`self.low`, `self.high`). NaN is missing already and has no reason.
+        """
+        is_code, is_beyond = equals_code(z, self.invalid), (z < self.low) | (z > self.high)
+        return np.where(is_code, number_of_reason("code"), np.where(is_beyond, number_of_reason("limits"), 0))
+
+    def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
+        """Return True for each number that by itself counts as missing; NaN is not one of them."""
+        return np.asarray(self.find_refusal_reasons(z) > 0)
+
+    def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
+        """Return in words which components of a measurement are refused, or "" if none is.
+
+        `refused`: the number of each component's reason, as `screen` returns it.
+        """
+        descriptions = []
+        for i in np.flatnonzero(refused).tolist():
+            if refused[i] == number_of_reason("code"):
+                reason = "is a code"
+            elif refused[i] == number_of_reason("limits"):
+                reason = f"is outside {self.low[i]:g} to {self.high[i]:g}"
+            else:
+                assert self.stuck is not None
+                reason = f"is stuck: {self.stuck[i]:g} equal readings in a row or more"
+            descriptions.append(f"{names[i]} {z[i]:g} {reason}")
+        return ", ".join(descriptions)
+
+
+def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
+    """Return whether each number is a code, a number such as -999 that stands for no reading.
+
+    Numbers count as equal up to the rounding of a product, and if single precision stores the code so.
+    """
+    numbers = np.asarray(z, dtype=np.float64)[..., None]
+    if not len(codes):
+        return np.zeros(numbers.shape[:-1], dtype=bool)
+    # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. All but the
+    # largest whole numbers are exact in both.
+    with np.errstate(over="ignore"):
+        single = codes.astype(np.float32).astype(np.float64)
+    rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)
+    is_code = (np.abs(numbers - codes) <= rounding) | (numbers == single)
+    return np.asarray(is_code.any(axis=-1))

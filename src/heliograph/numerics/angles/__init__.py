@@ -1,0 +1,1 @@
+"""States that are no numbers on a line: angles, attitudes as rotation vectors."""

@@ -1,0 +1,314 @@
+"""Arrivals of one received number over a recording: when it was due, how often it came, how often it was lost.
+
+A message is due in a row if its sender would send one then. A slot is a time at which one may come: a row, or of a
+sender with a period of its own one in each period.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.trigger import Periodic
+from heliograph.numerics.check import InputError
+from heliograph.numerics.confidence_intervals import count_independent
+from heliograph.numerics.types import Bool, Float, Int
+from heliograph.report.diagnosis.sending_pattern import SendingPattern, find_pattern
+from heliograph.report.diagnosis.sending_rate import SendingRate, find_rate
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+FEW = 8  # arrivals from which a rate of its own can be told
+NEAR = 0.25  # of a period: how far an interval may be from whole periods
+REGULAR = 0.95  # least share of intervals that are whole periods
+LEAST_SHARE = 0.01  # difference from the stated share below which none is worth a warning
+SLOWER = 1.5  # rows between messages from which a sender is slower than the table
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """When one component of a node's measurement arrived, and the values that did.
+
+    Args:
+        node: name of the node.
+        component: name of the component.
+        time: times of the rows (time,), numbers or dates, each once.
+        arrived: whether it arrived at each of them (time,).
+        values: those that arrived.
+        may_be_lost: whether the network says that it may be lost, or is not always sent.
+        declared_period: rows between messages of a sender that says so (`Periodic`); None of others.
+        stated_share: probability of arrival by the network; None where it is not one number, as in bursts.
+        of_messages: whether each row is there because some node's message is, so that others are not due in it.
+        refuses: whether the node refuses values, beyond limits or stuck, which then are missing here.
+        watched: whether it refuses those that are stuck.
+    """
+
+    node: str
+    component: str
+    time: np.ndarray
+    arrived: np.ndarray
+    values: np.ndarray
+    may_be_lost: bool
+    declared_period: int | None = None
+    stated_share: float | None = None
+    of_messages: bool = False
+    refuses: bool = False
+    watched: bool = False
+
+    @cached_property
+    def rate(self) -> SendingRate | None:
+        """Return the rate of a sender whose clock is not that of the rows, or None if there is no need of a rate.
+
+        There is none if the sender's period is declared, if rows are there because of messages, or if a pattern of rows
+        explains the arrivals as well. In a pattern, messages are due in the same few of each so many rows. The rate or
+        pattern that makes fewer messages due explains more. `arrived` says for each row whether a message came.
+        """
+        if self.declared_period is not None or self.of_messages:
+            return None
+        rate = find_rate(self.arrived)
+        pattern = None if rate is None else find_pattern(self.arrived)
+        if rate is None or pattern is None:
+            return rate
+        # By the rate, N / period messages are due in N rows. The pattern's number D of due rows is worse if it is more
+        # than one above this: D > N / period + 1, or period * D > N + period.
+        is_pattern_worse = rate.period * pattern.rows.sum() > len(self.arrived) + rate.period
+        return rate if is_pattern_worse else None
+
+    @cached_property
+    def period(self) -> float | None:
+        """Time between messages of a sender that is slower than the rows, in seconds or the unit of `time`; else None.
+
+        Declared, or found: it has a rate of its own, or nearly all intervals between arrivals are whole multiples of
+        their median. Losses of a sender that is due in each row leave intervals of all lengths, and no such period.
+        """
+        clock = _convert_times_to_numbers(self.time)
+        spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
+        if self.declared_period is not None:
+            return self.declared_period * spacing if self.declared_period > 1 else None
+        if self.rate is not None:
+            return self.rate.period * spacing
+        intervals = np.diff(clock[self.arrived])
+        if len(intervals) < FEW - 1 or self.arrived.all():
+            return None
+        period = float(np.median(intervals))
+        if not self.of_messages and period < SLOWER * spacing:
+            return None
+        # How far each interval is from the nearest whole number of periods, of one at least, in periods.
+        off_whole = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
+        return period if np.mean(off_whole <= NEAR) >= REGULAR else None
+
+    @cached_property
+    def slots(self) -> Bool[np.ndarray, " slots"] | None:
+        """Whether a message came in each slot that it may have: the rows, or one a period from the first arrival.
+
+        None where rows are messages of other nodes and this one has no period: then nobody knows.
+        """
+        if self.period is None:
+            return None if self.of_messages and not self.arrived.all() else self.arrived
+        clock = _convert_times_to_numbers(self.time)
+        arrivals = clock[self.arrived]
+        if not len(arrivals):
+            return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
+        # Whole periods from each arrival to the next; then those after the last, late by more than is usual.
+        if self.rate is not None:
+            steps = np.diff(self.rate.slots)
+        else:
+            steps = np.maximum(np.round(np.diff(arrivals) / self.period), 1).astype(np.int64)
+        missing_at_end = max(int((clock[-1] - arrivals[-1]) / self.period - NEAR), 0)
+        slots = np.zeros(1 + int(steps.sum()) + missing_at_end, dtype=bool)
+        slots[np.concatenate([[0], np.cumsum(steps)])] = True
+        return slots
+
+    @cached_property
+    def pattern(self) -> SendingPattern | None:
+        """The slots in which it is due, where these return as a pattern, such as 3 of each 4; None if it is in each.
+
+        A sender that says when it is due has none.
+        """
+        return None if self.slots is None or self.declared_period is not None else find_pattern(self.slots)
+
+    @property
+    def due_slots(self) -> Bool[np.ndarray, " due"] | None:
+        """Whether a message came in each slot in which one was due; None where nobody knows."""
+        return self.slots if self.slots is None or self.pattern is None else self.slots[self.pattern.rows]
+
+    @property
+    def due_in(self) -> str:
+        """Return in words the rows or times in which a message is due: each slot (a row or a period), or a pattern."""
+        if self.slots is None:
+            return "not known"
+        some = None if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
+        if self.period is None:
+            return "each row" if some is None else f"{some} rows"
+        return f"each {self.period:.4g}" if some is None else f"{some}, each {self.period:.4g}"
+
+    @property
+    def lost_times(self) -> np.ndarray:
+        """Times at which it was due and did not come; of a sender that is slower than the rows between its arrivals."""
+        if self.slots is None or not self.arrived.any():
+            return self.time[:0] if self.slots is None else self.time
+        due = np.ones(len(self.slots), dtype=bool) if self.pattern is None else self.pattern.rows
+        lost = np.flatnonzero(~self.slots & due)
+        if self.period is None:
+            return self.time[lost]
+        clock, filled = _convert_times_to_numbers(self.time), np.flatnonzero(self.slots)
+        times = clock[self.arrived]
+        if len(filled) != len(times):  # several came in one slot: slots evenly from the first arrival to the last
+            times = np.interp(filled, [filled[0], max(filled[-1], filled[0] + 1)], [times[0], times[-1]])
+        # Between arrivals by interpolation; after the last slot that is filled, a period each.
+        lost_clock = np.interp(lost, filled, times) + np.maximum(lost - filled[-1], 0) * self.period
+        if self.time.dtype.kind == "M":
+            return np.asarray(self.time[0] + lost_clock * np.timedelta64(10**9, "ns"))
+        return np.asarray(lost_clock)
+
+    @property
+    def due(self) -> int | None:
+        """Number of messages that were due; None where nobody knows."""
+        return None if self.due_slots is None else len(self.due_slots)
+
+    @property
+    def numbers(self) -> Int[np.ndarray, " arrivals"]:
+        """Running number of each message that arrived, from 0, among those that were due; of rows if nobody knows."""
+        places = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
+        return places - places[:1]
+
+    @property
+    def share(self) -> float:
+        """Share of the messages that were due which arrived; NaN where nobody knows how many were."""
+        return np.nan if self.due is None else min(float(self.arrived.sum()) / self.due, 1.0)
+
+    def contradicts(self, level: float) -> bool:
+        """Return whether the share that arrived contradicts the stated share p, by a test at `level`.
+
+        The shares must also differ by more than a hundredth (LEAST_SHARE). Arrivals in bursts count as fewer
+        independent ones: N (1 - a) / (1 + a), with the correlation a of each arrival with the next.
+        """
+        p = self.stated_share  # probability of arrival that the network states; due_slots: whether each message came
+        if p is None or self.due_slots is None or not 0 < p < 1:
+            return False
+        arrived = self.due_slots.astype(float)
+        independent = len(arrived) if self.period is not None else count_independent(arrived)
+        deviation = np.sqrt(p * (1 - p) / independent)
+        return bool(abs(self.share - p) > max(-ndtri(level / 2) * deviation, LEAST_SHARE))
+
+    @property
+    def longest_gap(self) -> int | None:
+        """Return the largest number of due messages in a row that did not arrive, or None if that is unknown."""
+        if self.due_slots is None:
+            return None
+        # As if a message had come before the first and after the last.
+        arrivals = np.flatnonzero(np.concatenate([[True], self.due_slots, [True]]))
+        return int(np.max(np.diff(arrivals)) - 1)
+
+
+def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
+    """Return whether each row is there because of a message: something arrived at each time, mostly from one node.
+
+    Args:
+        arrived: for each node whether anything of it arrived at each time.
+    """
+    nodes_at_time = np.sum(list(arrived.values()), axis=0)
+    return len(arrived) > 1 and bool(np.all(nodes_at_time > 0) and np.median(nodes_at_time) <= 1)
+
+
+def _convert_times_to_numbers(time: np.ndarray) -> Float[np.ndarray, " time"]:
+    """Return the times as numbers (time,): dates as seconds after the first."""
+    if time.dtype.kind == "M":
+        return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
+    return np.asarray(time, dtype=float)
+
+
+def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
+    """Return when each component of each node arrived, at distinct times: rows of one time count as one.
+
+    Args:
+        network: the network.
+        times: of the rows (time,).
+        received: by node, (time, received), NaN where nothing arrived.
+    """
+    time, time_of_row = np.unique(times, return_inverse=True)
+
+    def by_time(in_row: np.ndarray) -> np.ndarray:
+        """Return for each distinct time of `time` whether `in_row` is true in any row of it (`time_of_row`)."""
+        at_time = np.zeros(len(time), dtype=bool)
+        at_time[time_of_row[in_row]] = True
+        return at_time
+
+    # Is each row there because one node's message is? Then nothing is missing of the others in it. All nodes decide.
+    anything_of_node = {node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()}
+    of_messages = rows_are_messages(anything_of_node)
+    links = []
+    for node, z in received.items():
+        receiver = network.nodes[node]
+        limits = receiver.limits
+        refuses_values, refuses_stuck_values = limits is not None, limits is not None and limits.stuck is not None
+        declared = _read_declared_sending(receiver)
+        for i, name in enumerate(receiver.received_names):
+            arrived_in_row = ~np.isnan(z[:, i])
+            # Numbers that come with the values, such as a mode, stand behind those that shares are of.
+            has_share = declared.shares is not None and i < len(declared.shares)
+            links.append(
+                Arrivals(
+                    node=node,
+                    component=name,
+                    time=time,
+                    arrived=by_time(arrived_in_row),
+                    values=z[arrived_in_row, i],
+                    may_be_lost=declared.may_be_lost,
+                    declared_period=declared.period,
+                    stated_share=float(declared.shares[i]) if has_share else None,
+                    of_messages=of_messages,
+                    refuses=refuses_values,
+                    watched=refuses_stuck_values,
+                )
+            )
+    return links
+
+
+class _DeclaredSending(NamedTuple):
+    """What the network says of a node's messages.
+
+    period: rows between two, of a sender that declares it (`Periodic`); None of others. may_be_lost: whether some may
+    not arrive. shares: probability of arrival of each received number; None where these are not single numbers.
+    """
+
+    period: int | None
+    may_be_lost: bool
+    shares: Any
+
+
+def _read_declared_sending(receiver: Any) -> _DeclaredSending:
+    """Return what the network says of a node's messages: their period, if they may be lost, and which shares arrive.
+
+    The period is in steps, None if none is declared. There is a share for each received number, None if they are not
+    constant.
+    """
+    if not isinstance(receiver, Node):
+        return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=None)
+    shares = _find_arrival_probabilities(receiver)
+    # A node with a periodic sender is never complete. Then only the channel says whether messages may be lost.
+    if isinstance(receiver.trigger, Periodic):
+        may_be_lost = first(receiver.channel).erases
+        return _DeclaredSending(period=int(receiver.trigger.period), may_be_lost=may_be_lost, shares=shares)
+    return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=shares)
+
+
+def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
+    """Return the probability of arrival of each received number, or None if it is not constant.
+
+    It is also None if the link loses nothing, or if the sender decides when to send.
+    """
+    sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
+    if not sends_always or isinstance(receiver.channel, OverTime):
+        return None
+    if receiver.channel.remembers or not receiver.channel.erases:
+        return None
+    try:
+        outcomes = receiver.channel.list_outcomes()  # each set of components that may arrive together
+    except InputError:  # more sets than are listed
+        return None
+    return np.asarray(np.sum([float(outcome.probability) * outcome.arrived for outcome in outcomes], axis=0))

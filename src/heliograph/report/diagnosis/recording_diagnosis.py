@@ -1,0 +1,400 @@
+"""Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims.
+
+A filter claims what its covariance is: exact, an upper bound, nominal (without a guarantee), or nothing ("none"). Its
+innovations are white in units of that claim where it is right: of variance 1, and independent over time. An output is
+held, or stuck, if it repeats one value for longer than its noise allows.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import ndtri
+
+from heliograph.model.checks.refusal_reasons import Reason
+from heliograph.model.plant import TIME_STEP
+from heliograph.model.readings.timeouts import LongSilences, find_long_silences
+from heliograph.numerics.check import array, fail, instance
+from heliograph.numerics.confidence_intervals import average_correlated
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.report.diagnosis.arrivals import Arrivals, list_arrivals
+from heliograph.report.diagnosis.constant_sensor_error import ConstantError, find_constant_error
+from heliograph.report.diagnosis.disagreeing_nodes import find_constant_error_between_nodes
+from heliograph.report.diagnosis.doubt_sentences import (
+    say_constant_error,
+    say_declared_variances_are_off,
+    say_how_to_refuse_repeats,
+    say_innovations_are_correlated,
+    say_node_differs,
+    say_overconfident,
+    say_underconfident,
+)
+from heliograph.report.diagnosis.expected_squared_innovations import compute_expected_squares, scale_size_to_expected
+from heliograph.report.diagnosis.sensor_output_health import (
+    FilterWithMeasurements,
+    OutputHealth,
+    judge_outputs_of_filter,
+    weighs,
+    yield_filters_with_measurements,
+)
+from heliograph.report.diagnosis.stuck_sensors import StuckValue
+from heliograph.report.diagnosis.wrong_time_unit import describe_wrong_time_unit
+from heliograph.report.forecast_figures import Forecasts, Residuals
+from heliograph.simulation.declared_noise.judgement import DeclaredJudgement, judge_declared_links
+from heliograph.simulation.description.doubtful_estimates import doubt_estimates
+from heliograph.simulation.network import Network
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.whiteness import MemoryTest, score_innovations
+
+LAGS = 10  # of the test for memory, with ten rows for each at least
+FALSE = 0.001  # probability of a false warning by one kind of test, of all filters together
+LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below which none is worth a warning
+PULLED = 0.25  # of the largest excess of a mean square over its claim: what is less goes with it
+MOST = 0.5  # share of what is too large, from which one constant error explains it
+TYPICAL = 1.25  # ratio of the mean squares of one run and of all, from which its innovations need not be white
+LEAST_SHARE = 0.01  # of the variance of innovations that those before predict, below which none is worth a warning
+
+
+@dataclass(frozen=True)
+class FilterHealth:
+    """Innovations of one filter in units of its claim, and the test of their whiteness.
+
+    Args:
+        node: the node that it listens to, or "fused".
+        filter: its name.
+        claim: what its covariance claims to be.
+        white: innovations in units of their claim (time, m); None for a filter without a claim.
+        test: of their whiteness; None also where there are too few rows.
+        trusted: whether the network relies on it (default True).
+        declared: judgements of the variances that messages declare, one for each link that does.
+        unit: of the plant's time (default "steps").
+        expected: mean square of the innovations in this run over that in all runs, by the claim (default 1).
+    """
+
+    node: str
+    filter: str
+    claim: str
+    white: np.ndarray | None
+    test: MemoryTest | None
+    trusted: bool = True
+    declared: tuple[DeclaredJudgement, ...] = ()
+    unit: str = "steps"
+    expected: float = 1.0
+
+    @property
+    def numbers(self) -> int:
+        """Return how many innovations were tested; 0 where they are not known."""
+        return 0 if self.white is None else int(np.count_nonzero(~np.isnan(self.white)))
+
+
+@dataclass(frozen=True)
+class Health:
+    """A record, with the diagnosis of links and filters."""
+
+    record: Record
+    links: list[Arrivals]
+    filters: list[FilterHealth]
+    outputs: list[OutputHealth]  # by filter that claims a covariance
+    shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
+    beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
+    forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
+    predicted: Forecasts = field(default_factory=dict)  # of each row, by node and filter, where it was asked for
+    residuals: Residuals = field(default_factory=dict)  # of what was predicted, likewise
+    off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
+    apart: ConstantError | None = None  # of one node against the others, which filter by themselves
+    possible: tuple[str, ...] = ()  # of estimates where no sensor shows a state any more, or at a limit
+    silences: Mapping[str, LongSilences] = field(default_factory=dict)  # by node that was silent past its timeout
+    refused_messages: Mapping[str, Mapping[Reason, int]] = field(default_factory=dict)  # by node: for flag or counter
+    time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
+
+    def warnings(self) -> list[str]:
+        """Return one line for each reason to doubt the network, the weightiest first."""
+        lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.possible]
+        lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
+        for link in self.links:
+            name = f"{link.node}: {link.component}"
+            if not link.arrived.any():
+                lines.append(f"{name} never arrived")
+            elif link.refuses:  # what it refused is missing
+                continue
+            elif not link.may_be_lost and link.share < 1:
+                lines.append(
+                    f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
+                )
+            elif link.contradicts(FALSE / len(self.links)):
+                lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
+        lines += [] if self.apart is None else [say_node_differs(self.apart)]
+        lines += [self.time_unit] if self.time_unit else []
+        return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
+
+    def describe_stuck_outputs(self) -> dict[tuple[str, str], str]:
+        """Return by (node, output) a line for each output that repeats one value for longer than its noise allows.
+
+        An output that a node's filter and a central one both use is there once, by the node's.
+        """
+        trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
+        # Central filters first, whose outputs are named "node: output": a node's own filter takes their place.
+        held_outputs: dict[str, tuple[str, str, StuckValue]] = {}
+        for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED):
+            output = health.judged.output
+            name = output if health.node == Network.FUSED else f"{health.node}: {output}"
+            if health.judged.held is not None and (health.node, health.filter) in trusted:
+                held_outputs[name] = health.node, output, health.judged.held
+        watched = {f"{link.node}: {link.component}" for link in self.links if link.watched}
+        return {
+            (node, output): f"{name} is stuck, or has no noise: {held}, where its noise makes no run as long; "
+            f"{say_how_to_refuse_repeats(held, name in watched)}"
+            for name, (node, output, held) in held_outputs.items()
+        }
+
+    def doubted(self) -> list[FilterHealth]:
+        """Return the filters that the network relies on and whose claims the recording contradicts.
+
+        Filters that use a stuck output are left out: their innovations tell nothing else.
+        """
+        stuck = {node for node, _ in self.describe_stuck_outputs()}
+
+        def is_doubted(health: FilterHealth) -> bool:
+            """Return whether a filter is trusted, uses no stuck output, and has doubts."""
+            uses_stuck = health.node in stuck or (bool(stuck) and health.node == Network.FUSED)
+            return health.trusted and not uses_stuck and any(self._describe_doubts(health))
+
+        return [health for health in self.filters if is_doubted(health)]
+
+    def remarks(self) -> list[str]:
+        """Return one line for each doubt about a filter that is there to be compared with."""
+        return [line for filter in self.filters if not filter.trusted for line in self._describe_doubts(filter)]
+
+    def _describe_doubts(self, health: FilterHealth) -> Iterator[str]:
+        """Yield which claims innovations contradict: the size of each output's, of all together, and their memory."""
+        yield from self._describe_left_out(health)
+        name = f"{health.node}/{health.filter}"
+        off = self.off.get((health.node, health.filter))
+        if off is not None:
+            yield say_constant_error(name, off)
+            if off.nothing_else:
+                return
+        said = say_declared_variances_are_off(health.declared, health.unit)
+        yield from (f"{name}: {sentence}" for sentence in said)
+        if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
+            return
+        yield from self._describe_sizes(health, health.test)
+        if self._has_memory(health, health.test):
+            yield say_innovations_are_correlated(name, health.test)
+
+    def _level_of_one_test(self) -> float:
+        """Return the level of a test of one filter: all together are seldom wrong (Bonferroni)."""
+        return FALSE / sum(filter.test is not None for filter in self.filters)
+
+    def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
+        """Yield a sentence on the outputs whose innovations are larger than claimed, and one on those that are smaller.
+
+        Each output is judged by itself, since a mean over outputs hides the one that is wrong; all together where none
+        is wrong by itself. `test`: that of the filter's innovations.
+        """
+        name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
+        of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
+        # By output (mean square over its claim, the standard error of that, number of innovations); "" of all together.
+        judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
+        measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
+        signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
+        if not any(signs.values()):  # none is wrong by itself
+            measured = {"": (test.power, test.power_error, health.numbers)}
+            signs = {"": judge_size(*measured[""], level)}
+        sizes = {output: size for output, (size, _, _) in measured.items()}
+        larger = [output for output, sign in signs.items() if sign > 0]
+        # One that is far off pulls the estimates, and so makes others a little larger: these are not named.
+        largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
+        larger = [output for output in larger if sizes[output] - 1 >= PULLED * largest_excess]
+        weighs_any = any(output.weighs for output in of_filter)  # without outliers innovations are smaller: no fault
+        smaller = [output for output, sign in signs.items() if sign < 0 and not weighs_any]
+        for named, say in ((larger, say_overconfident), (smaller, say_underconfident)):
+            if named:  # an only output, or all together, needs no name in the sentence
+                yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
+
+    def explains_all_innovations(self, health: FilterHealth, error: ConstantError) -> bool:
+        """Return whether innovations without a constant error are as large as claimed and have no memory.
+
+        `error.white` are these innovations over their deviations, and `error.squares` the squares, NaN where none came.
+        """
+        level = self._level_of_one_test() / error.squares.shape[1]
+        for squares_of_output in error.squares.T:
+            count = int(np.count_nonzero(~np.isnan(squares_of_output)))
+            if count and judge_size(*average_correlated(squares_of_output), count, level):
+                return False
+        test = _test_memory(error.white)
+        return test is None or not self._has_memory(health, test)
+
+    def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
+        """Return whether innovations predict later ones (by the last one or by several) more than by chance.
+
+        Among N independent numbers, each lag seems to predict 1 / N of the variance.
+        """
+        # A filter's gains suit the mean over all runs. In a run whose mean square innovation, relative to all runs
+        # (`expected`), is further from 1 than TYPICAL, the gains are too large or too small.
+        if abs(np.log(health.expected)) > np.log(TYPICAL):
+            return False
+        by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
+        probability = 2 * min(test.p_value, test.p_value_of_all)  # two tests share the level
+        return probability < self._level_of_one_test() and test.predictable - by_chance >= LEAST_SHARE
+
+    def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
+        """Yield sentences on the outputs that a weighing filter left out most, in the words of `heliograph.run`."""
+        for output in self.outputs:
+            if output.weighs and (output.node, output.filter) == (health.node, health.filter):
+                yield from output.judged.summary.describe_left_out(
+                    f"{health.node}/{health.filter}", output.judged.output
+                )
+
+
+def judge_size(size: float, error: float, numbers: int, level: float) -> int:
+    """Return 1 (too large) or -1 (too small) if a mean square differs from its claim, 1, significantly; else 0.
+
+    It must be off by its interval and by a tenth. The logarithm of a mean square is nearly Gaussian, and its error is
+    the relative error. N numbers tell this error badly, so it counts as at least sqrt(2 / N), the error for N
+    independent Gaussian numbers.
+    """
+    if not (size > 0 and error > 0):
+        return 0
+    relative_error = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
+    half_width = max(-ndtri(level / 2) * relative_error, np.log(LEAST_SIZE))
+    return int(np.sign(np.log(size))) if abs(np.log(size)) > half_width else 0
+
+
+def examine(
+    network: Network,
+    record: Record,
+    inputs: ArrayLike | None = None,
+    advance: Callable[[str], object] = lambda what: None,
+) -> Health:
+    """Diagnose links and filters of a recording that was run through the network.
+
+    Args:
+        network: the network.
+        record: what `run` of this network returned.
+        inputs: inputs of the plant, as they were given to `run`. Shape (steps, inputs); None for a plant without.
+        advance: called with a few words before each filter is tested; nothing is called by default.
+
+    Returns:
+        The diagnosis; its `warnings()` are one line for each reason to doubt the network.
+
+    Raises:
+        ValueError: no network, no record of one recording run through it, inputs of another shape.
+    """
+    _check_record(network, record)
+    shape = len(record.time), len(network.inputs)
+    u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
+    # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, and their correlations over time.
+    filters, outputs = [], []
+    for listener in yield_filters_with_measurements(network, record):
+        advance(f"testing {listener.node}/{listener.name}")
+        filters.append(_examine_filter(network, listener, record, u))
+        if filters[-1].white is not None:
+            outputs += judge_outputs_of_filter(network, listener, record, u)
+    # Links, and what the network itself says of filters and estimates.
+    beliefs = tuple(belief.words for belief in network.beliefs())
+    timeouts = {node: network.nodes[node].timeout for node in network.names}
+    silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
+    links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
+    health = Health(record, links, filters, outputs, network.shared, beliefs, possible=possible, silences=silences)
+    # What may explain the doubts: a constant error of one output or node (unless one is stuck), another unit of time.
+    off = {
+        (doubted.node, doubted.filter): _find_constant_error(network, health, doubted, u)
+        for doubted in health.doubted()
+    }
+    apart = None if health.describe_stuck_outputs() else find_constant_error_between_nodes(network, record, u, FALSE)
+    health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
+    return replace(health, time_unit=_doubt_time_unit(network, health, u))
+
+
+def _examine_filter(
+    network: Network, listener: FilterWithMeasurements, record: Record, inputs: np.ndarray
+) -> FilterHealth:
+    """Return one filter's innovations in units of its claim (white), and what tests say of them.
+
+    There are neither of a filter that claims no covariance, or receives nothing.
+    """
+    node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
+    white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
+    if filter.claim != "none" and filter.received:
+        white = np.asarray(score_innovations(filter, z, inputs)[1])
+        test = _test_memory(subtract_mean(white) if weighs(filter) else white)
+        expected = compute_expected_squares(filter, z, inputs)
+        test = None if test is None else scale_size_to_expected(test, white, expected)
+    lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
+    return FilterHealth(
+        node=node,
+        filter=name,
+        claim="none" if lost_claim else filter.claim,
+        white=white,
+        test=test,
+        trusted=listener.trusted,
+        declared=() if test is None else judge_declared_links(filter, z, inputs),
+        unit=_name_time_unit(record) if TIME_STEP in network.inputs else "steps",
+        expected=float(np.nanmean(expected)),
+    )
+
+
+def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
+    """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or ""."""
+    tested = [judged for judged in health.doubted() if judged.test is not None]
+    if not tested:
+        return ""
+    first = _find_judged_filter(network, health.record, tested[0])
+    name = f"{first.node}/{first.name}"
+    return describe_wrong_time_unit(name, first.filter, first.measurements, inputs, network.inputs)
+
+
+def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) -> FilterWithMeasurements:
+    """Return the filter that was judged, with what it listens to."""
+    listeners = yield_filters_with_measurements(network, record)
+    return next(one for one in listeners if (one.node, one.name) == (judged.node, judged.filter))
+
+
+def _find_constant_error(
+    network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray
+) -> ConstantError | None:
+    """Return the constant error of an output that explains all or MOST of a filter's doubts, or None."""
+    if judged.test is None:
+        return None
+    tested = _find_judged_filter(network, health.record, judged)
+    error = find_constant_error(tested.outputs, tested.filter, tested.measurements, inputs)
+    if error is None:
+        return None
+    error = error._replace(nothing_else=health.explains_all_innovations(judged, error))
+    return error if error.nothing_else or error.explained > MOST else None
+
+
+def _name_time_unit(record: Record) -> str:
+    """Return the unit of the times of a record, in words."""
+    return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
+
+
+def _check_record(network: Network, record: Record) -> None:
+    """Raise ValueError if a record lacks filters of the network, or is of several runs."""
+    instance("network", network, Network, "a Network")
+    instance("record", record, Record, "a Record")
+    filters = {node: set(network.nodes[node].filters) for node in network.names}
+    if any(not names <= set(record.estimates.get(node, ())) for node, names in filters.items()):
+        raise fail("record", "the run of this network", f"one of the nodes {', '.join(record.estimates)}")
+    for estimate in (estimate for of_node in record.estimates.values() for estimate in of_node.values()):
+        if estimate.mean.ndim != 2:
+            raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")
+
+
+def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+    """Return the innovations minus the mean of each output.
+
+    If outliers lie to one side, the innovations that a filter keeps have a mean. It would look like memory.
+    """
+    count = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
+    return np.asarray(white - np.nansum(white, axis=0) / count)
+
+
+def _test_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
+    """Return the test of innovations' correlation between messages, or None for too few (LAGS, 10) or all zeros."""
+    came = white[~np.isnan(white).all(axis=1)]
+    lags = min(LAGS, len(came) // 10)
+    if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
+        return None
+    return MemoryTest.of(came, lags, claimed=True)

@@ -1,0 +1,141 @@
+"""Senders of a rate of their own among rows of another: told from losses by how seldom chance makes it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.types import Bool, Float, Int
+from heliograph.report.diagnosis.sending_pattern import CHANCE, BurstLossLaw
+
+PEAKS = 8  # of the spectrum of arrivals that are looked at
+FEWEST = 8  # arrivals from which a rate is looked for
+ENOUGH = 20_000  # rows that decide
+ROUNDING = 1e-9  # periods: the arrivals at both ends of a line are in it
+STEPS = 30  # of the search for a rate, each to two thirds
+LINE_PARAMETERS = 5  # rate, phase, width, first and last row: N rows tell some N values of each apart
+OFF = 0.25  # periods by which a line at a peak of the spectrum is too wide, at most
+
+
+class SendingRate(NamedTuple):
+    """A sender that is due once in each `period` rows, a real number; `slots` numbers the arrivals among what was due.
+
+    Shapes: slots (arrivals,).
+    """
+
+    period: float
+    slots: Int[np.ndarray, " arrivals"]
+
+
+class _PeriodicRows(NamedTuple):
+    """Rows r that come right after a multiple of the period: frac(frequency r - start) at most `width`."""
+
+    frequency: float
+    start: float
+    width: float
+
+    def phases(self, rows: Int[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Return how many periods after the first each row is."""
+        return np.asarray(self.frequency * rows - self.start)
+
+
+def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
+    """Return the rate of a sender whose clock is not that of the rows, or None if losses could have left the arrivals.
+
+    A sender that is due each T rows, where T is no integer, comes in the rows r with frac(r / T - phase) < 1 / T. frac
+    is the fractional part. All other rows are empty. If T is hardly above 1, empty rows are rare and have a rate
+    themselves: one in each 1 / (1 - 1 / T) rows, in every such slot. `slots` numbers each arrival among those due.
+    """
+    rate = _find_slowest_rate(arrived)
+    if rate is not None:
+        return rate
+    rows = np.flatnonzero(arrived)
+    rate_of_empty = _find_slowest_rate(~arrived[rows[0] : rows[-1]]) if len(rows) else None
+    if rate_of_empty is None or np.any(np.diff(rate_of_empty.slots) > 1):
+        return None
+    return SendingRate(period=1 / (1 - 1 / rate_of_empty.period), slots=np.arange(np.count_nonzero(arrived)))
+
+
+def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
+    """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
+
+    A sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. A line is
+    what such a rate makes of the arrivals: their phases (rows times rate, less whole periods) lie in a narrow interval.
+    """
+    rows = np.flatnonzero(arrived)
+    span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last
+    came_in_each_row = len(rows) == span
+    if len(rows) < FEWEST or came_in_each_row:
+        return None
+    loss_law, found = BurstLossLaw.fit_to_intervals(np.diff(rows)), None
+    deciding_rows = rows[0] + np.arange(min(span, ENOUGH))
+    arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
+    for frequency in _find_likely_frequencies(arrived):
+        # Due rows have phases in an interval of length 1 / T = frequency: the rest of the circle, about, is empty.
+        _, gap = _find_largest_gap(frequency, rows)
+        if gap < 1 - frequency - OFF:
+            continue
+        # Each arrival has to be in a period of its own.
+        line = _fit_periodic_rows(frequency, rows)
+        slots = np.floor(line.phases(rows)).astype(np.int64)
+        if line.width >= 1 or np.any(np.diff(slots) < 1):
+            continue
+        due = np.mod(line.phases(deciding_rows) + ROUNDING, 1) <= line.width + 2 * ROUNDING
+        # Many lines were possible, any of which would have been taken: the chance of one is multiplied by their number.
+        log_number_of_lines = LINE_PARAMETERS * np.log(len(arrived))
+        log_chance = loss_law.log_chance_within(due, arrivals_after_first) + log_number_of_lines
+        # Multiples of a frequency that passes do so too: the least is the sender's.
+        if log_chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
+            found = SendingRate(period=1 / line.frequency, slots=slots - slots[0])
+    return found
+
+
+def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
+    """Return frequencies to look at, in periods a row: of usual intervals, and of the largest peaks of the spectrum.
+
+    Of the spectrum of what arrived the PEAKS (8) largest count. It does not tell f from 1 - f: both are returned.
+    """
+    intervals = np.diff(np.flatnonzero(arrived))
+    # The next power of two, times four: the zeros behind the data make the frequencies of the spectrum close.
+    size = 4 * 2 ** int(np.ceil(np.log2(len(arrived))))
+    spectrum = np.abs(np.fft.rfft(arrived - np.mean(arrived), size))
+    inner = spectrum[1:-1]  # without the first and the last
+    has_risen, will_fall = inner >= spectrum[:-2], inner > spectrum[2:]
+    is_peak = has_risen & will_fall
+    peaks = 1 + np.flatnonzero(is_peak)
+    largest_first = peaks[np.argsort(spectrum[peaks])[::-1]]
+    frequencies = [1 / float(np.median(intervals)), 1 / float(np.mean(intervals))]
+    for f in (largest_first[:PEAKS] / size).tolist():
+        frequencies += [f, 1 - f]
+    return frequencies
+
+
+def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
+    """Return the middle and the length of the largest part of a period in which no arrival falls.
+
+    The period is a circle of length 1. `frequency` is in periods per row, and `rows` holds the rows of the arrivals.
+    """
+    phases = np.sort(np.mod(frequency * rows, 1))
+    gaps = np.diff(phases, append=phases[0] + 1)  # the last one goes around the circle, to the first phase
+    largest = int(np.argmax(gaps))
+    return float(phases[largest] + gaps[largest] / 2), float(gaps[largest])
+
+
+def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows:
+    """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
+
+    Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.
+    """
+    middle, _ = _find_largest_gap(frequency, rows)
+    whole_periods = np.floor(frequency * rows - middle)  # of each arrival, counted from the middle of the gap
+
+    def width(f: float) -> float:
+        """Return how far phases are apart at a frequency."""
+        phases = f * rows - whole_periods
+        return float(phases.max() - phases.min())
+
+    low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)
+    for _ in range(STEPS):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        low, high = (low, right) if width(left) <= width(right) else (left, high)
+    best = (low + high) / 2
+    return _PeriodicRows(frequency=best, start=float(np.min(best * rows - whole_periods)), width=width(best))

@@ -1,0 +1,1 @@
+"""Recorded measurements: screened, filtered by every filter of a network, and smoothed."""

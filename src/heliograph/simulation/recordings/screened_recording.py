@@ -1,0 +1,132 @@
+"""Measurements of a recording without readings that their nodes refuse, and what is said of these and of silences."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of_reason
+from heliograph.model.over_time import first
+from heliograph.model.readings.reading_limits import ReadingLimits
+from heliograph.model.readings.repeated_readings import Repeats
+from heliograph.model.readings.timeouts import find_long_silences
+from heliograph.model.trigger import AbstractThreshold
+from heliograph.numerics.types import Float, Int
+from heliograph.simulation.node import Node, ReceivingNode
+
+RIM = 1e-9  # share of delta by which a value may lie inside for rounding
+
+
+class ScreenedRecording(NamedTuple):
+    """A recording without the readings that its nodes refuse.
+
+    Args:
+        measurements: by node, (steps, received), NaN where nothing came or is kept.
+        refused: by node the number of the reason of each reading, 0 where it is kept, (steps, received).
+        said: what is said of that, of values that the rule of their sender forbids, which stay, and of silences that
+            are longer than a node's timeout; a line each.
+        repeats: the runs of equal readings with which rows end, by node with limits.
+    """
+
+    measurements: dict[str, np.ndarray]
+    refused: dict[str, np.ndarray]
+    said: list[str]
+    repeats: dict[str, Repeats]
+
+
+def screen_recording(
+    nodes: Mapping[str, Node | ReceivingNode],
+    inputs: Sequence[str],
+    z: dict[str, np.ndarray],
+    u: np.ndarray,
+    before: Mapping[str, Repeats],
+) -> ScreenedRecording:
+    """Return the measurements without readings that their nodes refuse, with the reason of each.
+
+    Args:
+        nodes: of the network, by name.
+        inputs: names of the plant's.
+        z: by node, (steps, received), NaN where nothing arrived.
+        u: inputs (steps, inputs).
+        before: the runs of equal readings with which the rows before these ended, by node; {} before the first ones.
+    """
+    kept, refused, said = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
+    repeats = dict[str, Repeats]()
+    for name, node in nodes.items():
+        # Readings beyond limits, codes, and readings that are stuck; none of a node without limits.
+        kept[name], refused[name] = z[name], np.zeros(z[name].shape, dtype=np.int8)
+        lines = list[str]()
+        if node.limits is not None:
+            screened = node.limits.screen(z[name], before.get(name, Repeats()))
+            repeats[name] = screened.repeats
+            kept[name], refused[name] = screened.values, screened.refused.astype(np.int8)
+            lines = [
+                _describe_refused(reason, node.limits, z[name], refused[name], node)
+                for reason in count_by_reason(refused[name])
+            ]
+        # Values that their sender should not have sent stay.
+        if rows := find_forbidden_rows(node, kept[name]):
+            lines.append(
+                f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
+                "within delta of the value before, and no heartbeat due"
+            )
+        said += [f"node {name!r}: {line}" for line in lines]
+    # Silences longer than a node's timeout.
+    timeouts = {name: node.timeout for name, node in nodes.items()}
+    silences = find_long_silences(timeouts, kept, u, inputs)
+    said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
+    return ScreenedRecording(kept, refused, said, repeats)
+
+
+def _describe_refused(
+    reason: Reason,
+    limits: ReadingLimits,
+    z: Float[np.ndarray, "steps m"],
+    refused: Int[np.ndarray, "steps m"],
+    node: Node | ReceivingNode,
+) -> str:
+    """Return in words how many readings a node refused for one reason, and those of the first such row.
+
+    Args:
+        reason: the reason.
+        limits: limits of the node's readings.
+        z: its measurements, NaN where nothing arrived.
+        refused: number of the reason of each reading, 0 where it is kept.
+        node: the node.
+    """
+    # Keep only readings refused for this reason, and find the first row that has some.
+    refused_so = np.where(refused == number_of_reason(reason), refused, 0)
+    row = int(np.argmax(refused_so.any(axis=1)))
+    shares = f"{np.count_nonzero(refused_so)} of {np.count_nonzero(~np.isnan(z))} values"
+    description = limits.describe_missing(z[row], refused_so[row], node.received_names)
+    return f"{shares} count as not arrived, by {reason}; row {row + 1}: {description}"
+
+
+def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
+    """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
+
+    Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
+    uses such a value and gives it a floor of 1e-6 as its probability.
+    """
+    trigger = node.trigger if isinstance(node, Node) else None
+    if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
+        return []
+    assert isinstance(node, Node)  # as it has a trigger
+    channel = first(node.channel)
+    is_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
+    if not is_as_sent:
+        return []
+    # Each row that came whole against the one before it, `last`.
+    forbidden, last = list[int](), None
+    for k, row in enumerate(z[:, : len(node.outputs)]):
+        if np.isnan(row).any():
+            continue
+        if last is not None:
+            heartbeat_is_due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
+            change = np.abs(row - z[last, : len(row)])
+            delta = (1 - RIM) * np.asarray(trigger.delta)
+            is_inside = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
+            if is_inside and not heartbeat_is_due:
+                forbidden.append(k)
+        last = k
+    return forbidden
