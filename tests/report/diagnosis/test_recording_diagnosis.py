@@ -219,3 +219,18 @@ def test_what_a_node_refuses_as_stuck_is_said_to_be_refused_and_not_to_be_lost()
     with pytest.warns(UserWarning, match="396 of 1500 values count as not arrived, by stuck; row 705: y"):
         (line,) = health_of(hg.Network(PLANT, {"a": node}), {"a": z}).warnings()
     assert line.startswith("a: y is stuck") and line.endswith("what repeated for longer was refused")
+
+
+@pytest.mark.parametrize("deviations, doubts", [(4000.0, 1), (30.0, 0)])
+def test_one_innovation_that_no_law_gives_is_doubted_in_few_rows(deviations, doubts):
+    """Of 4 rows, too few for tests: Chebyshev leaves one beyond sqrt(4 / 0.001) = 63 deviations to one in 1,000."""
+    network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {"kalman": hg.kalman_filter(PLANT, SENSOR)})})
+    # The state begins with variance 1 and is predicted with 1.01: the first innovation has the variance 2.01.
+    measured = np.zeros((4, 1))
+    measured[0] = deviations * np.sqrt(2.01)
+    lines = health_of(network, {"a": measured}).warnings()
+    assert len(lines) == doubts
+    if doubts:
+        assert lines[0].startswith(
+            "a/kalman is too sure, or the measurement is wrong: its innovation in row 1 is 4e+03 "
+        )

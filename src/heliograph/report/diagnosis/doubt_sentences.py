@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from heliograph.report.diagnosis.constant_sensor_error import ConstantError
+from heliograph.report.diagnosis.innovation_tests import ImpossibleInnovation
 from heliograph.report.diagnosis.stuck_sensors import StuckValue
 from heliograph.simulation.declared_noise.judgement import DeclaredJudgement
 from heliograph.simulation.results.whiteness import MemoryTest
@@ -22,6 +23,17 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
         "something out"
+    )
+
+
+def say_innovation_is_impossible(name: str, found: ImpossibleInnovation, probability: float) -> str:
+    """Return the sentence on one innovation that is larger than any law with the claimed variance allows.
+
+    `probability` is the largest with which one of all innovations is as large where the claim holds.
+    """
+    return (
+        f"{name} is too sure, or the measurement is wrong: its innovation in row {found.row} is {found.deviations:.3g} "
+        f"claimed deviations, which less than {probability:.1%} of such recordings have, whatever the law of noise"
     )
 
 

@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import ndtri
 
 from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.readings.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.confidence_intervals import average_correlated
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike
 from heliograph.report.diagnosis.arrivals import Arrivals, list_arrivals
 from heliograph.report.diagnosis.constant_sensor_error import ConstantError, find_constant_error
 from heliograph.report.diagnosis.disagreeing_nodes import find_constant_error_between_nodes
@@ -24,12 +23,20 @@ from heliograph.report.diagnosis.doubt_sentences import (
     say_constant_error,
     say_declared_variances_are_off,
     say_how_to_refuse_repeats,
+    say_innovation_is_impossible,
     say_innovations_are_correlated,
     say_node_differs,
     say_overconfident,
     say_underconfident,
 )
 from heliograph.report.diagnosis.expected_squared_innovations import compute_expected_squares, scale_size_to_expected
+from heliograph.report.diagnosis.innovation_tests import (
+    LAGS,
+    find_impossible_innovation,
+    find_memory,
+    judge_size,
+    subtract_mean,
+)
 from heliograph.report.diagnosis.sensor_output_health import (
     FilterWithMeasurements,
     OutputHealth,
@@ -46,9 +53,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, score_innovations
 
-LAGS = 10  # of the test for memory, with ten rows for each at least
 FALSE = 0.001  # probability of a false warning by one kind of test, of all filters together
-LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below which none is worth a warning
 PULLED = 0.25  # of the largest excess of a mean square over its claim: what is less goes with it
 MOST = 0.5  # share of what is too large, from which one constant error explains it
 TYPICAL = 1.25  # ratio of the mean squares of one run and of all, from which its innovations need not be white
@@ -176,6 +181,11 @@ class Health:
                 return
         said = say_declared_variances_are_off(health.declared, health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
+        if health.test is None:  # too few rows, of which one may still be more than any law allows
+            numbers = sum(filter.numbers for filter in self.filters)
+            found = find_impossible_innovation(health.white, FALSE / numbers) if numbers else None
+            if found is not None:
+                yield say_innovation_is_impossible(name, found, FALSE)
         if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
             return
         yield from self._describe_sizes(health, health.test)
@@ -222,7 +232,7 @@ class Health:
             count = int(np.count_nonzero(~np.isnan(squares_of_output)))
             if count and judge_size(*average_correlated(squares_of_output), count, level):
                 return False
-        test = _test_memory(error.white)
+        test = find_memory(error.white)
         return test is None or not self._has_memory(health, test)
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
@@ -245,20 +255,6 @@ class Health:
                 yield from output.judged.summary.describe_left_out(
                     f"{health.node}/{health.filter}", output.judged.output
                 )
-
-
-def judge_size(size: float, error: float, numbers: int, level: float) -> int:
-    """Return 1 (too large) or -1 (too small) if a mean square differs from its claim, 1, significantly; else 0.
-
-    It must be off by its interval and by a tenth. The logarithm of a mean square is nearly Gaussian, and its error is
-    the relative error. N numbers tell this error badly, so it counts as at least sqrt(2 / N), the error for N
-    independent Gaussian numbers.
-    """
-    if not (size > 0 and error > 0):
-        return 0
-    relative_error = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
-    half_width = max(-ndtri(level / 2) * relative_error, np.log(LEAST_SIZE))
-    return int(np.sign(np.log(size))) if abs(np.log(size)) > half_width else 0
 
 
 def examine(
@@ -318,7 +314,7 @@ def _examine_filter(
     white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
     if filter.claim != "none" and filter.received:
         white = np.asarray(score_innovations(filter, z, inputs)[1])
-        test = _test_memory(subtract_mean(white) if weighs(filter) else white)
+        test = find_memory(subtract_mean(white) if weighs(filter) else white)
         expected = compute_expected_squares(filter, z, inputs)
         test = None if test is None else scale_size_to_expected(test, white, expected)
     lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
@@ -380,21 +376,3 @@ def _check_record(network: Network, record: Record) -> None:
     for estimate in (estimate for of_node in record.estimates.values() for estimate in of_node.values()):
         if estimate.mean.ndim != 2:
             raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")
-
-
-def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
-    """Return the innovations minus the mean of each output.
-
-    If outliers lie to one side, the innovations that a filter keeps have a mean. It would look like memory.
-    """
-    count = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
-    return np.asarray(white - np.nansum(white, axis=0) / count)
-
-
-def _test_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
-    """Return the test of innovations' correlation between messages, or None for too few (LAGS, 10) or all zeros."""
-    came = white[~np.isnan(white).all(axis=1)]
-    lags = min(LAGS, len(came) // 10)
-    if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
-        return None
-    return MemoryTest.of(came, lags, claimed=True)

@@ -1,0 +1,71 @@
+"""Tests of innovations in units of their claimed covariance: their size, their memory, and one that is too large."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from heliograph.numerics.types import Float
+from heliograph.simulation.results.whiteness import MemoryTest
+
+LAGS = 10  # of the test for memory, with ten rows for each at least
+LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below which none is worth a warning
+
+
+def judge_size(size: float, error: float, numbers: int, level: float) -> int:
+    """Return 1 (too large) or -1 (too small) if a mean square differs from its claim, 1, significantly; else 0.
+
+    It must be off by its interval and by a tenth. The logarithm of a mean square is nearly Gaussian, and its error is
+    the relative error. N numbers tell this error badly, so it counts as at least sqrt(2 / N), the error for N
+    independent Gaussian numbers.
+    """
+    if not (size > 0 and error > 0):
+        return 0
+    relative_error = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
+    half_width = max(-ndtri(level / 2) * relative_error, np.log(LEAST_SIZE))
+    return int(np.sign(np.log(size))) if abs(np.log(size)) > half_width else 0
+
+
+class ImpossibleInnovation(NamedTuple):
+    """An innovation of `deviations` claimed standard deviations in row number `row`, counted from 1."""
+
+    row: int
+    deviations: float
+
+
+def find_impossible_innovation(
+    white: Float[np.ndarray, "steps m"] | None, probability: float
+) -> ImpossibleInnovation | None:
+    """Return the largest innovation if no law with the claimed variance gives one as large so often, else None.
+
+    By Chebyshev's inequality P(|e| >= t) <= 1 / t^2 for every law of e with a mean square of at most 1, so that neither
+    Gaussian noise nor a number of rows is needed.
+
+    Args:
+        white: innovations in units of their claimed covariance, NaN where nothing arrived; None of a filter without.
+        probability: the largest that a number by itself may have to be called impossible.
+    """
+    if white is None or not np.any(~np.isnan(white)):
+        return None
+    sizes = np.abs(np.nan_to_num(white))
+    row, _ = np.unravel_index(np.argmax(sizes), sizes.shape)
+    largest = float(sizes.max())
+    return ImpossibleInnovation(int(row) + 1, largest) if largest**2 * probability > 1 else None
+
+
+def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+    """Return the innovations minus the mean of each output.
+
+    If outliers lie to one side, the innovations that a filter keeps have a mean. It would look like memory.
+    """
+    count = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
+    return np.asarray(white - np.nansum(white, axis=0) / count)
+
+
+def find_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
+    """Return the test of innovations' correlation between messages, or None for too few (LAGS, 10) or all zeros."""
+    came = white[~np.isnan(white).all(axis=1)]
+    lags = min(LAGS, len(came) // 10)
+    if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
+        return None
+    return MemoryTest.of(came, lags, claimed=True)
