@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compute_once
+from heliograph.engine.choice import scan_rows
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
 from heliograph.filters.linear_recursion import initial_state_if_linear
 from heliograph.model.checks.plant_inputs import check_inputs
@@ -180,7 +180,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     # return None where they do not apply.
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row_results, *start)
     result = result or filter.filter_rows(rows_z, rows_u, *start)
-    state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
+    state, outputs = result or _scan_natively_or_by_xla(filter, rows_z, rows_u, start, begin)
     mean, covariance, innovation, modes, counts = outputs
     _warn_of_lost_estimate(filter, mean, begin)
     if counts is not None:
@@ -197,6 +197,30 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
         modes=modes,
         effective_numbers=counts,
     )
+
+
+def _scan_natively_or_by_xla(
+    filter: SteppedFilter, z: Array, u: Array, start: tuple[PyTree, ...], begin: int
+) -> tuple[PyTree, PyTree]:
+    """Filter the rows from number `begin` on, one after another; return the last state, and the results of all rows.
+
+    `start` has the state before the first row and its number, or nothing: then the filter begins before any data.
+    """
+    rows = begin + np.arange(len(z)), z, u
+    return scan_rows(_begin, _step, (filter, *start), rows, lambda: _by_xla(filter, z, u, *start))
+
+
+def _begin(fixed: tuple[SteppedFilter, PyTree, Array] | tuple[SteppedFilter]) -> PyTree:
+    """Return the state before the first row: the one that is given with the filter, or else the filter's own."""
+    filter, *start = fixed
+    return jax.tree.map(jnp.asarray, start[0] if start else filter.init())
+
+
+def _step(fixed: tuple[SteppedFilter, ...], state: PyTree, row: tuple[Array, ...]) -> tuple[PyTree, PyTree]:
+    """Return the state after a row (number, measurement, input), and what is kept of the row."""
+    filter, (k, z, u) = fixed[0], row
+    after, innovation = filter.correct(filter.predict(state, u, k), z, k)
+    return after, _collect_row_results(filter, after, innovation, k)
 
 
 def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
@@ -281,7 +305,7 @@ def _compute_filtered(
     return scan_with_last_state(filter, z, u, partial(_collect_row_results, filter), state, begin)
 
 
-def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: Array) -> PyTree:
     """Return what is kept of a row: mean, covariance, innovation, probabilities of modes, number of particles."""
     estimate = filter.after_step(state, k)
     return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)
