@@ -1,5 +1,6 @@
 """All filters of a network over the rows of a recording: in one scan, in chunks side by side, or part after part."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -61,6 +62,10 @@ class FilteringTask(NamedTuple):
         if self.begin is not None:
             numbers = self.begin.step + numbers
         return numbers, self.u, z, self.arrivals
+
+    def number_rows(self) -> np.ndarray:
+        """Return the numbers of the rows, as `rows` has them, outside of a trace."""
+        return np.arange(len(self.u)) + (0 if self.begin is None else self.begin.step)
 
 
 def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> Origin:
@@ -124,10 +129,9 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
         return _scan_in_parts(task, z, judged)
     if task.smoother is not None:  # it goes back over all rows
         return compute_once(_scan_all_rows, _by_xla, (task, z, judged))
-    states = None if task.begin is None else task.begin.states
-    k = np.arange(len(task.u)) + (0 if task.begin is None else task.begin.step)
-    rows, step = (k, task.u, z, task.arrivals), _step_judged if judged else _step_unjudged
-    scanned = scan_rows(_begin, step, (task.filters, states), rows, lambda: _scanned_by_xla(task, z, judged))
+    fixed = task.filters, None if task.begin is None else task.begin.states
+    rows, step = (task.number_rows(), task.u, z, task.arrivals), _step_judged if judged else _step_unjudged
+    scanned = scan_rows(_begin, step, fixed, rows, lambda: _scanned_by_xla(task, z, judged))
     return _collect_results(None, z, *scanned)
 
 
@@ -256,28 +260,21 @@ def _collect_results(
 
 def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
     """Return the states of the central filters before each row (steps, ...), by name; z as of `filter_rows`."""
-    return compute_once(_collect_central_states, _central_states_by_xla, (task._replace(smoother=None), z))
+    rows = task.number_rows(), task.u, z, task.arrivals
+    fixed = task.filters, None if task.begin is None else task.begin.states
+    return scan_rows(_begin, _step_central, fixed, rows, lambda: _central_states_by_xla(fixed, rows))[1]
 
 
-def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
-    """Return the states of the central filters, those of all measurements, before each row, by a scan over the rows.
+def _step_central(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return the states of all filters after a row, and the states of the central filters before it."""
+    after, _ = _step_judged(fixed, states, row)
+    _, central, *_ = states
+    return after, central
 
-    z: measurements (steps, node, received) by group of nodes.
-    """
 
-    def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Return the states of all filters after a row, and the states of the central filters before it.
-
-        The row holds the step, inputs, measurements, and what arrived of reports.
-        """
-        k, u_k, z_k, arrivals = row
-        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, arrivals)
-        _, central, *_ = states
-        return after, central
-
-    before: PyTree
-    _, before = jax.lax.scan(step, task.first_states(), task.rows(z))
-    return before
+def _collect_central_states(fixed: tuple[AllFilters, PyTree], rows: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return the last states, and the states of the central filters, those of all measurements, before each row."""
+    return jax.lax.scan(partial(_step_central, fixed), _begin(fixed), rows)
 
 
 _by_xla, _scanned_by_xla = quickly_compiled(_scan_all_rows), quickly_compiled(_scan_to_the_end)
