@@ -5,6 +5,9 @@ from .compiled import (
     compile_one as compile_one,
     explain as explain,
 )
+from .scan_over_rows import (
+    compile_scan as compile_scan,
+)
 from .sums_over_runs import (
     accumulate as accumulate,
 )

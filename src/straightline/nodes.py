@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from straightline.size_limits import ANY_LENGTH
+
 Type = Literal["f64", "f32", "bool", "i32", "i64", "u32", "u64"]
 TYPES: dict[str, Type] = {
     "float64": "f64",
@@ -114,7 +116,8 @@ class Block:
 
     def count_turns(self) -> int:
         """Return how many turns these loops make together; of unknown length one."""
-        return math.prod(loop.length or 1 for loop in self.list_loops())
+        lengths = [loop.length for loop in self.list_loops()]
+        return math.prod(1 if length is None or length == ANY_LENGTH else length for length in lengths)
 
 
 class Buffer:
@@ -183,6 +186,7 @@ class Store:
 class Loop:
     """A body that is repeated: `length` times, or while any run's condition holds (then `length` is None).
 
+    Of ANY_LENGTH are the loops of a scan over rows, whose code reads the number of turns when it is called.
     `parameters` stand for the carry in the body, `initial` and `following` for the carry before and after a turn,
     `results` for the carry after the last one. `counter` counts the turns from 0. `block` is the enclosing block.
     """

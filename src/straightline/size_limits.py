@@ -10,6 +10,9 @@ def divide_rounded_up(a: int, b: int) -> int:
     return -(-a // b)
 
 
+# Turns of the scan of `compile_scan`, of which code learns the number when it is called: no array in memory is as long.
+ANY_LENGTH = 2**31 - 1
+
 # Operations of a program, and of half of those made while it is folded: of 120,000 LLVM takes half as long as XLA, 0.1
 # ms each; a refusal comes after some 4 s.
 LONGEST = 200_000

@@ -86,6 +86,58 @@ def test_a_step_is_traced_once_for_recordings_of_any_length_and_alone():
     np.testing.assert_allclose(item.estimate(state).mean, item.run(Z, U).means[0], rtol=1e-13)  # another program
 
 
+class Compiled(Traced):
+    """A filter that also notes each time that its estimate is traced: once for each program that is compiled of it."""
+
+    def estimate(self, state):
+        self.noted.append(state)
+        return self.base.estimate(state)
+
+
+class Started(Traced):
+    """A filter that also notes each time that its start is traced."""
+
+    def init(self):
+        self.noted.append("init")
+        return self.base.init()
+
+
+@pytest.mark.parametrize("make", [hg.linear_filter, hg.cubature_filter])
+def test_recordings_of_any_length_share_one_program(make):
+    """The rows of a shorter one are the first of a longer one, bit for bit; rows behind others have a program too."""
+    item = Compiled(make(PLANT, SENSOR, RELAY), Notes())
+    whole, compiled = item.run(Z, U), len(item.noted)
+    for rows in (1, 2, 13, 19):
+        part = item.run(Z[:rows], U[:rows])
+        np.testing.assert_array_equal(part.means, whole.means[:rows])
+        np.testing.assert_array_equal(part.covariances, whole.covariances[:rows])
+    assert len(item.noted) == compiled
+    for rows in (1, 2, 13):
+        behind = item.run(Z[rows:], U[rows:], after=item.run(Z[:rows], U[:rows]))
+        np.testing.assert_array_equal(behind.means, whole.means[rows:])
+    assert len(item.noted) == compiled + 1
+
+
+def whiten(item, z, u):
+    return hg.simulation.whitened_innovations(z, item, u)
+
+
+@pytest.mark.parametrize("function", [hg.log_likelihood, whiten, hg.forecasting.predict_rows])
+def test_what_is_computed_of_rows_has_one_program_for_any_number_of_them(function):
+    item = Started(hg.linear_filter(PLANT, SENSOR, RELAY), Notes())
+    function(item, Z, U)
+    compiled = len(item.noted)
+    for rows in (1, 2, 13):
+        function(item, Z[:rows], U[:rows])
+    assert len(item.noted) == compiled
+
+
+def test_a_log_likelihood_is_the_sum_of_those_of_rows():
+    item = hg.linear_filter(PLANT, SENSOR, RELAY)
+    for rows in (1, 2, 13, 20):
+        assert hg.log_likelihood(item, Z[:rows], U[:rows]) == item.run(Z[:rows], U[:rows]).log_likelihood
+
+
 def test_native_code_computes_it(monkeypatch):
     """If it did not, the forced engine would say why."""
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.numerics import cholesky, diagonal, psd_solve
+from heliograph.numerics import cholesky, diagonal, psd_solve, where
 
 WRITTEN = 24  # rows up to which a matrix is written out
 FACTOR = jax.jit(cholesky)
@@ -67,3 +67,24 @@ def test_the_diagonal_is_that_of_numpy(n):
     a = np.arange(float(n * n)).reshape(n, n)
     with jax.enable_x64(True):
         assert diagonal(a).tolist() == np.diagonal(a).tolist()
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_where_is_that_of_jax_in_fewer_operations(double):
+    """Shapes are broadcast and types promoted as there; in a trace nothing is a function of its own."""
+    rows = np.arange(6.0).reshape(2, 3)
+    with jax.enable_x64(double):
+        for condition, a, b in [
+            (rows > 2, rows, 0.0),
+            (rows[:, :1] > 2, jnp.nan, jnp.asarray(rows)),
+            (np.array([True, False, True]), jnp.asarray(rows, np.float32), -1.0),
+            (True, rows[0], rows),
+            (rows > 2, jnp.asarray(rows, np.float32), jnp.asarray(rows)),
+            (rows > 2, np.arange(3), 2),
+        ]:
+            expected, found = jnp.where(condition, a, b), where(condition, a, b)
+            assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
+            np.testing.assert_array_equal(found, expected)
+        traced = jax.make_jaxpr(lambda condition: where(condition, rows, 0.0))(np.ones(3, bool))
+    names = {equation.primitive.name for equation in traced.eqns}
+    assert names <= {"broadcast_in_dim", "select_n"}

@@ -20,7 +20,7 @@ from heliograph.numerics.process.garbage_collector import pause_collector
 from heliograph.numerics.process.interpreter_stack import reserve_stack
 from heliograph.numerics.trace_settings import trace_settings
 from heliograph.numerics.types import PyTree
-from straightline import Unsupported, compile
+from straightline import Unsupported, compile, compile_scan
 
 Code = TypeVar("Code")
 P = ParamSpec("P")
@@ -137,6 +137,43 @@ def compute_once(
         return map_arrays(lambda leaf: leaf[0, ...], choice.results())
 
 
+def scan_rows(
+    begin: Callable[[Any], PyTree],
+    step: Callable[[Any, Any, Any], tuple[PyTree, PyTree]],
+    fixed: PyTree,
+    rows: PyTree,
+    by_xla: Callable[[], PyTree],
+) -> tuple[PyTree, PyTree]:
+    """Step over rows of data in double precision; return the last state and the outputs of all rows, as NumPy arrays.
+
+    Native code serves any number of rows, so that a recording of another length compiles nothing.
+
+    Args:
+        begin: a function that returns the state before the first row from `fixed`.
+        step: a function that returns the state after a row and the row's output, from `fixed`, the state before it and
+            the row.
+        fixed: a tree of what is the same for all rows, such as a filter.
+        rows: a tree of arrays (rows, ...).
+        by_xla: computes the same by XLA, where native code does not take the step, and for no rows.
+
+    Raises:
+        ValueError: native code is forced and does not take the step.
+    """
+    engine, count = read_forced_engine(), len(jax.tree.leaves(rows)[0])
+    with jax.enable_x64(True):
+        if engine != "xla" and count:
+            choice = _find_code(_compile_scan, (begin, step, fixed, rows), (False, False, False, True), most=None)
+            why = choice.why or choice.code.generate_code(count)
+            if not why:
+                first = len(choice.arrays) - len(jax.tree.leaves(rows))  # of the rows, behind those of `fixed`
+                results: tuple[PyTree, PyTree] = choice.code(choice.arrays[:first], choice.arrays[first:])
+                return results
+            if engine == "native":
+                raise fail("native code", "a program of operations that it takes", why)
+        computed: tuple[PyTree, PyTree] = float64.to_numpy(by_xla())
+        return computed
+
+
 def map_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:
     """Change the arrays of results; what they have beside arrays, such as a model's functions, stays."""
     return jax.tree.map(lambda leaf: change(leaf) if isinstance(leaf, np.ndarray) else leaf, results)
@@ -231,23 +268,35 @@ def _find_compiled_code(
         differs_by_run: for each argument whether its arrays have a leading axis of runs.
         most: operations above which there is no code; the compiler's own limit if None.
     """
-    leaves, structure = jax.tree.flatten((function, *arguments))
-    # The same of each leaf; those of the function have no axis of runs.
-    leaf_differs = [False] * len(jax.tree.leaves(function))
-    for argument, argument_differs in zip(arguments, differs_by_run, strict=True):
-        leaf_differs += [argument_differs] * len(jax.tree.leaves(argument))
+    return _find_code(_compile_for_structure, (function, *arguments), (False, *differs_by_run), most)
+
+
+def _find_code(
+    compile: Callable[..., tuple[Any, str]], trees: Sequence[PyTree], has_axis: Sequence[bool], most: int | None
+) -> EngineChoice:
+    """Return the native code that `compile` makes of trees of this structure, made once, or why there is none.
+
+    Args:
+        compile: one of the functions below, which keep what they made.
+        trees: functions and their arguments, with arrays.
+        has_axis: for each tree whether its arrays have a leading axis, of runs or of rows.
+        most: operations above which there is no code; the compiler's own limit if None.
+    """
+    leaves, structure = jax.tree.flatten(tuple(trees))
+    leaf_has_axis = list[bool]()  # the same of each leaf
+    for tree, tree_has_axis in zip(trees, has_axis, strict=True):
+        leaf_has_axis += [tree_has_axis] * len(jax.tree.leaves(tree))
     # The key of the cache of code: the structure and its leaves, of arrays their shape in one run and their type.
     # Arrays become arguments of the code; all other leaves are part of it.
     arrays, key_leaves = list[Any](), list[Any]()
-    for leaf, has_runs in zip(leaves, leaf_differs, strict=True):
+    for leaf, is_led in zip(leaves, leaf_has_axis, strict=True):
         if isinstance(leaf, np.ndarray | jax.Array):
             arrays.append(leaf)
-            shape_of_run = leaf.shape[1:] if has_runs else leaf.shape
-            key_leaves.append(_ArrayOfRun(shape_of_run, leaf.dtype, has_runs))
+            key_leaves.append(_ArrayOfRun(leaf.shape[1:] if is_led else leaf.shape, leaf.dtype, is_led))
         else:
             key_leaves.append(leaf)
     try:
-        code, why = _compile_for_structure(structure, tuple(key_leaves), most)
+        code, why = compile(structure, tuple(key_leaves), most)
     except TypeError as error:  # a leaf without a hash has no key: XLA computes
         is_of_key = "unhashable" in str(error)  # rather than one that the function raises while it is traced
         if not is_of_key:
@@ -259,11 +308,11 @@ def _find_compiled_code(
 
 
 class _ArrayOfRun(NamedTuple):
-    """Shape and type of one run's array, and whether each run has its own."""
+    """Shape and type of one run's array, or of one row's, and whether each run or row has its own."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
-    differs_by_run: bool
+    differs: bool
 
 
 @lru_cache(COMPILED)
@@ -274,22 +323,60 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
 
     Of arrays the leaves have shapes and types: these are the arguments of the code.
     """
-    arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
 
     def call(*values: Any) -> PyTree:
         """Call the function with these values in the places of the placeholders among `leaves`, and return its result.
 
         `leaves` and `structure` are those of the tree (function, *arguments), since the function may hold arrays too.
         """
-        next_value = iter(values)
-        with_values = [next(next_value) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
-        function, *arguments = jax.tree.unflatten(structure, with_values)
+        function, *arguments = _put_in_tree(structure, leaves, values)
         return function(*arguments)
 
-    placeholder: Any = jax.ShapeDtypeStruct
-    examples = [placeholder(array.shape, array.dtype) for array in arrays]
-    shared = [n for n, array in enumerate(arrays) if not array.differs_by_run]
+    arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
+    shared = [n for n, array in enumerate(arrays) if not array.differs]
     try:
-        return compile(call, *examples, shared=shared, most=most), ""
+        return compile(call, *_make_examples(arrays), shared=shared, most=most), ""
     except Unsupported as error:
         return None, str(error)
+
+
+@lru_cache(COMPILED)
+@reserve_stack
+@pause_collector()
+def _compile_scan(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
+    """Return the code of a scan in a tree (begin, step, fixed, rows) with these leaves, or None and why there is none.
+
+    Of arrays the leaves have shapes and types, of rows those of one row.
+    """
+
+    def begin(fixed: Any) -> PyTree:
+        """Return the state before the first row; what `begin` is given has no row in it."""
+        function, _, tree, _ = _put_in_tree(structure, leaves, [*fixed, *[None] * len(of_rows)])
+        return function(tree)
+
+    def step(fixed: Any, state: PyTree, row: Any) -> tuple[PyTree, PyTree]:
+        """Return the state after a row, and the row's output."""
+        _, function, *trees = _put_in_tree(structure, leaves, [*fixed, *row])
+        after: tuple[PyTree, PyTree] = function(trees[0], state, trees[1])
+        return after
+
+    arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
+    of_rows = [array for array in arrays if array.differs]
+    fixed = [array for array in arrays if not array.differs]
+    try:
+        return compile_scan(begin, step, _make_examples(fixed), _make_examples(of_rows), most=most), ""
+    except Unsupported as error:
+        return None, str(error)
+
+
+def _put_in_tree(structure: Any, leaves: Sequence[Any], values: Sequence[Any]) -> Any:
+    """Return a tree of this structure with `values` in the places of the placeholders among its leaves."""
+    next_value = iter(values)
+    with_values = [next(next_value) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
+    return jax.tree.unflatten(structure, with_values)
+
+
+def _make_examples(arrays: Sequence[_ArrayOfRun]) -> list[Any]:
+    """Return placeholders of arrays of these shapes and types."""
+    placeholder: Any = jax.ShapeDtypeStruct
+    return [placeholder(array.shape, array.dtype) for array in arrays]

@@ -109,26 +109,27 @@ def _take_entries(entries: jax.Array, indices: np.ndarray) -> jax.Array:
 
 def is_positive(x: jax.Array) -> jax.Array:
     """Return whether x is a positive normal number: of smaller ones 1 / x may be infinite, so that they count as 0."""
-    return x > float(np.finfo(np.dtype(x.dtype)).tiny)
+    return lax.gt(x, lax.full_like(x, np.finfo(np.dtype(x.dtype)).tiny))
 
 
 @jax.jit
 def reciprocal_or_one(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
-    return 1 / lax.select(is_positive(x), x, lax.full_like(x, 1.0))
+    one = lax.full_like(x, 1.0)
+    return lax.div(one, lax.select(is_positive(x), x, one))
 
 
 @jax.jit
 def reciprocal_or_zero(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 0 of 0."""
-    positive = is_positive(x)
-    return lax.select(positive, 1 / lax.select(positive, x, lax.full_like(x, 1.0)), lax.full_like(x, 0.0))
+    positive, one = is_positive(x), lax.full_like(x, 1.0)
+    return lax.select(positive, lax.div(one, lax.select(positive, x, one)), lax.full_like(x, 0.0))
 
 
 @jax.jit
 def square_root(x: jax.Array) -> jax.Array:
     """Return the root of x, with the derivative 0 at 0: times the infinite one a derivative of 0 would be NaN."""
-    positive = x > 0
+    positive = lax.gt(x, lax.full_like(x, 0.0))
     return lax.select(positive, lax.sqrt(lax.select(positive, x, lax.full_like(x, 1.0))), lax.full_like(x, 0.0))
 
 
@@ -334,7 +335,7 @@ def unit_of(numbers: Array) -> float:
 
 def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
     """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
-    return jnp.where(pivot >= floor, pivot, floor)
+    return lax.select(lax.ge(pivot, floor), pivot, floor)
 
 
 def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:

@@ -40,7 +40,7 @@ from heliograph.factors.scalar_update import (
     update_root_columns,
 )
 from heliograph.numerics.gaussian_density import LOG_TURN
-from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
+from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric, where
 from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.trace_settings import writes_short_programs
 from heliograph.numerics.types import Array, Float
@@ -74,7 +74,8 @@ class Gaussian(NamedTuple):
         root, variances = (xp.asarray(factor) for factor in (self.root, self.variances))
         product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
         upper = np.triu(np.ones(product.shape[-2:], bool))
-        return xp.where(upper, product, xp.swapaxes(product, -1, -2))
+        choose = np.where if xp is np else where
+        return choose(upper, product, xp.swapaxes(product, -1, -2))
 
 
 def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
@@ -207,12 +208,12 @@ class Innovations(NamedTuple):
         with them, and -inf if not. `size` (m,) is the size of the terms whose difference is the innovation.
         """
         determined = self.determined
-        variance = jnp.where(determined, 1.0, self.variance)
+        variance = where(determined, 1.0, self.variance)
         density = -(self.value**2 * (1 / variance) + jnp.log(variance) + LOG_TURN) / 2
         # It agrees up to rounding: shares of its deviation by itself (`whole` is the variance), and of the terms.
         tolerance = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
-        log_agreement = jnp.where(lax.abs(self.value) <= tolerance, 0.0, -jnp.inf)
-        return jnp.sum(jnp.where(present, jnp.where(determined, log_agreement, density), 0.0))
+        log_agreement = where(lax.abs(self.value) <= tolerance, lax.full_like(self.value, 0.0), -jnp.inf)
+        return jnp.sum(where(present, where(determined, log_agreement, density), 0.0))
 
 
 def condition_on_observation(
@@ -227,11 +228,11 @@ def condition_on_observation(
     n = len(x.mean)
     present = ~jnp.isnan(innovation) if present is None else present
     # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
-    fresh = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
-    rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
-    rows = jnp.where(present[:, None], rows, 0.0)
+    fresh = triangularise_noise(WeightedColumns(where(present[:, None], noise.matrix, 0.0), noise.weights))
+    rows = jnp.concatenate([slopes, where(present, innovation, 0.0)[:, None]], axis=1)
+    rows = where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
-    rows, variance = decorrelate(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
+    rows, variance = decorrelate(fresh.matrix, rows), where(present, fresh.weights, 1.0)
     least = rounding_of_slopes(n, fresh.matrix, whole)
     # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
     root, news = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
@@ -373,8 +374,8 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         power = f * product
         # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.
         depends_on_xi = jnp.sum(power) > rounding
-        products = jnp.append(jnp.where(depends_on_xi, product, 0.0), r)
-        powers = jnp.append(jnp.where(depends_on_xi, power, 0.0), r)
+        products = jnp.append(where(depends_on_xi, product, 0.0), r)
+        powers = jnp.append(where(depends_on_xi, power, 0.0), r)
         rows = jnp.concatenate([root, column[:, None]], axis=1)
         rows, d, gain, _ = update_by_scalar_given_products(
             rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)

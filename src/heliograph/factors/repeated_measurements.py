@@ -21,7 +21,7 @@ from heliograph.factors.covariance_factors import (
     triangularise,
     unit_of,
 )
-from heliograph.numerics.linalg import WRITTEN, outer, scale
+from heliograph.numerics.linalg import WRITTEN, outer, scale, where
 from straightline import operation
 
 
@@ -53,7 +53,7 @@ def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     each subtracted L_ik w_k. The share is at least RANK, since correlations of noises are not known better.
     """
     share = max(ROUNDING_UNITS * n * unit_of(whole), RANK)
-    below = jnp.tril(lower, -1)
+    below = where(np.tri(len(lower), k=-1, dtype=bool), lower, 0.0)
     return rounding_of_products(n, whole) + share**2 * (below**2 @ whole)
 
 

@@ -9,7 +9,7 @@ from jax import lax
 
 from heliograph.factors.covariance_factors import is_positive, reciprocal_or_one
 from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
-from heliograph.numerics.linalg import WRITTEN
+from heliograph.numerics.linalg import WRITTEN, where
 from heliograph.numerics.trace_settings import writes_short_programs
 
 
@@ -130,9 +130,9 @@ def update_by_row(
     if least is None:
         return update_by_scalar_given_products(root, d, f, (product, power), noise)
     is_rounding = jnp.sum(power) <= least
-    noise_or_large = jnp.where(is_rounding, noise + noise_beside_rounding(len(d), least), noise)
+    noise_or_large = where(is_rounding, noise + noise_beside_rounding(len(d), least), noise)
     root, d, gain, variance = update_by_scalar_given_products(root, d, f, (product, power), noise_or_large)
-    return root, d, gain, jnp.where(is_rounding, noise, variance)
+    return root, d, gain, where(is_rounding, noise, variance)
 
 
 Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]

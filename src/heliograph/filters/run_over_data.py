@@ -4,13 +4,13 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compute_once
+from heliograph.engine.choice import scan_rows
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
 from heliograph.filters.linear_recursion import initial_state_if_linear
 from heliograph.model.checks.plant_inputs import check_inputs
@@ -180,7 +180,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     # return None where they do not apply.
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row_results, *start)
     result = result or filter.filter_rows(rows_z, rows_u, *start)
-    state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
+    state, outputs = result or step_over_known_rows(filter, rows_z, rows_u, _collect_row_results, start)
     mean, covariance, innovation, modes, counts = outputs
     _warn_of_lost_estimate(filter, mean, begin)
     if counts is not None:
@@ -197,6 +197,44 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
         modes=modes,
         effective_numbers=counts,
     )
+
+
+def step_over_known_rows(
+    filter: SteppedFilter,
+    z: Array,
+    u: Array,
+    output: Callable[[Any, PyTree, Innovation, Array], PyTree],
+    start: tuple[PyTree, Array] | tuple[()] = (),
+) -> tuple[PyTree, PyTree]:
+    """Step a filter over rows of data outside of any trace; return the last state and the outputs, stacked.
+
+    One program of native code serves any number of rows; XLA computes what it does not take.
+
+    Args:
+        filter: the filter.
+        z: measurements (rows, received).
+        u: inputs (rows, inputs).
+        output: what is kept of a row, a function of a module, of the filter, its state after the row, the innovation
+            and the row's number.
+        start: the state before the first row, and the number of that row; by default those before any data.
+    """
+    begin = start[1] if start else 0
+    rows = np.asarray(begin + np.arange(len(z))), z, u
+    return scan_rows(_begin, _step, (filter, output, *start), rows, lambda: _by_xla(filter, output, z, u, *start))
+
+
+def _begin(fixed: tuple[Any, ...]) -> PyTree:
+    """Return the state before the first row: the one that is given with the filter, or else the filter's own."""
+    filter, _, *start = fixed
+    return jax.tree.map(jnp.asarray, start[0] if start else filter.init())
+
+
+def _step(fixed: tuple[Any, ...], state: PyTree, row: tuple[Array, ...]) -> tuple[PyTree, PyTree]:
+    """Return the state after a row (number, measurement, input), and what is kept of the row."""
+    filter, output, *_ = fixed
+    k, z, u = row
+    after, innovation = filter.correct(filter.predict(state, u, k), z, k)
+    return after, output(filter, after, innovation, k)
 
 
 def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
@@ -271,23 +309,28 @@ def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) ->
         warnings.warn(f"{finding}; take more of them", stacklevel=4)
 
 
-def _compute_filtered(
-    filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
+def _compute_rows(
+    filter: SteppedFilter,
+    output: Callable[[Any, PyTree, Innovation, Array], PyTree],
+    z: Array,
+    u: Array,
+    state: PyTree | None = None,
+    begin: Array | int = 0,
 ) -> PyTree:
-    """Filter all rows and return the results of all, in a program that `run_over_data` compiles.
+    """Compute what `step_over_known_rows` does, in a program of XLA.
 
     `begin` is the number of the first row, and `state` the state before it (None: that before any data).
     """
-    return scan_with_last_state(filter, z, u, partial(_collect_row_results, filter), state, begin)
+    return scan_with_last_state(filter, z, u, partial(output, filter), state, begin)
 
 
-def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: Array) -> PyTree:
     """Return what is kept of a row: mean, covariance, innovation, probabilities of modes, number of particles."""
     estimate = filter.after_step(state, k)
     return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)
 
 
-_by_xla = quickly_compiled(_compute_filtered)
+_by_xla = quickly_compiled(_compute_rows)
 
 
 def check_data(

@@ -1,12 +1,13 @@
 """One step ahead at every row: what a filter, or each filter of a record, predicted of it from the rows before."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compute_once
+from heliograph.engine.choice import scan_rows
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.run_over_data import check_data
 from heliograph.forecasting.backtest import list_single_filters, select_measurements
@@ -93,7 +94,9 @@ def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, na
     `names`: of the numbers that arrive.
     """
     filter, sensor = outlook.filter, first(outlook.sensor)
-    states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, z, u))
+    rows = np.arange(len(z)), z, u
+    _, moments = scan_rows(_begin, _predict_and_correct, outlook, rows, lambda: _by_xla(outlook, rows))
+    states, outputs, received = moments
     angles = filter.angles_used() or FilterAngles((), ())
     measured = outputs and make_prediction(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
@@ -109,20 +112,24 @@ def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, na
     )
 
 
-def _predict_each_row(outlook: MultistepPredictor, z: jax.Array, u: jax.Array) -> PyTree:
-    """Return the moments (rows, K, ...) that a filter predicts for each row of a recording from the earlier rows."""
+def _begin(outlook: MultistepPredictor) -> PyTree:
+    """Return the filter's state before the first row."""
+    return jax.tree.map(jnp.asarray, outlook.filter.init())
 
-    def predict_and_correct(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Return the state after a row, and the moments that were predicted for it."""
-        k, z_k, u_k = row
-        prior, moments = outlook.predict_step(state, u_k, k)
-        state_after, _ = outlook.filter.correct(prior, z_k, k)
-        return state_after, moments
 
-    start = jax.tree.map(jnp.asarray, outlook.filter.init())
-    rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)
-    _, moments_of_rows = jax.lax.scan(predict_and_correct, start, rows)
-    return moments_of_rows
+def _predict_and_correct(
+    outlook: MultistepPredictor, state: PyTree, row: tuple[jax.Array, ...]
+) -> tuple[PyTree, PyTree]:
+    """Return the state after a row, and the moments (K, ...) that were predicted for it from the earlier rows."""
+    k, z, u = row
+    prior, moments = outlook.predict_step(state, u, k)
+    state_after, _ = outlook.filter.correct(prior, z, k)
+    return state_after, moments
+
+
+def _predict_each_row(outlook: MultistepPredictor, rows: PyTree) -> tuple[PyTree, PyTree]:
+    """Return the last state, and the moments (rows, K, ...) that a filter predicts for each row of a recording."""
+    return jax.lax.scan(partial(_predict_and_correct, outlook), _begin(outlook), rows)
 
 
 _by_xla = quickly_compiled(_predict_each_row)

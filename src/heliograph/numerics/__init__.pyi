@@ -98,6 +98,7 @@ from .linalg import squared_distance_terms as squared_distance_terms
 from .linalg import symmetric as symmetric
 from .linalg import symmetrize as symmetrize
 from .linalg import whiten as whiten
+from .linalg import where as where
 from .angles.manifold import Manifold as Manifold
 from .masked_arrays import fill_masked as fill_masked
 from .masked_arrays import is_absent as is_absent

@@ -4,14 +4,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.chunks import sum_filtered_in_chunks
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.run_over_data import check_data, step_over_known_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
-from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, Scalar
 
@@ -51,7 +50,8 @@ def log_likelihood(
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if total is not None:  # None: the filter cannot be run in chunks
         return float(total)
-    return float(compute_once(_sum_log_likelihoods, _sum_by_xla, arguments))
+    _, log_likelihoods = step_over_known_rows(*arguments, _judge_likelihood)
+    return float(np.sum(log_likelihoods))
 
 
 def _sum_log_likelihoods(
@@ -62,10 +62,7 @@ def _sum_log_likelihoods(
     return jnp.sum(log_likelihoods)
 
 
-def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:
+def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: Array) -> jax.Array:
     """Return the log-likelihood of a row; NaN where the estimate is no number, since the row would look lost."""
     lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
     return jnp.where(lost, jnp.nan, innovation.log_likelihood)
-
-
-_sum_by_xla = compile_in_float64(_sum_log_likelihoods)

@@ -20,7 +20,7 @@ from straightline.llvm.prefetch import PrefetchedRows, write_prefetch_requests
 from straightline.llvm.vector_types_and_gathers import WIDTH, gather_name
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
 from straightline.program import find_fused_product
-from straightline.size_limits import LONGEST_BASIC_BLOCK
+from straightline.size_limits import ANY_LENGTH, LONGEST_BASIC_BLOCK
 
 Scope = dict[Any, str]
 
@@ -341,7 +341,8 @@ class FunctionWriter:
         self.line(f"br label %{name}.latch")
         self.start_basic_block(f"{name}.latch")
         self.line(f"{counter}.next = add i64 {counter}, 1")
-        self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
+        turns = "%runs" if loop.length == ANY_LENGTH else loop.length  # a scan gets its rows where others get runs
+        self.line(f"%{name}.more = icmp slt i64 {counter}.next, {turns}")
         self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
         return following
 

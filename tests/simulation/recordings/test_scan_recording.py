@@ -1,5 +1,6 @@
 """Rows of a network in blocks, each after the record of the one before: the records of one run."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -113,3 +114,49 @@ def test_a_gap_between_two_blocks_is_an_unequal_step():
     hg.run(item, {"near": np.zeros(5)}, time=day + np.arange(5, 10), after=first)
     with pytest.warns(UserWarning, match="time: steps of 1 and 96 seconds"):
         hg.run(item, {"near": np.zeros(5)}, time=day + np.arange(100, 105), after=first)
+
+
+class Compiled(hg.filters.AbstractFilter):
+    """A filter around another, which notes each time that its start is traced: once for each program."""
+
+    base: hg.filters.AbstractFilter
+    noted: list = eqx.field(static=True)
+    claim: str = eqx.field(static=True, default="exact")
+    states: tuple = eqx.field(static=True, default=WALK.states)
+    inputs: tuple = eqx.field(static=True, default=())
+    received: int = eqx.field(static=True, default=1)
+
+    def init(self):
+        self.noted.append("init")
+        return self.base.init()
+
+    @hg.filters.predicts
+    def predict(self, state, u=(), k=0):
+        return self.base.predict(state, u, k)
+
+    @hg.filters.corrects
+    def correct(self, state, z, k=0):
+        return self.base.correct(state, z, k)
+
+    def estimate(self, state):
+        return self.base.estimate(state)
+
+
+class Notes(list):
+    """Notes that a filter may hold as a part that is no array: known by what they are, not by what stands in them."""
+
+    __hash__, __eq__ = object.__hash__, object.__eq__
+
+
+@pytest.mark.filterwarnings("ignore:.*left out")
+@pytest.mark.parametrize("outlier", [0.0, 1e6])
+def test_recordings_of_any_length_share_one_program(outlier):
+    """Also where a value is implausible, so that all rows are filtered again with judgements."""
+    item = Compiled(hg.linear_filter(WALK, PLACE, LOSSY), Notes())
+    net = hg.Network(WALK, {"far": hg.Node(PLACE, LOSSY, {"f": item})})
+    z = np.where(np.arange(ROWS) == 0, outlier, measured()["far"])
+    whole, compiled = hg.run(net, {"far": z}), len(item.noted)
+    for rows in (1, 2, 33):
+        part = hg.run(net, {"far": z[:rows]})
+        np.testing.assert_array_equal(part.estimates["far"]["f"].mean, whole.estimates["far"]["f"].mean[:rows])
+    assert len(item.noted) == compiled

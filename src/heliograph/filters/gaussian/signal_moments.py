@@ -25,7 +25,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angles.angle import Angles, continue_angles, wrap_near
-from heliograph.numerics.linalg import contract, diagonal
+from heliograph.numerics.linalg import contract, diagonal, where
 from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -171,7 +171,7 @@ def condition_on_measurement(
     after, innovations = condition_on_observation(x, slopes, value, noise, present)
     covariance = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
     log_likelihood = innovations.log_density(present, lax.abs(z) + lax.abs(expected))
-    covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
+    covariance = where(present[:, None] & present, covariance, jnp.nan)
     return after, Innovation(value, covariance, log_likelihood)
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, predict_affine
@@ -117,4 +118,4 @@ def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[ja
 
 def _clip_to(a: jax.Array, largest: float) -> jax.Array:
     """Clip the entries of a to [-largest, largest]."""
-    return jnp.maximum(jnp.minimum(a, largest), -largest)
+    return lax.max(lax.min(a, lax.full_like(a, largest)), lax.full_like(a, -largest))

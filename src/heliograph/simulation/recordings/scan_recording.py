@@ -1,12 +1,13 @@
 """All filters of a network over the rows of a recording: in one scan, in chunks side by side, or part after part."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compute_once
+from heliograph.engine.choice import compute_once, scan_rows
 from heliograph.filters.chunks import scan_in_chunks
 from heliograph.filters.linear_recursion import Recursion
 from heliograph.model.forecast_origin import Origin
@@ -49,7 +50,7 @@ class FilteringTask(NamedTuple):
 
     def first_states(self) -> PyTree:
         """Return the states before the first of these rows."""
-        return self.filters.init() if self.begin is None else jax.tree.map(jnp.asarray, self.begin.states)
+        return _begin((self.filters, None if self.begin is None else self.begin.states))
 
     def rows(self, z: tuple[np.ndarray, ...]) -> tuple[PyTree, ...]:
         """Return the rows, with a leading axis of steps: step numbers, inputs, measurements z, and what arrived.
@@ -61,6 +62,10 @@ class FilteringTask(NamedTuple):
         if self.begin is not None:
             numbers = self.begin.step + numbers
         return numbers, self.u, z, self.arrivals
+
+    def number_rows(self) -> np.ndarray:
+        """Return the numbers of the rows, as `rows` has them, outside of a trace."""
+        return np.arange(len(self.u)) + (0 if self.begin is None else self.begin.step)
 
 
 def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> Origin:
@@ -120,7 +125,32 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
         return results
     # Native code cannot store a joint covariance here, since its layout depends on the graph, an argument.
     by_xla = any(mesh.has_long_step or mesh.needs_joint for mesh in task.filters.meshes.values())
-    return _scan_in_parts(task, z, judged) if by_xla else compute_once(_scan_all_rows, _by_xla, (task, z, judged))
+    if by_xla:
+        return _scan_in_parts(task, z, judged)
+    if task.smoother is not None:  # it goes back over all rows
+        return compute_once(_scan_all_rows, _by_xla, (task, z, judged))
+    fixed = task.filters, None if task.begin is None else task.begin.states
+    rows, step = (task.number_rows(), task.u, z, task.arrivals), _step_judged if judged else _step_unjudged
+    scanned = scan_rows(_begin, step, fixed, rows, lambda: _scanned_by_xla(task, z, judged))
+    return _collect_results(None, z, *scanned)
+
+
+def _begin(fixed: tuple[AllFilters, PyTree]) -> PyTree:
+    """Return the states of filters before the first row: those that are given with them, or else their own."""
+    filters, states = fixed
+    return filters.init() if states is None else jax.tree.map(jnp.asarray, states)
+
+
+def _step_unjudged(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return the states of all filters after one row, and their outputs; all data are used."""
+    k, u, z, arrivals = row
+    return fixed[0].step(states, z, u, k, arrivals)
+
+
+def _step_judged(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return the states of all filters after one row, and their outputs; what is implausible is left out."""
+    k, u, z, arrivals = row
+    return step_plausibly(fixed[0], states, z, u, k, arrivals)
 
 
 class NetworkRecursion(Recursion):
@@ -168,7 +198,7 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
         k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
         drawn |= {name: (drawn[name], mesh.compute_weights_ahead(drawn[name])) for name, mesh in filters.meshes.items()}
         is_counted = np.arange(start, start + size) < len(u)
-        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, is_counted)
+        states, results = _part_by_xla(filters, states, (k, u_k, z_k, drawn), judged, is_counted)
         parts.append(to_numpy(results))
     all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
     return to_numpy(_collect_results(smoother, z, states, all_rows))
@@ -176,7 +206,12 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
 
 def _scan_all_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return what `filter_rows` does, of all rows in one scan."""
-    return _collect_results(task.smoother, z, *_scan_rows(task.filters, task.first_states(), task.rows(z), judged))
+    return _collect_results(task.smoother, z, *_scan_to_the_end(task, z, judged))
+
+
+def _scan_to_the_end(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> tuple[PyTree, dict[str, PyTree]]:
+    """Step over all rows of a recording: return the last states, and the results by row."""
+    return _scan_rows(task.filters, task.first_states(), task.rows(z), judged)
 
 
 def _scan_rows(
@@ -200,8 +235,8 @@ def _scan_rows(
         leave out measurements that are judged implausible.
         """
         (k, u_k, z_k, arrivals), row_is_counted = row
-        step = step_plausibly if judged else AllFilters.step
-        after, results = step(filters, states, z_k, u_k, k, arrivals)
+        step = _step_judged if judged else _step_unjudged
+        after, results = step((filters, None), states, (k, u_k, z_k, arrivals))
         if row_is_counted is not None:
             after = jax.tree.map(lambda new, old: jnp.where(row_is_counted, new, old), after, states)
         return after, results
@@ -225,29 +260,23 @@ def _collect_results(
 
 def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
     """Return the states of the central filters before each row (steps, ...), by name; z as of `filter_rows`."""
-    return compute_once(_collect_central_states, _central_states_by_xla, (task._replace(smoother=None), z))
+    rows = task.number_rows(), task.u, z, task.arrivals
+    fixed = task.filters, None if task.begin is None else task.begin.states
+    return scan_rows(_begin, _step_central, fixed, rows, lambda: _central_states_by_xla(fixed, rows))[1]
 
 
-def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
-    """Return the states of the central filters, those of all measurements, before each row, by a scan over the rows.
-
-    z: measurements (steps, node, received) by group of nodes.
-    """
-
-    def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Return the states of all filters after a row, and the states of the central filters before it.
-
-        The row holds the step, inputs, measurements, and what arrived of reports.
-        """
-        k, u_k, z_k, arrivals = row
-        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, arrivals)
-        _, central, *_ = states
-        return after, central
-
-    before: PyTree
-    _, before = jax.lax.scan(step, task.first_states(), task.rows(z))
-    return before
+def _step_central(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return the states of all filters after a row, and the states of the central filters before it."""
+    after, _ = _step_judged(fixed, states, row)
+    _, central, *_ = states
+    return after, central
 
 
-_by_xla, _scanned_by_xla = quickly_compiled(_scan_all_rows), quickly_compiled(_scan_rows)
+def _collect_central_states(fixed: tuple[AllFilters, PyTree], rows: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return the last states, and the states of the central filters, those of all measurements, before each row."""
+    return jax.lax.scan(partial(_step_central, fixed), _begin(fixed), rows)
+
+
+_by_xla, _scanned_by_xla = quickly_compiled(_scan_all_rows), quickly_compiled(_scan_to_the_end)
+_part_by_xla = quickly_compiled(_scan_rows)
 _central_states_by_xla = quickly_compiled(_collect_central_states)

@@ -7,14 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import HALF
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.run_over_data import check_data, step_over_known_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.confidence_intervals import average_correlated
-from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import whiten
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -190,26 +188,17 @@ def score_innovations(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     if filter.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    arguments = filter, *check_data(filter, data, inputs)
-    likelihoods, whitened = compute_once(_whiten_innovations, _by_xla, arguments)
+    _, (likelihoods, whitened) = step_over_known_rows(filter, *check_data(filter, data, inputs), _score_row)
     return likelihoods, whitened
 
 
-def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
-    """Return each row's log-likelihood (steps,) and whitened innovation (steps, m), NaN where nothing arrived."""
-
-    def score_row(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return one row's log-likelihood and its whitened innovation (m,), NaN for components that are not used."""
-        is_used = ~jnp.isnan(innovation.value)
-        if innovation.weight is not None:  # do not judge a filter by what it mostly left out
-            is_used &= innovation.weight >= HALF
-        # Replace components that are not used by 0 with variance 1 and no correlation.
-        unit_if_unused = jnp.diag(jnp.where(is_used, 0.0, 1.0))
-        covariance = jnp.where(is_used[:, None] & is_used, innovation.covariance, unit_if_unused)
-        whitened = whiten(covariance, jnp.where(is_used, innovation.value, 0.0))
-        return jnp.asarray(innovation.log_likelihood), jnp.where(is_used, whitened, jnp.nan)
-
-    return filter.scan(z, u, score_row)
-
-
-_by_xla = quickly_compiled(_whiten_innovations)
+def _score_row(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: Array) -> tuple[jax.Array, jax.Array]:
+    """Return one row's log-likelihood and its whitened innovation (m,), NaN for components that are not used."""
+    is_used = ~jnp.isnan(innovation.value)
+    if innovation.weight is not None:  # do not judge a filter by what it mostly left out
+        is_used &= innovation.weight >= HALF
+    # Replace components that are not used by 0 with variance 1 and no correlation.
+    unit_if_unused = jnp.diag(jnp.where(is_used, 0.0, 1.0))
+    covariance = jnp.where(is_used[:, None] & is_used, innovation.covariance, unit_if_unused)
+    whitened = whiten(covariance, jnp.where(is_used, innovation.value, 0.0))
+    return jnp.asarray(innovation.log_likelihood), jnp.where(is_used, whitened, jnp.nan)
