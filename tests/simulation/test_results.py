@@ -184,7 +184,7 @@ def test_bad_places_and_files(runs, result, tmp_path):
     refused(lambda: runs.save(tmp_path / "no" / "runs.nc"), "an existing folder")
     (tmp_path / "mine.zarr").mkdir()
     (tmp_path / "mine.zarr" / "thesis.txt").touch()
-    refused(lambda: runs.save(tmp_path / "mine.zarr"), "other files")
+    refused(lambda: runs.save(tmp_path / "mine.zarr"), "thesis.txt, which would be lost")
     refused(lambda: hg.Record.open(tmp_path / "no.nc"), "a file of results", "nothing of that name")
     (tmp_path / "no.nc").write_text("no")
     refused(lambda: hg.Record.open(tmp_path / "no.nc"), "can be read")
