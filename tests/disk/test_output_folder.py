@@ -107,7 +107,7 @@ def test_a_folder_of_the_user_is_not_taken_for_results_by_the_name_of_a_file(tmp
     (tmp_path / "summary.json").write_text("{}")
     (tmp_path / "thesis.tex").touch()
     (tmp_path / LISTING).write_text("no list of ours")
-    with pytest.raises(ValueError, match="got .written.json and 2 others"):
+    with pytest.raises(ValueError, match=r"got \.written\.json and 2 others"):
         check_replaceable(tmp_path)
 
 
