@@ -264,6 +264,26 @@ def test_stamps_that_lost_their_digits_are_said(tmp_path):
         h.files.read_recording(tmp_path / "six.csv", WALK)
 
 
+def test_steps_that_are_rounded_by_the_size_of_their_times_are_said():
+    """Nanoseconds since 1970 as doubles are multiples of 256: steps of 1000 were 1024, or 768, without a word."""
+    k = np.arange(20)
+    for times in (1.7e18 + 1000.0 * k, (1e6 + 0.2 * k).astype(np.float32), 1.7e9 + 1e-5 * k):
+        with pytest.warns(UserWarning, match=r"column 'time': steps of .* they lost digits"):
+            h.files.read_recording({"time": times, "y": np.ones(20)}, WALK)
+    exact = (
+        1.7e18 + 1e6 * k,
+        (1e6 + k).astype(np.float32),
+        1.7e9 + 0.01 * k,
+        2.0**53 + 4 * k,
+        k * 0.25,
+        1e9 + 0 * k[:1],
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for times in exact:
+            h.files.read_recording({"time": times, "y": np.ones(len(times))}, WALK)
+
+
 @pytest.mark.parametrize(
     ("times", "date"),
     [

@@ -158,6 +158,28 @@ def is_mix_of_units(earlier: Any, later: Any) -> Any:
     return (earlier >= LONG_AGO) & (later > LEAP * earlier)
 
 
+COARSE = 0.01  # of a step, from which on the distance of doubles is an error of it
+
+
+def find_lost_digits(clock: np.ndarray) -> tuple[float, float] | None:
+    """Return the distance of neighbouring doubles at these times and the median step, if steps lost digits to it.
+
+    They did where the distance is more than COARSE of the median step and the times go to their last digit: not all
+    are multiples of two distances. Doubles that are all of single precision, as of a column of float32, have the
+    distance of these. None of dates and of whole numbers.
+    """
+    if clock.dtype.kind != "f" or len(clock) < 2:
+        return None
+    largest = np.abs(clock).max()
+    is_single = largest < np.finfo(np.float32).max and np.array_equal(clock.astype(np.float32), clock)
+    distance = float(np.spacing(np.float32(largest) if is_single else largest))
+    steps = np.abs(np.diff(clock))
+    steps = steps[steps > 0]
+    if not steps.size or distance <= COARSE * np.median(steps) or not np.any(np.remainder(clock, 2 * distance)):
+        return None
+    return distance, float(np.median(steps))
+
+
 def find_backwards_row(clock: np.ndarray) -> int | None:
     """Return the first row whose time is before that of the row above, None if there is none."""
     is_lower = clock[1:] < clock[:-1]
