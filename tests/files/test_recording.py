@@ -221,6 +221,23 @@ WALK = h.Network(
 )
 
 
+@pytest.mark.parametrize("smooth", [None, h.smoothing.FixedInterval()])
+def test_angles_in_tables_are_those_without_the_truth(estimate_columns, smooth):
+    """A record has its angles beside a known truth, so that they may be subtracted; a table has no truth in it."""
+    plant = h.LinearPlant([[1.0]], [[0.01]], [3.1], 0.1, states=["heading"], circular=["heading"])
+    sensor = h.LinearSensor([[1.0]], 0.1, outputs=["compass"], circular=["compass"])
+    node = h.Node(sensor, h.perfect(), {"f": h.kalman_filter(plant, sensor)})
+    z = {"a": [[3.1], [-3.1], [-2.9], [3.0], [-3.0]]}
+    truth = np.full((5, 1), 3.13)
+    net = h.Network(plant, {"a": node})
+    record, without = (h.run(net, z, truth=x, smooth=smooth) for x in (truth, None))
+    assert np.asarray(record.estimates["a"]["f"].mean).max() > np.pi
+    columns, expected = estimate_columns(record), estimate_columns(without)
+    assert columns.keys() == expected.keys()
+    for name, values in columns.items():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-14)  # full turns came and went: rounding
+
+
 @pytest.mark.parametrize("kind", ["us", "ms", "s", "D"])
 def test_a_date_that_nanoseconds_cannot_say_is_refused(kind):
     """The year 1 is "not set" for .NET, OPC UA and Parquet; in 64 bits of nanoseconds it would be one of 1754."""
