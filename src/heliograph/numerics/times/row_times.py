@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked, find_packing
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates, round_to_nanoseconds
 from heliograph.numerics.types import ArrayLike
@@ -124,10 +124,11 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
 
     Args:
         name: name of the rows, for errors.
-        rows: the rows; an index (pandas) or a coordinate of the first dimension (xarray) labels them.
+        rows: the rows; an index (pandas) or a coordinate of the first dimension (xarray) labels them. Spans of time
+            become seconds.
 
     Raises:
-        ValueError: dates that are missing or go backwards.
+        ValueError: dates that are missing or go backwards, or that are not decoded (numbers "days since 2000-01-01").
     """
     labels = getattr(rows, "index", None)
     if hasattr(rows, "dims") and hasattr(rows, "coords"):
@@ -135,7 +136,12 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
         labels = rows.coords.get(next(iter(dims))) if dims else None
     if labels is None or callable(labels):  # a list has a function of that name
         return None
+    if packing := find_packing(labels):
+        came = f"{packing!r} of {getattr(labels, 'attrs', {})[packing]!r}"
+        raise fail(f"dates of {name}", "decoded ones, as xarray.decode_cf makes them", came)
     label_array = np.asarray(labels)
+    if label_array.dtype.kind == "m":
+        return check_times(f"times of {name}", label_array / np.timedelta64(1, "s"), len(label_array))
     if label_array.dtype.kind != "M":
         is_filled_list = label_array.ndim == 1 and len(label_array) > 0
         if not is_filled_list or not all(_is_date_label(label) for label in label_array):
