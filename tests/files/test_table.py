@@ -1,4 +1,6 @@
+import bz2
 import csv
+import lzma
 import os
 from decimal import Decimal
 from pathlib import Path
@@ -158,6 +160,21 @@ def test_csv_that_is_no_table_of_numbers(tmp_path, text, fragments):
 def test_bytes_that_are_no_utf8(tmp_path):
     (tmp_path / "data.csv").write_bytes(b"time,a\n0,\xff\n")
     refused(lambda: read_table(tmp_path / "data.csv"), "data.csv", "UTF-8")
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (bz2.compress(b"time,a\n0,1\n"), "a file of bzip2"),
+        (lzma.compress(b"time,a\n0,1\n"), "a file of xz"),
+        (b"PK\x03\x04\x14\x00", "a file of zip"),
+        (b"PAR1\x15\x04", "a Parquet file"),
+    ],
+)
+def test_a_file_of_another_kind_is_called_by_it(tmp_path, content, kind):
+    """It was called a text in another encoding, with a call that would not have rewritten it."""
+    (tmp_path / "data.csv").write_bytes(content)
+    refused(lambda: read_table(tmp_path / "data.csv"), "data.csv: expected a text, as it is or packed by gzip", kind)
 
 
 def test_parquet_that_is_no_table_of_numbers(tmp_path):
