@@ -13,8 +13,10 @@ import pytest
 
 import heliograph.files.table
 from heliograph.disk import check_folder_writable, check_writable, name_path_in_errors
-from heliograph.files.table import convert_to_columns, read_rows, read_table, write_table
-from heliograph.numerics.times.dates import MISSING
+from heliograph.files.table import read_table, write_table
+
+MISSING = np.iinfo(np.int64).min  # in a column of whole numbers
+convert_to_columns, read_rows = heliograph.files.table.convert_to_columns, heliograph.files.table.read_rows
 
 COLUMNS = {
     "time": np.array([0.0, 0.1, 1e-300]),
