@@ -164,3 +164,19 @@ def test_the_noise_of_a_bag_is_learned(folder, capsys):
     (row,), (share,) = fitted["table"], fitted["delays"]["gps"]["shares"]
     assert row["low"] <= 0.04 <= row["high"] < 0.15
     assert (share["steps"], share["estimate"]) == (0, 1.0) and "gps: late by 0 s 1 (" in capsys.readouterr().out
+
+
+def test_times_that_no_stamp_of_a_bag_can_say_are_one_line(tmp_path, monkeypatch, capsys):
+    """Nanoseconds as whole numbers are taken for seconds: an error of struct; a date before 1970 was one of Python."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.py").write_text("""import heliograph as hg
+plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states=["x"])
+sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["z"])
+network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
+""")
+    for first, second in (("1700000000000000000", "1700000001000000000"), ("1960-01-01", "1960-01-02")):
+        (tmp_path / "data.csv").write_text(f"time,z\n{first},1\n{second},2\n")
+        assert cli.main(["run", "net.py", "--measurements", "data.csv", "--out", "out.mcap"]) == 2
+        said = capsys.readouterr().err
+        assert f"times of a bag: expected dates, or seconds since then, from 1970 to 2038, got {first}" in said
+        assert not (tmp_path / "out.mcap").exists()

@@ -54,6 +54,20 @@ def test_a_row_without_a_stamp_does_not_cost_the_digits_of_others(folder, capsys
     assert np.isnan(read_table(name)["time"][3])  # for whoever reads the table, which is of float64 then
 
 
+@pytest.mark.parametrize("word", ["inf", "-Infinity", "1e400"])
+def test_an_infinite_stamp_does_not_cost_the_digits_of_others(folder, capsys, word):
+    """It was read as a double, and all others of its part of the table with it."""
+    stamps = [1_700_000_000_000_000_000 + step for step in (0, 1, 2, 4)]
+    rows = [f"{stamp},0,1" for stamp in stamps]
+    (folder / "data.csv").write_text("\n".join(["time,push,pos", *rows[:2], f"{word},0,1", *rows[2:], ""]))
+    assert cli.main(["run", "net.py", "--measurements", "data.csv", "--out", "out.parquet"]) == 0
+    assert (
+        f"row 3, column 'time': expected a finite number, or none where it did not arrive, got '{word}'"
+        in capsys.readouterr().err
+    )
+    assert read_table("out.parquet")["time"].tolist() == stamps
+
+
 def test_rows_that_could_not_be_read_do_not_share_the_time_of_others(folder, capsys):
     """Their times are made up: "3 of 3 rows share their time, as stamps do that lost their digits" was said of them."""
     (folder / "net.py").write_text(

@@ -113,6 +113,24 @@ def counts_in(lines) -> list[str]:
     return [line for line in found if "could not be read" in line or "in the order" in line]
 
 
+@pytest.mark.parametrize("size", [1, 10, 60])
+@pytest.mark.parametrize("text", [
+    table(["0,1,x", "x,1,1", *ROWS[2:9]]),  # the first two rows, of times 0 and 1
+    table(["0,1,x", "1,1,x", ROWS[2], "3,1,x", "4,1,x", *ROWS[5:9]]),  # and two behind the first that is read
+    table([f"{dated(0)},1,x", f"{dated(10)},1,x", *(f"{dated(10 * k)},0,1" for k in (2, 3, 4))]),
+    table(["0,1,x", "1,1,x", "2,1,1"]),  # the times of what is ahead of the only row are not known: its own
+], ids=["ahead", "alone", "dates", "one row"])  # fmt: skip
+def test_rows_ahead_of_the_first_that_is_read_have_times_of_their_own(folder, text, size):
+    """They had its time; in blocks of single lines too, of which the first does not know how long a step is."""
+    (folder / "data.csv").write_text(text)
+    run_in_blocks(STEPS, block=BlockSize(rows=8, bytes=size))
+    run_in_blocks(STEPS, out="whole.csv", block=ALL)
+    blocks, whole = read_table("out.csv"), read_table("whole.csv")
+    assert_same(whole, blocks)
+    length = np.diff(whole["time"])
+    assert (length == length[-1]).all()  # exactly: whole numbers
+
+
 def test_parquet_and_packed_tables_in_blocks(folder):
     """Of Parquet as of CSV; whole numbers beyond doubles and dates stay what they are."""
     (folder / "data.csv.gz").write_bytes(gzip.compress(TABLES["missing at the edges"].encode()))

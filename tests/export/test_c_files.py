@@ -305,10 +305,23 @@ def test_one_line_and_nothing_written(make, path, precision, words, tmp_path):
     assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
 
 
+def test_a_header_of_somebody_else_is_not_replaced(tmp_path):
+    """It is written beside the source that is named: a header of that name was gone without a word."""
+    item = hg.linear_filter(LINE, RANGE, FADING)
+    (tmp_path / "control.h").write_text("/* mine */")
+    with pytest.raises(hg.InputError, match=r"control\.h: expected a name beside control\.c that is free, or has an"):
+        hg.export_c(item, tmp_path / "control.c")
+    assert [p.name for p in tmp_path.iterdir()] == ["control.h"]
+    (tmp_path / "control.h").unlink()
+    for _ in range(2):  # the second time over its own
+        hg.export_c(item, tmp_path / "control.c")
+
+
 def test_both_files_or_none(tmp_path, monkeypatch):
     """The second file cannot take its place: the first is what it was before."""
     item, replace = hg.linear_filter(LINE, RANGE, FADING), os.replace
-    (tmp_path / "a.h").write_text("before")
+    before = "Made by heliograph"
+    (tmp_path / "a.h").write_text(before)
 
     def full(partial, path):
         if path.suffix == ".c":
@@ -318,7 +331,7 @@ def test_both_files_or_none(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(OSError, match=r"No space left on device: '.*a\.c'"):
         hg.export_c(item, tmp_path / "a.c")
-    assert [p.name for p in tmp_path.iterdir()] == ["a.h"] and (tmp_path / "a.h").read_text() == "before"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.h"] and (tmp_path / "a.h").read_text() == before
     (tmp_path / "a.h").unlink()
     with pytest.raises(OSError, match="No space"):
         hg.export_c(item, tmp_path / "a.c")

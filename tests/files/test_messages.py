@@ -3,6 +3,7 @@
 import re
 import sqlite3
 from contextlib import closing
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -297,6 +298,22 @@ def test_a_stamp_with_an_offset_is_the_same_one_by_one(world, monkeypatch):
     assert list(table.columns["gps"].time) == (drive.measured[order] - 5 * 10**7).tolist()
     assert all(table.columns[n].time == one.columns[n].time for n in ("gps", "inputs"))
     assert set(table.columns["inputs"].values) == set(one.columns["inputs"].values) == {0.0}
+
+
+def test_flags_and_decimals_of_tables_are_what_they_are_in_messages(world, tmp_path):
+    """A flag in CSV was a text, so that `valid` refused every row; a decimal of a database was no number."""
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    network, *_ = world
+    (tmp_path / "log.csv").write_text("at,mm,ok\n1700000000,1.25,True\n1700000001,2.5,False\n1700000002,True,TRUE\n")
+    seconds = [Decimal(1_700_000_000), Decimal(1_700_000_001), Decimal("1700000002.000000001")]
+    values = pa.array([Decimal("1.25"), Decimal("2.50"), Decimal(1)], pa.decimal128(4, 2))
+    flags = pa.array([True, False, True])
+    pq.write_table(pa.table({"at": pa.array(seconds), "mm": values, "ok": flags}), tmp_path / "log.parquet")
+    for name, last in (("log.csv", 2.0), ("log.parquet", 2.000000001)):
+        for options in ({"valid": "ok"}, {"where": {"ok": True}}, {"where": {"ok": "True"}}):
+            field = hg.files.json_field("mm", "gps", time="at", **options)
+            rows = hg.files.read_messages(tmp_path / name, network, {name: field}).recording()
+            assert rows.time.tolist() == [0.0, last] and rows.measurements["gps"].ravel().tolist() == [1.25, 1.0]
 
 
 def test_parquet_of_another_hand_is_mapped_too(world, tmp_path):

@@ -221,6 +221,23 @@ WALK = h.Network(
 )
 
 
+@pytest.mark.parametrize("smooth", [None, h.smoothing.FixedInterval()])
+def test_angles_in_tables_are_those_without_the_truth(estimate_columns, smooth):
+    """A record has its angles beside a known truth, so that they may be subtracted; a table has no truth in it."""
+    plant = h.LinearPlant([[1.0]], [[0.01]], [3.1], 0.1, states=["heading"], circular=["heading"])
+    sensor = h.LinearSensor([[1.0]], 0.1, outputs=["compass"], circular=["compass"])
+    node = h.Node(sensor, h.perfect(), {"f": h.kalman_filter(plant, sensor)})
+    z = {"a": [[3.1], [-3.1], [-2.9], [3.0], [-3.0]]}
+    truth = np.full((5, 1), 3.13)
+    net = h.Network(plant, {"a": node})
+    record, without = (h.run(net, z, truth=x, smooth=smooth) for x in (truth, None))
+    assert np.asarray(record.estimates["a"]["f"].mean).max() > np.pi
+    columns, expected = estimate_columns(record), estimate_columns(without)
+    assert columns.keys() == expected.keys()
+    for name, values in columns.items():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-14)  # full turns came and went: rounding
+
+
 @pytest.mark.parametrize("kind", ["us", "ms", "s", "D"])
 def test_a_date_that_nanoseconds_cannot_say_is_refused(kind):
     """The year 1 is "not set" for .NET, OPC UA and Parquet; in 64 bits of nanoseconds it would be one of 1754."""
@@ -262,6 +279,26 @@ def test_stamps_that_lost_their_digits_are_said(tmp_path):
     (tmp_path / "six.csv").write_text("time,y\n1.73234e+09,1\n1.73234e+09,2\n1.73234e+09,3\n1.73235e+09,4\n")
     with pytest.warns(UserWarning, match="column 'time': 3 of 4 rows share their time with another row"):
         h.files.read_recording(tmp_path / "six.csv", WALK)
+
+
+def test_steps_that_are_rounded_by_the_size_of_their_times_are_said():
+    """Nanoseconds since 1970 as doubles are multiples of 256: steps of 1000 were 1024, or 768, without a word."""
+    k = np.arange(20)
+    for times in (1.7e18 + 1000.0 * k, (1e6 + 0.2 * k).astype(np.float32), 1.7e9 + 1e-5 * k):
+        with pytest.warns(UserWarning, match=r"column 'time': steps of .* they lost digits"):
+            h.files.read_recording({"time": times, "y": np.ones(20)}, WALK)
+    exact = (
+        1.7e18 + 1e6 * k,
+        (1e6 + k).astype(np.float32),
+        1.7e9 + 0.01 * k,
+        2.0**53 + 4 * k,
+        k * 0.25,
+        1e9 + 0 * k[:1],
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for times in exact:
+            h.files.read_recording({"time": times, "y": np.ones(len(times))}, WALK)
 
 
 @pytest.mark.parametrize(

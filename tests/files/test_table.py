@@ -1,8 +1,12 @@
+import bz2
 import csv
+import lzma
 import os
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -10,6 +14,9 @@ import pytest
 import heliograph.files.table
 from heliograph.disk import check_folder_writable, check_writable, name_path_in_errors
 from heliograph.files.table import read_table, write_table
+
+MISSING = np.iinfo(np.int64).min  # in a column of whole numbers
+convert_to_columns, read_rows = heliograph.files.table.convert_to_columns, heliograph.files.table.read_rows
 
 COLUMNS = {
     "time": np.array([0.0, 0.1, 1e-300]),
@@ -76,6 +83,58 @@ def test_truth_values_are_one_and_zero_in_csv(tmp_path):
     assert (tmp_path / "t.csv").read_text().split() == ["valid", "1", "0"]
 
 
+def test_flags_are_one_and_zero_in_every_format(tmp_path):
+    """As pandas writes them to CSV; they were refused there, and read from Parquet and from a DataFrame."""
+    path = text_file(tmp_path, "valid,x\nTrue,1\nfalse,2\nTRUE,\n,3\n")
+    flags = pa.array([True, False, True, None])
+    pq.write_table(pa.table({"valid": flags}), tmp_path / "t.parquet")
+    frame = pd.DataFrame({"valid": pd.array([True, False, True, None], pd.ArrowDtype(pa.bool_()))})
+    tables = (path, tmp_path / "t.parquet", frame, pa.table({"valid": flags}))
+    for table in tables:
+        np.testing.assert_array_equal(convert_to_columns(table)["valid"], [1, 0, 1, np.nan])
+    refused(lambda: read_table(text_file(tmp_path, "valid\nTrue\nyes\n")), "row 2, column 'valid'", "'yes'")
+
+
+def test_decimals_and_categories_of_parquet_are_numbers(tmp_path):
+    """As databases and pandas write them; whole decimals keep every digit."""
+    stamps = [1_700_000_000_000_000_001, None, 1_700_000_000_000_000_003]
+    columns = {
+        "price": pa.array([Decimal("1.10"), None, Decimal("-3.07")], pa.decimal128(5, 2)),
+        "time": pa.array([stamp and Decimal(stamp) for stamp in stamps], pa.decimal128(20, 0)),
+        "level": pa.array([5.5, None, 5.5]).dictionary_encode(),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
+    rows = read_rows(tmp_path / "t.parquet", None, strict=True).columns
+    np.testing.assert_array_equal(rows["price"], [1.1, np.nan, -3.07])
+    np.testing.assert_array_equal(rows["level"], [5.5, np.nan, 5.5])
+    assert rows["time"].tolist() == [stamps[0], MISSING, stamps[2]]
+
+
+def test_the_least_whole_number_is_none_that_is_missing(tmp_path):
+    """-2^63 stands for a missing one among whole numbers: then these are doubles. It was read as missing."""
+    pq.write_table(pa.table({"a": pa.array([-(2**63), None, 2**60 + 1])}), tmp_path / "t.parquet")
+    np.testing.assert_array_equal(read_table(tmp_path / "t.parquet")["a"], [-(2.0**63), np.nan, 2.0**60])
+
+
+def test_whole_numbers_keep_their_digits_beside_one_that_is_missing():
+    stamps = [1_700_000_000_000_000_001, None, 1_700_000_000_000_000_003]
+    kept = [stamps[0], MISSING, stamps[2]]
+    for column in (stamps, tuple(stamps), np.array(stamps, dtype=object), pd.array(stamps, "Int64")):
+        assert convert_to_columns({"time": column})["time"].tolist() == kept
+    assert convert_to_columns(pa.table({"time": pa.array(stamps)}))["time"].tolist() == kept
+    np.testing.assert_array_equal(convert_to_columns({"x": [1e300, None, 0.5]})["x"], [1e300, np.nan, 0.5])
+
+
+def test_columns_that_do_not_belong_together_are_one_line():
+    """Of unlike lengths, of several axes, and of pandas by another index, whose rows were joined by their places."""
+    shuffled = {"time": pd.Series([0.0, 1, 2], index=[2, 1, 0]), "x": pd.Series([5.0, 6, 7], index=[0, 1, 2])}
+    refused(lambda: convert_to_columns(shuffled), "column 'x'", "the index of column 'time'")
+    assert list(convert_to_columns({"time": [0.0, 1, 2], "x": shuffled["x"]})["x"]) == [5, 6, 7]
+    refused(lambda: convert_to_columns({"time": [0.0, 1], "x": [1.0]}), "as many rows in each", "{'time': 2, 'x': 1}")
+    for x in (np.ones((2, 2)), 1.0):
+        refused(lambda x=x: convert_to_columns({"x": x}), "column 'x'", "one number or date in each row")
+
+
 @pytest.mark.parametrize(
     ("text", "fragments"),
     [
@@ -103,6 +162,21 @@ def test_csv_that_is_no_table_of_numbers(tmp_path, text, fragments):
 def test_bytes_that_are_no_utf8(tmp_path):
     (tmp_path / "data.csv").write_bytes(b"time,a\n0,\xff\n")
     refused(lambda: read_table(tmp_path / "data.csv"), "data.csv", "UTF-8")
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (bz2.compress(b"time,a\n0,1\n"), "a file of bzip2"),
+        (lzma.compress(b"time,a\n0,1\n"), "a file of xz"),
+        (b"PK\x03\x04\x14\x00", "a file of zip"),
+        (b"PAR1\x15\x04", "a Parquet file"),
+    ],
+)
+def test_a_file_of_another_kind_is_called_by_it(tmp_path, content, kind):
+    """It was called a text in another encoding, with a call that would not have rewritten it."""
+    (tmp_path / "data.csv").write_bytes(content)
+    refused(lambda: read_table(tmp_path / "data.csv"), "data.csv: expected a text, as it is or packed by gzip", kind)
 
 
 def test_parquet_that_is_no_table_of_numbers(tmp_path):

@@ -160,3 +160,60 @@ def test_whole_numbers_keep_every_digit(kind):
     assert record.time.tolist() == ticks
     with pytest.raises(hg.InputError, match="got 1700000000000000000 after 1700000000000000100 in row 2"):
         hg.run(NETWORK, {"a": np.ones((4, 1))}, time=np.array([ticks[1], ticks[0], *ticks[2:]], dtype=kind))
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_numbers_that_are_still_packed_are_refused(door):
+    """As xarray reads them with mask_and_scale=False: .1 of the numbers was meant, and -999 was used as a value."""
+    packed = xr.Dataset(
+        {"z": ("time", FLOW, {"scale_factor": 0.1, "_FillValue": -999.0})},
+        {"time": ("time", np.arange(10.0), {"units": "days since 2000-01-01"})},
+    )
+    values, times = packed.z.drop_vars("time"), packed.z.copy()
+    times.attrs.clear()
+    for rows, said in ((values, "attribute 'scale_factor'"), (times, "'units' of 'days since 2000")):
+        with pytest.raises(hg.InputError, match=rf"as xarray\.decode_cf makes them, got .*{said}"):
+            DOORS[door](rows)
+    decoded = xr.decode_cf(packed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        DOORS[door](decoded.z)
+
+
+def test_spans_of_time_are_seconds_and_their_steps_are_said():
+    """They were no times: an index of 0, 1 and 5 hours was rows 0, 1 and 2."""
+    spans = pd.to_timedelta([0, 1, 5], "h")
+    for rows in (pd.Series(FLOW[:3], index=spans), xr.DataArray(FLOW[:3], dims="time", coords={"time": spans})):
+        with pytest.warns(UserWarning, match=r"^time: steps of 9000 and 14400: a plant without the input dt"):
+            record = hg.run(NETWORK, {"a": rows})
+        assert record.time.tolist() == [0.0, 3600.0, 18000.0]
+    plant = hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0, [[1.0]], inputs=["push"])
+    two = hg.Network(plant, {"a": hg.Node(SENSOR, hg.perfect(), {"f": hg.kalman_filter(plant, SENSOR)})})
+    pushes = pd.Series(np.zeros(3), index=pd.date_range("2026-01-01", periods=3))
+    with pytest.raises(hg.InputError, match=r"times of inputs: expected spans of time, as .* has, got dates"):
+        hg.run(two, {"a": pd.Series(FLOW[:3], index=spans)}, pushes.to_frame())
+
+
+def test_dates_of_another_calendar_are_refused():
+    """As of climate models: from 28 February 2000 to 1 March is one day there, and was two."""
+    from types import SimpleNamespace
+
+    class Day(SimpleNamespace):
+        def isoformat(self):
+            return self.text
+
+    days = [Day(text="2000-02-28", calendar="noleap"), Day(text="2000-03-01", calendar="noleap")]
+    with pytest.raises(hg.InputError, match="expected a date of the calendar standard, got 2000-02-28 of noleap"):
+        hg.run(NETWORK, {"a": FLOW[:2]}, time=days)
+    same = [Day(text=day.text, calendar="proleptic_gregorian") for day in days]
+    assert hg.run(NETWORK, {"a": FLOW[:2]}, time=same).time.astype(str)[1] == "2000-03-01T00:00:00.000000000"
+
+
+def test_text_is_no_number_at_any_door():
+    """A list of texts was refused, and a table of the same texts was used."""
+    texts = ["1120", "1160"]
+    for rows in (texts, pd.Series(texts), pd.DataFrame({"z": texts}), pd.Series(texts, dtype="category"),
+                 np.array(texts, dtype=object)):  # fmt: skip
+        for door in ("run", "filter.run", "log_likelihood"):
+            with pytest.raises(hg.InputError, match="expected an array of numbers, got"):
+                DOORS[door](rows)

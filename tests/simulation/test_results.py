@@ -184,7 +184,7 @@ def test_bad_places_and_files(runs, result, tmp_path):
     refused(lambda: runs.save(tmp_path / "no" / "runs.nc"), "an existing folder")
     (tmp_path / "mine.zarr").mkdir()
     (tmp_path / "mine.zarr" / "thesis.txt").touch()
-    refused(lambda: runs.save(tmp_path / "mine.zarr"), "other files")
+    refused(lambda: runs.save(tmp_path / "mine.zarr"), "thesis.txt, which would be lost")
     refused(lambda: hg.Record.open(tmp_path / "no.nc"), "a file of results", "nothing of that name")
     (tmp_path / "no.nc").write_text("no")
     refused(lambda: hg.Record.open(tmp_path / "no.nc"), "can be read")
@@ -195,6 +195,46 @@ def test_bad_places_and_files(runs, result, tmp_path):
     refused(lambda: runs.with_units({"speed": "m/s"}), "names of states ['position', 'velocity']", "'speed'")
     refused(lambda: runs.errors("cart", "awar"), "one of cart/aware, cart/trusting", "cart/awar")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["found.nc", "mine.zarr", "no.nc"]
+
+
+def test_states_are_found_by_their_names_in_datasets_and_tables(runs):
+    """Places were taken for names: a selection of one axis of states left covariances of others, without a word."""
+    expected = runs.estimates["cart"]["aware"]
+
+    def check(record, states):
+        places = [runs.states.index(state) for state in states]
+        assert record.states == tuple(states)
+        found = record.estimates["cart"]["aware"]
+        np.testing.assert_array_equal(found.mean, np.asarray(expected.mean)[..., places])
+        covariance = np.asarray(expected.covariance)[..., places, :][..., places]
+        np.testing.assert_array_equal(found.covariance, covariance)
+
+    dataset, frame = runs.to_xarray(), runs.to_pandas()
+    check(hg.Record.from_xarray(dataset.isel(state=[1, 0])), ["velocity", "position"])
+    check(hg.Record.from_xarray(dataset.isel(other=[1, 0])), ["position", "velocity"])
+    check(hg.Record.from_xarray(dataset.isel(state=[1])), ["velocity"])
+    with pytest.raises(ValueError, match="dimension 'other': expected the states, position, velocity, got velocity"):
+        hg.Record.from_xarray(dataset.isel(other=[1]))
+    names = list(frame.columns)
+    swapped = {("cart", "aware", "mean"), ("cart", "aware", "covariance (nominal)")}
+    order = sorted(range(len(names)), key=lambda i: (names[i][:3] in swapped, -i if names[i][:3] in swapped else i))
+    assert order != list(range(len(names)))
+    check(hg.Record.from_pandas(frame.iloc[:, order]), ["position", "velocity"])
+    without = [i for i, name in enumerate(names) if name[2:] != ("covariance (nominal)", "velocity", "velocity")]
+    with pytest.raises(
+        ValueError, match=r"table, covariance \(nominal\) of cart/\w+: expected a column for each of pos"
+    ):
+        hg.Record.from_pandas(frame.iloc[:, without])
+
+
+def test_rows_of_runs_are_whole_and_in_order(runs):
+    """Rows were taken by their places: of a shuffled table the runs were mixed, and a missing row was NumPy's error."""
+    frame = runs.to_pandas()
+    shuffled = frame.sample(frac=1, random_state=0)
+    for table in (shuffled, frame.iloc[1:]):
+        with pytest.raises(ValueError, match="table, rows: expected the same times of each run, one run after another"):
+            hg.Record.from_pandas(table)
+    np.testing.assert_array_equal(hg.Record.from_pandas(shuffled.sort_index()).truth, runs.truth)
 
 
 def test_plots_draw_on_what_they_are_given(runs, result, tmp_path):

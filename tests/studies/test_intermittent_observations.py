@@ -165,7 +165,7 @@ def test_verdicts_follow_the_evidence(result):
 def test_every_file_is_there(folder, result, fits):
     names = {path.name for path in folder.iterdir()}
     figures = ("scalar", "coupled", "bursts", "patterns", "rounding")
-    assert names == {"summary.json", "report.html", "curves.npz"} | {
+    assert names == {".written.json", "summary.json", "report.html", "curves.npz"} | {
         f"{f}.{e}" for f in figures for e in ("png", "svg")
     }
     with np.load(folder / "curves.npz") as curves:

@@ -27,7 +27,7 @@ from heliograph.campaign.zarr_store import (
     unite_labels,
     write_claims,
 )
-from heliograph.disk.atomic_files import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
+from heliograph.disk.atomic_files import check_folder_writable, check_only_results, lock_folder, remove_leftover_folders
 from heliograph.numerics.check import check_count, check_progress, fail, file_path, instance
 from heliograph.numerics.module import readable
 
@@ -109,7 +109,7 @@ def _compute_missing(
     """
     store = (out / STORE).absolute()
     remove_leftover_folders(store)
-    check_replaceable(out, f"{STORE}/zarr.json")
+    check_only_results(out, f"{STORE}/zarr.json")
     expected = _list_jobs(campaign, only)
     done, damaged = _remove_damaged_and_partial(store, campaign)
     missing = [job for job in expected if (job.setting, job.chunk) not in done]

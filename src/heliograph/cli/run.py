@@ -218,9 +218,8 @@ def _check_output_places(
         check_writable(out, (*FORMATS, ".mcap"))
     if report is not None:
         from heliograph.disk.atomic_files import check_replaceable
-        from heliograph.report.results_folder import SUMMARY
 
-        check_replaceable(report, SUMMARY)
+        check_replaceable(report)
 
 
 def _refuse_losing_files(

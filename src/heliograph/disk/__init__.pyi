@@ -2,6 +2,7 @@
 
 from .atomic_files import FORMATS as FORMATS
 from .atomic_files import check_folder_writable as check_folder_writable
+from .atomic_files import check_only_results as check_only_results
 from .atomic_files import check_replaceable as check_replaceable
 from .atomic_files import check_writable as check_writable
 from .atomic_files import format_of as format_of

@@ -1,9 +1,12 @@
 """Files and folders that appear whole or not at all, also after a power failure, and locks on them."""
 
+import json
 import os
 import re
 import shutil
 import tempfile
+import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from glob import escape as glob_escape
@@ -18,6 +21,8 @@ except ImportError:  # no such system call: then nothing is held, and what other
     fcntl = None  # type: ignore[assignment]
 
 LOCK = ".lock"
+LISTING = ".written.json"  # in a folder of results: {path of a file: its checksum}, of all that were written
+LEFT_BY_OTHERS = {LOCK, ".DS_Store", "Thumbs.db", "desktop.ini"}  # which no user made
 
 
 @contextmanager
@@ -227,17 +232,74 @@ def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
     return kind
 
 
-def check_replaceable(target: Path, mark: str) -> None:
-    """Raise ValueError unless the folder `target` can be written, and is new, empty or holds earlier results.
+def check_only_results(target: Path, mark: str) -> None:
+    """Raise ValueError unless the folder `target` can be written, and is new, empty or holds the file `mark`.
 
-    A file `mark` in it shows earlier results. A lock file (LOCK) does not count. Folders that killed processes left
-    beside it are removed first.
+    The file shows earlier results, which are added to. A lock file (LOCK) does not count.
+    """
+    check_folder_writable(target)
+    names = {path.name for path in target.iterdir()} - {LOCK} if target.is_dir() else set()
+    if names and not (target / mark).is_file():
+        raise fail(f"output folder {target}", f"a new or empty folder, or one with {mark} to go on with", "other files")
+
+
+def check_replaceable(target: Path) -> None:
+    """Raise ValueError unless the folder `target` can be written, and holds nothing but what `whole_folder` wrote.
+
+    A file that the user added, or changed, is named. Folders that killed processes left beside it are removed first.
     """
     check_folder_writable(target)
     remove_leftover_folders(target)
-    names = {path.name for path in target.iterdir()} - {LOCK} if target.is_dir() else set()
-    if names and not (target / mark).is_file():
-        raise fail(f"output folder {target}", f"a new or empty folder, or one with {mark} to replace", "other files")
+    foreign = find_foreign_files(target)
+    if foreign:
+        others = f" and {len(foreign) - 1} others" if len(foreign) > 1 else ""
+        expected = "a new or empty folder, or one with nothing but earlier results, as they were written"
+        raise fail(f"output folder {target}", expected, f"{foreign[0]}{others}, which would be lost with it")
+
+
+def find_foreign_files(folder: Path) -> list[str]:
+    """Return the paths in a folder, relative to it and sorted, of files that `whole_folder` did not write as they are.
+
+    LISTING holds the checksums of the files that it wrote. What file managers and Python leave behind does not count.
+    """
+    listing = folder / LISTING
+    try:
+        written = json.loads(listing.read_text(encoding="utf-8")) if listing.is_file() else {}
+    except ValueError:  # somebody else's file
+        written = {}
+    kept = {name: path for name, path in _find_files(folder).items() if path.name not in LEFT_BY_OTHERS}
+    known = written if isinstance(written, dict) else {}
+    own = {LISTING} if known else set()
+    return sorted(name for name, path in kept.items() if name not in own and _compute_checksum(path) != known.get(name))
+
+
+def _find_files(folder: Path) -> dict[str, Path]:
+    """Return all files in a folder, and links, by their paths relative to it with slashes; none in caches of Python."""
+    found = dict[str, Path]()
+    for place, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(place) / name).is_symlink()]
+        folders[:] = [name for name in folders if name != "__pycache__"]
+        for name in (*files, *links):
+            path = Path(place) / name
+            found[path.relative_to(folder).as_posix()] = path
+    return found
+
+
+def _compute_checksum(path: Path) -> int | None:
+    """Return the CRC-32 of a file's bytes; None of anything but a plain file."""
+    if path.is_symlink() or not path.is_file():
+        return None
+    checksum = 0
+    with path.open("rb") as file:
+        while part := file.read(1 << 20):
+            checksum = zlib.crc32(part, checksum)
+    return checksum
+
+
+def _write_listing(folder: Path) -> None:
+    """Write LISTING into a folder: the checksum of each file in it, by which `find_foreign_files` knows it again."""
+    checksums = {name: _compute_checksum(path) for name, path in sorted(_find_files(folder).items())}
+    (folder / LISTING).write_text(json.dumps(checksums, indent=0), encoding="utf-8")
 
 
 @contextmanager
@@ -245,7 +307,8 @@ def whole_folder(target: Path) -> Iterator[Path]:
     """Yield an empty folder that replaces `target` at the end; after an error or interrupt `target` is unchanged.
 
     Remains of killed processes that wrote the same folder are cleared first, and earlier results that one had moved
-    aside are restored.
+    aside are restored. A folder into which files of somebody else came meanwhile is kept beside it, and a warning names
+    it.
     """
     remove_leftover_folders(target)
     made = [folder for folder in target.parents if not folder.exists()]
@@ -260,6 +323,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
         # The lock goes before the folder is renamed.
         with lock, name_path_in_errors(target):
             yield temporary / "new"
+            _write_listing(temporary / "new")
             flush_tree_to_disk(temporary / "new")
         with hold_signals():
             _replace_folder(temporary, target)
@@ -282,8 +346,17 @@ def _restore_old_folder(temporary: Path, target: Path) -> None:
 
 
 def _replace_folder(partial: Path, target: Path) -> None:
-    """Put the new folder of `partial` in place of `target` by two renames, and remove the old one."""
-    if target.exists():
+    """Put the new folder of `partial` in place of `target` by two renames, and remove the old one.
+
+    One with files that `whole_folder` did not write is kept instead, under another name.
+    """
+    if target.exists() and find_foreign_files(target):
+        kept = Path(tempfile.mkdtemp(prefix=f"{target.name}-kept-", dir=target.parent))
+        target.rename(kept)
+        warnings.warn(
+            f"{target}: what was in it is in {kept}, since it had files that were not written by a run", stacklevel=2
+        )
+    elif target.exists():
         target.rename(partial / "old")
     (partial / "new").rename(target)
     sync(target.parent)

@@ -12,7 +12,7 @@ import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from heliograph.disk.atomic_files import check_writable, whole_files
-from heliograph.export.c_text import CText, CTextOptions, generate_header_and_source
+from heliograph.export.c_text import MADE, CText, CTextOptions, generate_header_and_source
 from heliograph.export.late_measurement_window import check_and_count_window_steps
 from heliograph.export.step_program import RESERVED, Real, lower_step_to_c_functions
 from heliograph.filters.base import AbstractFilter
@@ -127,13 +127,18 @@ def check_source_path(path: str | Path) -> Path:
     """Return the checked path of the C source; the file's name is the prefix of the names in it.
 
     Raises:
-        ValueError: the file does not end in .c, cannot be written, or has a name that is no name of a C function.
+        ValueError: the file does not end in .c, cannot be written, or has a name that is no name of a C function; the
+            header would replace a file of somebody else.
     """
     if not isinstance(path, str | Path):
         raise fail("path of the source", "a file that ends in .c", show_value(path))
     source = Path(path)
     check_writable(source, (".c",))
-    check_writable(source.with_suffix(".h"), (".h",))
+    header = source.with_suffix(".h")
+    check_writable(header, (".h",))
+    if header.is_file() and MADE not in header.read_text(encoding="utf-8", errors="replace"):
+        expected = f"a name beside {source.name} that is free, or has an earlier header"
+        raise fail(f"output file {header}", expected, "a file that is not exported")
     stem = source.stem
     if not (stem.isascii() and stem.isidentifier()) or stem in RESERVED or stem.startswith("_"):
         raise fail(f"output file {source}", "a name that C takes for its functions, such as step.c", repr(stem))

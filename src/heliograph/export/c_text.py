@@ -25,6 +25,7 @@ MEANING: dict[Claim, str] = {
     "nominal": "the covariance is what the filter's approximations say, and nothing is proved",
     "none": "no covariance: NaN",
 }
+MADE = "Made by heliograph"  # by which a header that was exported is known again
 
 
 class CTextOptions(NamedTuple):
@@ -137,7 +138,7 @@ def _generate_header_comment(program: StepProgram, form: CTextOptions, window: W
     rounding = explain_rounding(filter, any(ranges)) if form.real == "float" else []
     lines = [
         f"{prefix}.h: one step of {form.kind}.",
-        f"Made by heliograph {heliograph.__version__}; do not edit.",
+        f"{MADE} {heliograph.__version__}; do not edit.",
         "",
         f"Call {prefix}_start once, then {prefix}_step at every step: it moves the estimate on with the inputs u and",
         "corrects it by the measurement z. A component of z that did not arrive is NaN; nothing may be infinite.",

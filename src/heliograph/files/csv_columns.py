@@ -165,11 +165,22 @@ class CsvColumnReader:
             elif has_dates:
                 numbers.append(NAT)
             else:
-                numbers.append(parse_cell(row.where, name, cell, self.path))
+                numbers.append(self._parse_number(row, name, cell))
                 if cell:
                     newly_dated[name] = False
         self._dated |= newly_dated
         return numbers
+
+    def _parse_number(self, row: CsvRow, name: str, cell: str) -> float:
+        """Return the number in a cell, NaN if there is none; unless reading is strict, an infinite one is an error.
+
+        Else the doubles that have it would cost the whole numbers of the column their last digits.
+        """
+        number = parse_cell(row.where, name, cell, self.path)
+        if not self._strict and np.isinf(number):
+            expected = "a finite number, or none where it did not arrive"
+            raise fail(f"{row.where}, column {name!r}", expected, show_value(cell))
+        return number
 
     @staticmethod
     def _is_missing(cell: str) -> bool:

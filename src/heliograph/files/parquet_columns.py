@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -56,28 +56,46 @@ def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, f
         only: the columns that are read; None for all.
         first: number of its first row.
     """
+    columns = {
+        name: _convert_column(column, f"{path}, row {first}, column {name!r}", f"{path}, column {name!r}", first)
+        for name, column in zip(table.column_names, table.columns, strict=True)
+        if only is None or name in only
+    }
+    return TableRows(columns, np.arange(first, first + table.num_rows), [])
+
+
+def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first: int) -> np.ndarray:
+    """Return a column of Arrow as dates, integers (which may be too large for float64), or other numbers.
+
+    Decimal numbers are the nearest doubles, whole ones are integers. `where` is the place of its first row and `name`
+    its own, for errors; `first` is the number of its first row.
+
+    Raises:
+        ValueError: it holds neither numbers nor dates.
+    """
     import pyarrow as pa
 
-    columns = {}
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        if only is not None and name not in only:
-            continue
-        # Dates, integers (which may be too large for float64), and other numbers; anything else is refused.
-        kind = column.type
-        if pa.types.is_timestamp(kind):
-            moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
-            columns[name] = convert_to_nanoseconds(moments, f"{path}, column {name!r}", first)
-            continue
-        if pa.types.is_date(kind):
-            days = column.cast(pa.date32()).to_numpy()
-            columns[name] = convert_to_nanoseconds(days, f"{path}, column {name!r}", first)
-            continue
-        if pa.types.is_integer(kind):
-            missing = column.is_null().to_numpy()
-            columns[name] = convert_to_numbers(column.fill_null(0).to_numpy(), missing)
-            continue
-        is_number = pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)
-        if not (is_number or pa.types.is_null(kind)):
-            raise fail(f"{path}, row {first}, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
-        columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
-    return TableRows(columns, np.arange(first, first + table.num_rows), [])
+    if pa.types.is_dictionary(column.type):  # each value once, and which one a row has
+        column = column.cast(column.type.value_type)
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
+        return convert_to_nanoseconds(moments, name, first)
+    if pa.types.is_date(kind):
+        return convert_to_nanoseconds(column.cast(pa.date32()).to_numpy(), name, first)
+    if pa.types.is_integer(kind):
+        return convert_integers_of_arrow(column)
+    if pa.types.is_decimal(kind):
+        values = column.to_pylist()
+        whole = kind.scale <= 0 and all(value is None or abs(value) < 2**63 for value in values)
+        if whole:
+            return convert_integers_of_arrow(pa.chunked_array([pa.array([v and int(v) for v in values], pa.int64())]))
+        return np.array([np.nan if value is None else float(value) for value in values], dtype=np.float64)
+    if not (pa.types.is_null(kind) or (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind))):
+        raise fail(where, "numbers", f"{kind} {column[:1].to_pylist()}")
+    return np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
+
+
+def convert_integers_of_arrow(column: "pa.ChunkedArray[Any]") -> np.ndarray:
+    """Return integers of Arrow as numbers, without doubles in between: these would round large ones beside a null."""
+    return convert_to_numbers(column.fill_null(0).to_numpy(), column.is_null().to_numpy())

@@ -23,7 +23,7 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import read_compact_date, seconds_between
-from heliograph.numerics.times.row_times import backwards_text, find_backwards_row, is_mix_of_units
+from heliograph.numerics.times.row_times import backwards_text, find_backwards_row, find_lost_digits, is_mix_of_units
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
@@ -258,6 +258,7 @@ def _make_inputs(
     _warn_of_equal_times(time[rows.arrived], source)
     _warn_of_dates_as_numbers(time[rows.arrived], source)
     _warn_of_mixed_units(time[rows.arrived], source, rows.numbers[rows.arrived])
+    _warn_of_lost_digits(time[rows.arrived], source)
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
@@ -274,6 +275,17 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         warnings.warn(
             f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
             f"that lost their digits; {len(counts)} times in all",
+            stacklevel=7,
+        )
+
+
+def _warn_of_lost_digits(time: np.ndarray, source: str) -> None:
+    """Warn if times are doubles, or of single precision, so large that their steps lost digits."""
+    lost = find_lost_digits(time)
+    if lost is not None:
+        warnings.warn(
+            f"{source}, column {TIME!r}: steps of {lost[1]:g} between numbers that are multiples of {lost[0]:g}: they "
+            "lost digits; whole numbers, dates, or times from the first row on keep them",
             stacklevel=7,
         )
 

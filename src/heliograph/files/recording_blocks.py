@@ -8,6 +8,7 @@ import numpy as np
 
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.recording import Recording, RowReader
+from heliograph.files.recording_rows import RecordingRows, join_recording_rows, lacks_second_row
 from heliograph.files.row_order_across_blocks import BlockOrderCheck
 from heliograph.files.table import read_row_blocks
 from heliograph.files.table_rows import TableRows
@@ -84,12 +85,7 @@ class RecordingBlocks:
     def _yield_recordings(self, parts: Iterable[TableRows]) -> Iterator[Recording]:
         """Yield parts of a table as recordings, each of which goes on from the last row of the one before it."""
         order = BlockOrderCheck(self._path, self._reader.network)
-        for rows in parts:
-            self._last_number = int(rows.numbers[-1]) if len(rows.numbers) else self._last_number
-            if not len(rows.numbers):
-                self._note_refused(rows.refused)
-                continue
-            came = self._reader.read_cells(rows)
+        for came in self._yield_cells(parts):
             cells = self._reader.put_in_order(came)
             self._note_refused(self._reader.refused)
             self._reader.refused = []
@@ -103,6 +99,32 @@ class RecordingBlocks:
             self.doubts += [str(doubt.message) for doubt in doubts]
             yield recording
         order.check_left_out_rows()
+
+    def _yield_cells(self, parts: Iterable[TableRows]) -> Iterator[RecordingRows]:
+        """Yield the rows of each part of a table that can be read, as they came; of the first parts at least two rows.
+
+        A single row is held until the next comes where the times of rows ahead of it follow from both.
+        """
+        held: RecordingRows | None = None  # while nothing was yielded
+        is_first = True
+        for rows in parts:
+            self._last_number = int(rows.numbers[-1]) if len(rows.numbers) else self._last_number
+            if not len(rows.numbers):
+                self._note_refused(rows.refused)
+                continue
+            cells = self._reader.read_cells(rows)
+            if held is not None and held.time.dtype != cells.time.dtype:  # which the order of blocks refuses
+                yield held
+                held, is_first = None, False
+            cells = cells if held is None else join_recording_rows([held, cells])
+            held = None
+            if is_first and lacks_second_row(cells, self._reader.network, str(self._path)):
+                held = cells
+                continue
+            is_first = is_first and not len(cells.numbers)
+            yield cells
+        if held is not None:
+            yield held
 
     def _note_progress(self, done: int, total: int) -> None:
         """Keep how many bytes of the file are read and how many there are, and call `progress` if there is one."""

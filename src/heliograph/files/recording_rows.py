@@ -102,19 +102,34 @@ class RowsWithMissing(NamedTuple):
     def fill_times(self, time: np.ndarray) -> np.ndarray:
         """Return the times of all rows; rows that did not arrive are spaced evenly between the others.
 
-        `time` holds the times of the rows that were read. `self.read_row` holds for each row the index of the last row
-        that was read up to it.
+        Those ahead of the first row that was read go back from it in the steps in which the next one follows. Where
+        only one was read they have its time. `time` holds the times of the rows that were read. `self.read_row` holds
+        for each row the index of the last row that was read up to it.
         """
         missing = np.flatnonzero(~self.arrived)
         filled = np.array(time[self.read_row])
-        # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
-        before, after = self.read_row[missing], np.minimum(self.read_row[missing] + 1, len(time) - 1)
+        if len(time) < 2:
+            return filled
+        # t = t_before + share (t_after - t_before), between the rows that arrived before and after it; the share is
+        # negative ahead of the first.
+        before = np.minimum(self.read_row[missing], len(time) - 2)
         numbers = self.numbers[self.arrived]
-        rows_behind = np.maximum(self.numbers[missing] - numbers[before], 0)
-        share = rows_behind / np.maximum(numbers[after] - numbers[before], 1)
-        since_row_before = share * (time[after] - time[before]).astype(np.float64)
+        share = (self.numbers[missing] - numbers[before]) / (numbers[before + 1] - numbers[before])
+        since_row_before = share * (time[before + 1] - time[before]).astype(np.float64)
         filled[missing] += since_row_before.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
         return filled
+
+
+def lacks_second_row(cells: RecordingRows, network: Network, source: str) -> bool:
+    """Return whether the times of rows ahead of the first one that can be read need a row that is not among these.
+
+    These are rows from the first on, as they came. Without an input dt every row is a step, and of those that did not
+    arrive ahead of the first row the times follow from the first two.
+    """
+    if TIME_STEP in network.inputs or not len(cells.numbers):
+        return False
+    ordered, _, _ = order_rows(cells, network, source)
+    return len(ordered.numbers) == 1 and int(ordered.numbers[0]) > 1
 
 
 def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -> RowsWithMissing:

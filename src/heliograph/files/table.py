@@ -10,8 +10,9 @@ import numpy as np
 from heliograph.disk.atomic_files import FORMATS, format_of
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.csv_columns import read_csv_blocks
-from heliograph.files.parquet_columns import read_parquet_blocks
+from heliograph.files.parquet_columns import convert_integers_of_arrow, read_parquet_blocks
 from heliograph.files.table_rows import (
+    EXACT,
     TableRows,
     convert_to_doubles,
     convert_to_nanoseconds,
@@ -56,14 +57,37 @@ def convert_to_columns(table: object, name: str = "table", only: Container[str] 
         if not isinstance(column, str):
             raise fail(f"{name}, columns", "names that are text", show_value(column))
     kept = {column: values for column, values in named.items() if only is None or column in only}
-    return {column: _convert_column(values, f"{name}, column {column!r}") for column, values in kept.items()}
+    _check_indexes(name, kept)
+    columns = {column: _convert_column(values, f"{name}, column {column!r}") for column, values in kept.items()}
+    lengths = {column: len(values) for column, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise fail(f"{name}, columns", "as many rows in each", lengths)
+    return columns
+
+
+def _check_indexes(name: str, columns: Mapping[str, Any]) -> None:
+    """Raise ValueError if columns of pandas have unequal indexes: by position their rows would not belong together."""
+    indexed = [(column, values.index) for column, values in columns.items() if _has_index(values)]
+    for column, index in indexed[1:]:
+        first, expected = indexed[0]
+        if not index.equals(expected):
+            rows = f"rows with the index of column {first!r} (a DataFrame of both aligns them)"
+            raise fail(f"{name}, column {column!r}", rows, show_value(index))
+
+
+def _has_index(values: object) -> bool:
+    """Return whether a column is one of pandas, with an index; a list has a function of that name."""
+    return hasattr(getattr(values, "index", None), "equals")
 
 
 def _convert_column(values: Any, name: str) -> np.ndarray:
     """Return one column as numbers or dates; what its own kind marks as missing becomes NaN or NaT."""
     if hasattr(values, "isna") and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
-        kind = {"i": np.int64, "u": np.uint64}.get(values.dtype.kind, np.float64)
-        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=0), np.asarray(values.isna(), dtype=bool))
+        kind = {"i": np.int64, "u": np.uint64, "b": np.bool_}.get(values.dtype.kind, np.float64)
+        absent = np.asarray(values.isna(), dtype=bool)
+        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=kind(0)), absent)
+    if hasattr(values, "null_count") and hasattr(values, "chunks") and str(values.type).startswith(("int", "uint")):
+        return convert_integers_of_arrow(values)
     if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
         return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
     if hasattr(values, "to_numpy"):
@@ -71,6 +95,16 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     else:
         is_of_objects = type(values) is np.ndarray and values.dtype.kind == "O"
         column = values if is_of_objects else np.asarray(fill_masked(values))
+        if (
+            isinstance(values, list | tuple)
+            and column.dtype.kind == "f"
+            and np.nanmax(np.abs(column), initial=0) >= EXACT
+        ):
+            column = np.array(
+                values, dtype=object
+            )  # among these whole numbers keep the digits that doubles do not have
+    if column.ndim != 1:
+        raise fail(name, "one number or date in each row", f"shape {column.shape}")
     if column.dtype.kind == "M":
         return convert_to_nanoseconds(column, name)
     if column.dtype.kind in "fiub":
@@ -107,7 +141,7 @@ def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:
 
 
 def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN.
+    """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN, and true and false are 1 and 0.
 
     A column whose first cell is a date of ISO 8601, as 2026-11-21T23:25:00+01:00, is read as dates: datetime64[ns] in
     UTC. Dates without a time zone are not converted.

@@ -77,7 +77,7 @@ def find_missing(numbers: np.ndarray) -> np.ndarray:
 def convert_to_numbers(column: np.ndarray, missing: np.ndarray | None = None) -> np.ndarray:
     """Return numbers as float64, or as int64 if integers are too large for exact doubles.
 
-    A missing number becomes NaN in float64, and MISSING in int64.
+    A missing number becomes NaN in float64, and MISSING in int64, which therefore holds no number as small as this.
 
     Args:
         column: numbers of any type.
@@ -87,7 +87,7 @@ def convert_to_numbers(column: np.ndarray, missing: np.ndarray | None = None) ->
     doubles = np.where(absent, np.nan, column.astype(np.float64))
     present = column[~absent]
     is_large = column.dtype.kind in "iu" and present.size and np.nanmax(np.abs(doubles)) >= EXACT
-    if not is_large or int(present.max()) > np.iinfo(np.int64).max:
+    if not is_large or int(present.max()) > np.iinfo(np.int64).max or int(present.min()) <= MISSING:
         return doubles
     return np.where(absent, MISSING, column.astype(np.int64))
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked, find_packing, holds_texts_or_dates
 from heliograph.numerics.numpy_or_jax import is_traced, warn_of_single
 from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
 
@@ -134,10 +134,12 @@ def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str
 
 
 def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
-    """Raise ValueError if a table's column names contradict an array's: one twice, or just `names` in another order.
+    """Raise ValueError if a table's names contradict an array's (one twice, another order), or its numbers are packed.
 
     Only texts count as names. An array, or a table whose columns have numbers, has none.
     """
+    if packing := find_packing(table):
+        raise fail(name, "decoded numbers, as xarray.decode_cf makes them", f"an array with the attribute {packing!r}")
     columns: Any = getattr(table, "columns", None)
     is_table = columns is not None and not callable(columns)
     texts = [column for column in columns if isinstance(column, str)] if is_table else []
@@ -155,7 +157,7 @@ def _read_numbers(name: str, value: ArrayLike) -> Any:
         check_columns(name, value)
     try:
         numbers = jnp.asarray(value) if traced else np.asarray(fill_masked(value))
-        if numbers.dtype.kind in "USmM":  # text and dates are no numbers, though they may read as such
+        if isinstance(numbers, np.ndarray) and holds_texts_or_dates(numbers):
             raise ValueError
         known = None if traced else numbers.astype(np.float64 if numbers.dtype.kind != "c" else complex)
     except (TypeError, ValueError, OverflowError):

@@ -1,5 +1,6 @@
 """What is masked or missing in arrays and tables, as NaN: every array that comes in passes here."""
 
+from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
@@ -22,6 +23,26 @@ def fill_masked(value: Any) -> Any:
     if hasattr(value, "to_numpy"):  # a column of a table, or several
         return _fill_array(np.asarray(value), np.asarray(False))
     return value
+
+
+# What NetCDF and Zarr say of numbers that are packed or stand for missing ones; xarray takes it away as it decodes.
+PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value")
+
+
+def find_packing(value: Any) -> str:
+    """Return the attribute by which a labelled array says that its numbers are not decoded yet, or ""."""
+    attributes = getattr(value, "attrs", None)
+    if not isinstance(attributes, Mapping):
+        return ""
+    since = ["units"] if " since " in str(attributes.get("units", "")) else []  # a clock that counts from a date
+    return next((name for name in (*PACKED, *since) if name in attributes), "")
+
+
+def holds_texts_or_dates(numbers: np.ndarray) -> bool:
+    """Return whether an array holds texts, dates or spans of time: no numbers, though they may read as such."""
+    return numbers.dtype.kind in "USmM" or (
+        numbers.dtype.kind == "O" and any(isinstance(entry, str | bytes) for entry in numbers.flat)
+    )
 
 
 def _fill_array(numbers: np.ndarray, masked: np.ndarray) -> np.ndarray:

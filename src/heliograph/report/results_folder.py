@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # a missing extra is reported by `write_results`, in one line
 
     from heliograph.report.pages.page import Page
 
-SUMMARY = "summary.json"  # also tells earlier results from other folders
+SUMMARY = "summary.json"
 NEEDS = ("jinja2", "matplotlib")
 T = TypeVar("T")
 Json: TypeAlias = "str | float | bool | Sequence[Json] | Mapping[str, Json] | None"
@@ -47,8 +47,8 @@ def write_results(
 ) -> T:
     """Compute, then write figures, report, data and summary to `target`.
 
-    The folder replaces earlier results, and nothing else. A package that is missing is reported before the computation
-    starts.
+    The folder replaces earlier results, and nothing else: a file that was added to them, or changed, is an error. A
+    package that is missing is reported before the computation starts.
 
     Args:
         target: the folder of results.
@@ -65,7 +65,7 @@ def write_results(
         ModuleNotFoundError: an extra is not installed.
     """
     check_installed([*NEEDS, *needs])
-    check_replaceable(target, SUMMARY)
+    check_replaceable(target)
     with progress(stages + 1) as advance, whole_folder(target) as folder:
         outcome = compute(advance)
         advance("drawing and writing")

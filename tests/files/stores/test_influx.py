@@ -119,6 +119,16 @@ def test_estimates_are_points_of_the_line_protocol():
     assert state == estimate.mean[0, 0] and deviation == np.sqrt(estimate.covariance[0, 0, 0])
 
 
+def test_rows_of_one_time_that_would_replace_each_other_are_said():
+    """InfluxDB keeps one point of a moment: of two rows of one time the first was gone, and "3 rows" were written."""
+    times = TIMES[[0, 1, 1]]
+    with (
+        Answering() as server,
+        pytest.warns(UserWarning, match="1 of 3 rows are replaced by a later row of the same time"),
+    ):
+        hg.files.store_estimates(record(times), server.url)
+
+
 def test_what_is_refused_half_way_says_how_much_is_there(monkeypatch):
     monkeypatch.setattr("heliograph.files.stores.influx.BATCH", 1)
     writes = [(204, b""), (400, b'{"error":"partial write: field type conflict"}')]

@@ -47,6 +47,16 @@ def test_measurements_of_one_time_are_rows_of_their_own():
     assert sorted(columns["level"][columns["time"] == columns["time"].min()]) == [1.5, 7.5]
 
 
+def test_two_values_of_a_field_at_one_time_are_refused():
+    """A query that yields means and maxima under one name: the last took the place of the first."""
+    mean, other = UNTAGGED.replace(",,", ",mean,", 1), UNTAGGED.replace(",1.5,", ",9.5,")
+    with (
+        Answering((mean + other).encode()) as server,
+        pytest.raises(hg.InputError, match=r"one value of a field at a time .* got two of 'level' at 2026-11-29T10:00"),
+    ):
+        hg.files.read_store(f"{server.url}?flux={ASKED}")
+
+
 def test_rows_that_a_query_has_pivoted_are_taken_as_they_are():
     pivoted = "#datatype,string,long,dateTime:RFC3339,double,long\n,result,table,_time,level,gate\n"
     with Answering(f"{pivoted},,0,2026-11-29T10:01:00Z,2,\n,,0,2026-11-29T10:00:00Z,1,7\n".encode()) as server:

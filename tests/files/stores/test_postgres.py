@@ -1,5 +1,7 @@
 """PostgreSQL, by a real server: rows of a query in, estimates out, all or nothing."""
 
+from decimal import Decimal
+
 import numpy as np
 import psycopg
 import pytest
@@ -38,6 +40,30 @@ def test_a_server_that_is_away_is_one_line():
         ) as error:
             call()
         assert "\n" not in str(error.value)
+
+
+def test_decimals_keep_the_digits_that_doubles_do_not_have(monkeypatch):
+    """Of a column numeric: seconds since 1970 with nanoseconds lost theirs, and two messages had one time."""
+    seconds = [Decimal("1700000000.000000001"), Decimal("1700000000.000000101")]
+    columns = {"at": seconds, "level": [Decimal("1.5"), Decimal(2)]}
+    monkeypatch.setattr("heliograph.files.stores.postgres.query_postgres", lambda address: ("db", columns))
+    plant = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, [[0.0]], inputs=["dt"])
+    network = hg.Network(plant, {"tank": hg.Node(hg.LinearSensor([[1.0]], 0.1), hg.perfect(), {})})
+    field = hg.files.json_field("level", node="tank", time="at")
+    events = hg.files.read_messages(f"{AWAY}?table=t", network, {"db": field})
+    assert events.lateness()["tank"].tolist() == [0, 0] and events.date == np.datetime64(
+        1_700_000_000_000_000_001, "ns"
+    )
+    recording = events.recording()
+    assert recording.time.tolist() == [0.0, 1e-7] and recording.measurements["tank"].ravel().tolist() == [1.5, 2.0]
+
+
+@pytest.mark.real("PostgreSQL")
+def test_whole_numbers_of_times_keep_their_digits(url):
+    """Nanoseconds went into a column of doubles, where they are multiples of 256."""
+    times = 1_700_000_000_000_000_000 + np.array([1, 2, 3])
+    hg.files.store_estimates(record(times), f"{url}&table=whole")
+    assert run(url, "SELECT time FROM whole ORDER BY time") == [(time,) for time in times.tolist()]
 
 
 @pytest.mark.real("PostgreSQL")

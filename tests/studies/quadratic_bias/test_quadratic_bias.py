@@ -128,7 +128,8 @@ def test_outage_covariances_are_the_oracles():
 def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
     names = {path.name for path in folder.iterdir()}
     figures = {"fig1_x1", "fig2_x2", "fig3_covariance_x1", "fig4_covariance_x2", "fig5_mse_x1", "fig6_mse_x2", "outage"}
-    assert names == {"summary.json", "report.html", "record.nc"} | {f"{f}.{e}" for f in figures for e in ("png", "svg")}
+    of_figures = {f"{figure}.{ending}" for figure in figures for ending in ("png", "svg")}
+    assert names == {".written.json", "summary.json", "report.html", "record.nc"} | of_figures
     xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(folder / "record.nc", engine="h5netcdf") as record:
         assert record["covariance"].sel(design="cubic").shape == (101, 4, 4)

@@ -22,6 +22,8 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # rows of the covariance of a po
 UNKNOWN = -1.0  # first entry of a covariance that is not known, as messages of ROS have it
 ODOMETRY, NUMBER = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
 
+LATEST = 2**31 * 10**9  # nanoseconds since 1970 below which a stamp's seconds have 32 bits
+
 State = TypeAliasType("State", str | None)  # name of a state of the plant; None if the plant has no such state
 
 
@@ -141,11 +143,19 @@ def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None
     """Return times in nanoseconds since 1970, from dates or from seconds after `origin` (1970 if it is None).
 
     Times that are numbers of steps are taken as seconds.
+
+    Raises:
+        ValueError: a time that no stamp of ROS can say.
     """
     if time.dtype.kind == "M":
-        return [int(nanoseconds) for nanoseconds in time.astype("datetime64[ns]").astype(np.int64)]
-    start = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
-    return [start + round(seconds * 1e9) for seconds in time.tolist()]
+        stamps = [int(nanoseconds) for nanoseconds in time.astype("datetime64[ns]").astype(np.int64)]
+    else:
+        start = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
+        stamps = [start + round(seconds * 1e9) for seconds in time.tolist()]
+    outside = next((i for i, stamp in enumerate(stamps) if not 0 <= stamp < LATEST), None)
+    if outside is not None:
+        raise fail("times of a bag", "dates, or seconds since then, from 1970 to 2038", f"{time[outside]}")
+    return stamps
 
 
 def _make_valid_topic_word(name: str) -> str:

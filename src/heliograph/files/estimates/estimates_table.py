@@ -9,9 +9,12 @@ import numpy as np
 
 from heliograph.files.table import TIME, write_table
 from heliograph.model.estimate import Estimate, mask_sound_estimates
+from heliograph.model.over_time import first
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.angles.rotation_vectors import quaternion_of
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.types import units_in
+from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:
@@ -21,18 +24,22 @@ Predicted = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by 
 
 
 def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict[str, np.ndarray]:
-    """Return the estimates of a recording as columns, with what was predicted of each row where it is given."""
-    columns = [(TIME, record.time)]
+    """Return the estimates of a recording as columns, with what was predicted of each row where it is given.
+
+    Angles are between -pi and pi, also where the record has them beside a known truth.
+    """
+    columns, angles = [(TIME, record.time)], _find_angles(record)
     # Node and filter are part of a name where there are several of them.
     has_several_nodes = len(record.estimates) > 1
     has_several_filters = any(len(filters) > 1 for filters in record.estimates.values())
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             prefix = (f"{node}." if has_several_nodes else "") + (f"{name}." if has_several_filters else "")
-            columns += [(prefix + key, values) for key, values in _make_columns(record.states, record.units, estimate)]
+            parts = _make_columns(record.states, record.units, estimate, angles)
+            columns += [(prefix + key, values) for key, values in parts]
             smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in smoothed:  # which may cover the last rows alone
-                parts = _make_columns(record.states, record.units, smoothed[name])
+                parts = _make_columns(record.states, record.units, smoothed[name], angles)
                 columns += [
                     (f"{prefix}smoothed.{key}", _pad_rows_before(values, len(record.time))) for key, values in parts
                 ]
@@ -74,9 +81,17 @@ def make_column_header(name: str, unit: str | None) -> str:
     return f"{name} ({unit})" if unit else str(name)
 
 
-def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
+def _find_angles(record: Record) -> Angles:
+    """Return which states are angles, of a record that `heliograph.run` returned; of any other none are known."""
+    network = getattr(record.origin, "model", None)
+    return first(network.plant).angles if isinstance(network, Network) else ()
+
+
+def _make_columns(
+    states: Sequence[str], units: Mapping[str, str], estimate: Estimate, angles: Angles
+) -> list[tuple[str, np.ndarray]]:
     """Return the columns that show an estimate: means, standard deviations and covariances as claimed, and validity."""
-    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    mean, covariance = wrap_angles(np.asarray(estimate.mean), angles), np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from heliograph.files.sources.message_fields import decode_items, decode_json, fail_of_doubled, parse_number
-from heliograph.files.text.csv_dialects import check_distinct
+from heliograph.files.text.csv_dialects import FLAGS, check_distinct
 from heliograph.files.text.csv_text import CsvRow, read_csv_header, read_csv_rows
 from heliograph.files.text.text_file import find_extension, is_valid_text, open_text, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
@@ -206,7 +206,7 @@ def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
 
 
 def convert_cells(row: CsvRow) -> dict[str, Any]:
-    """Return {name: value} for the cells of a row: numbers, None for empty cells, and texts.
+    """Return {name: value} for the cells of a row: numbers, flags (true, False), None for empty cells, and texts.
 
     Integers keep every digit. A payload stays a text.
     """
@@ -215,7 +215,7 @@ def convert_cells(row: CsvRow) -> dict[str, Any]:
         if name == PAYLOAD:
             results[name] = cell
         else:
-            results[name] = parse_number(cell) if cell else None
+            results[name] = FLAGS.get(cell.lower(), parse_number(cell)) if cell else None
     return results
 
 

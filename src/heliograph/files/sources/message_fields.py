@@ -176,7 +176,7 @@ def convert_number(value: Any, name: str, quoted: bool = False) -> float:
         return np.nan
     if quoted and isinstance(value, str):
         value = parse_number(value)
-    if not isinstance(value, bool | int | float | np.number | np.bool_):
+    if not isinstance(value, bool | int | float | Decimal | np.number | np.bool_):
         raise fail(name, NUMBER, show_value(value))
     try:
         numeric = float(value)
@@ -232,7 +232,8 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
         except ValueError:
             raise fail(name, "a date of ISO 8601 with its zone", show_value(value)) from None
         return int(parse_dates([value], name)[0].astype(np.int64))
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
+    is_number = isinstance(value, int | float | Decimal | np.number) and not isinstance(value, bool)
+    if not is_number or not isfinite(value):
         raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
     if unit == "step":
         return convert_count(value, name)
@@ -264,7 +265,10 @@ def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "n
     UNITS maps each unit to its nanoseconds. The error suggests a unit in which the number would be a time.
     """
     # Compute with the decimal number that was meant: a double of seconds times 10^9 is off by up to 128 ns.
-    decimal = int(value) if float(value).is_integer() else Decimal(repr(float(value)))
+    if isinstance(value, Decimal):
+        decimal: Decimal | int = value
+    else:
+        decimal = int(value) if float(value).is_integer() else Decimal(repr(float(value)))
     stamp = round(decimal * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
         fits = next((other for other, size in UNITS.items() if 0 <= float(value) * size < 2**63), None)
@@ -295,7 +299,7 @@ def convert_count(value: Any, name: str, quoted: bool = False) -> int:
     """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text."""
     if quoted and isinstance(value, str):
         value = parse_number(value)
-    if isinstance(value, float) and value.is_integer():
+    if isinstance(value, float | Decimal) and isfinite(value) and value == int(value):
         value = int(value)
     return check_63_bits(name, value)
 

@@ -1,5 +1,6 @@
 """What one message says of one node, or why it could not be read."""
 
+from collections.abc import Container
 from typing import NamedTuple
 
 import numpy as np
@@ -41,3 +42,13 @@ class Unread(NamedTuple):
 
     error: InputError
     counted: Reading | None
+
+
+def is_allowed(value: object, allowed: Container[object]) -> bool:
+    """Return whether a field's value is among those that are allowed; a flag is there also as a word, such as "True".
+
+    Cells of tables in text are flags where they say so.
+    """
+    if not isinstance(value, bool):
+        return value in allowed
+    return value in allowed or any(word in allowed for word in (str(value), str(value).lower(), str(value).upper()))

@@ -11,6 +11,7 @@ from typing_extensions import TypeAliasType
 from heliograph.files.device_availability import Available
 from heliograph.files.sources.derived_values import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.sources.message_fields import TimeUnit, convert_name, convert_time, field_at, parse_start
+from heliograph.files.sources.message_reading import is_allowed
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
@@ -206,8 +207,7 @@ class Source:
             ValueError: a flag has another value, or it is missing.
         """
         for field, allowed in self.valid.items():
-            value = field_at(message, field, where)
-            if value not in allowed:
+            if not is_allowed(value := field_at(message, field, where), allowed):
                 expected = "true or 1" if allowed == (True, 1) else f"one of {show_value(allowed)}"
                 said = f"{expected}, of a message that can be trusted"
                 raise RefusedError("flag", fail(f"{where}, field {field!r}", said, show_value(value)))

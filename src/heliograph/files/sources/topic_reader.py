@@ -16,7 +16,7 @@ from heliograph.files.sources.message_fields import (
     field_at,
     match_topic,
 )
-from heliograph.files.sources.message_reading import Reading, Unread
+from heliograph.files.sources.message_reading import Reading, Unread, is_allowed
 from heliograph.files.sources.mixed_sender_detection import SenderCounter
 from heliograph.files.sources.source_description import Field, Source
 from heliograph.files.sources.topic_clocks import TopicClocks
@@ -243,7 +243,7 @@ class TopicReader:
     def _is_left_out(self, source: Source, topic: str, message: object, where: str) -> bool:
         """Return whether a message is left out, by a field's value or since its device is offline; count it if so."""
         for field, allowed in source.where.items():
-            if field_at(message, field, where) not in allowed:
+            if not is_allowed(field_at(message, field, where), allowed):
                 self.excluded[topic] += 1
                 return True
         if any(self.device_statuses.is_offline(condition, topic) for condition in source.available):

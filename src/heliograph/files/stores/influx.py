@@ -6,6 +6,7 @@ Those are /query and /write (of 2 and 3 their "1.x compatibility"): a bucket or 
 
 import json
 import re
+import warnings
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
@@ -59,12 +60,20 @@ def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:
 def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str) -> None:
     """Write the rows of a table as points at `moments` (datetime64[ns]); numbers that are not finite are left out.
 
-    A point of the same moment and plant is replaced, so that an interrupted call can simply be repeated.
+    A point of the same moment and plant is replaced, so that an interrupted call can simply be repeated. Of several
+    rows of one moment only the last stays therefore, and a warning says how many do not.
 
     Raises:
         ValueError: the server does not answer or refuses. The error says how many rows are written.
     """
     target = f"/write?{urlencode({'db': address.database, 'precision': 'ns'})}"
+    replaced = len(moments) - len(np.unique(moments))
+    if replaced:
+        warnings.warn(
+            f"{address}: {replaced} of {len(moments)} rows are replaced by a later row of the same time, of which a "
+            "measurement has one point",
+            stacklevel=2,
+        )
     done = 0
     for body, rows in _batch_protocol_lines(address.table_for_estimates, columns, moments, plant):
         try:

@@ -88,7 +88,7 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
         rows: by name of the column; they are changed.
 
     Raises:
-        ValueError: an error in the place of a row; a tag of a field's name.
+        ValueError: an error in the place of a row; a tag of a field's name; two values of a field at one time.
     """
     joined: dict[tuple[object, ...], dict[str, Any]] = {}
     first_measurement = ""
@@ -107,6 +107,11 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
         name, value = str(row.pop("_field")), row.pop("_value")
         # What is left are the time and the tags, which all fields of one row share.
         fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
+        if name in fields and name not in row and fields[name] != value:
+            remedy = "a query that yields several results, such as a mean and a maximum, sets _field of each"
+            raise fail(
+                str(address), f"one value of a field at a time ({remedy})", f"two of {name!r} at {row.get('time')}"
+            )
         fields |= _join_row_with_tags(address, row, {name: value})
     return first_measurement, list(joined.values())
 

@@ -12,7 +12,8 @@ from heliograph.numerics.check import InputError, fail
 
 LONGEST = 63  # bytes of a column's name; what is longer would be cut
 PLANT, TIME = "plant", "time"
-TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "double precision", "u": "double precision"}
+# By NumPy's kinds. Whole numbers are those that doubles cannot tell apart, such as nanoseconds.
+TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "bigint", "u": "numeric"}
 
 
 def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:

@@ -17,6 +17,8 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.process.optional_packages import check_installed
 from heliograph.simulation.results.record import Record
 
+DIGITS = 15  # of a decimal number, which a double gives back
+
 
 @dataclass(frozen=True)
 class StoreTable:
@@ -61,7 +63,9 @@ def _convert_cell(cell: object) -> object:
         return f"{cell}Z"
     if isinstance(cell, date):  # and moments
         return cell.isoformat()
-    return float(cell) if isinstance(cell, Decimal) else cell
+    if isinstance(cell, Decimal) and len(cell.as_tuple().digits) <= DIGITS:
+        return float(cell)
+    return cell
 
 
 def query_store(address: StoreAddress) -> StoreTable:

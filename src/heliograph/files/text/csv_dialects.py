@@ -14,6 +14,7 @@ COMMENTS = ("#", "%")
 NO_VALUE = re.compile(
     r"[-+]?nan(?:\([a-z0-9]*\))?|[-+]?1\.#(?:q?nan|snan|ind)\d*|#?n/?a|null|none|nil|nat|-+|\?", re.IGNORECASE
 )
+FLAGS = {"true": True, "false": False}  # as pandas and others write them, in letters of any size
 DAY_FIRST = re.compile(r"(\d{1,2})([./-])(\d{1,2})[./-]\d{2,4}(?:\D.*)?")
 SEEN = 10_000  # characters in which a decimal comma is looked for
 

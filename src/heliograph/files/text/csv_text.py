@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from heliograph.disk.quoted_text import unquote_cell
 from heliograph.files.text.csv_dialects import (
+    FLAGS,
     NO_VALUE,
     check_header,
     guess_meaning_of_cell,
@@ -168,7 +169,7 @@ def read_csv_header(path: Path) -> list[str]:
 
 
 def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
-    """Return the number in a cell; it is NaN if the cell is empty or says that there is no value.
+    """Return the number in a cell: 1 of true and 0 of false, NaN if it is empty or says that there is no value.
 
     Raises:
         ValueError: the cell holds no number. The error says what is probably meant.
@@ -180,6 +181,8 @@ def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
     except ValueError:
         if NO_VALUE.fullmatch(cell):
             return float("nan")
+        if cell.lower() in FLAGS:
+            return float(FLAGS[cell.lower()])
         hint = guess_meaning_of_cell(cell, name, path)
         expected = "a number or an empty cell"
         raise fail(f"{where}, column {name!r}", expected, f"{show_value(cell)}{hint}") from None

@@ -17,6 +17,17 @@ T = TypeVar("T")
 Progress: TypeAlias = Callable[[int, int], None]  # called with how much is done, and how much there is
 PACKED = ".gz"
 GZIP = b"\x1f\x8b"  # the first bytes of what is packed
+OTHER_KINDS = {  # what files begin with that are no text: what they are
+    b"PAR1": "a Parquet file",
+    b"\x89MCAP": "a bag",
+    b"SQLite format 3": "a bag",
+    b"#ROSBAG": "a bag",
+    b"PK\x03\x04": "a file of zip",
+    b"BZh91AY&SY": "a file of bzip2",
+    b"\xfd7zXZ": "a file of xz",
+    b"\x28\xb5\x2f\xfd": "a file of zstd",
+    b"7z\xbc\xaf": "a file of 7z",
+}
 WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 DAMAGE = (gzip.BadGzipFile, EOFError, zlib.error)  # of a packed file
 NO_TEXT = re.compile("[\x00\udc80-\udcff\ufffd]")  # bytes that are no text, as they are escaped
@@ -126,8 +137,16 @@ def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tu
 
 
 def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
-    """Return the same file, or what is packed in it."""
+    """Return the same file, or what is packed in it.
+
+    Raises:
+        ValueError: what the file begins with is no text, nor packed by gzip.
+    """
     buffered = cast(BufferedReader, file)
+    start = buffered.peek(max(map(len, OTHER_KINDS)))
+    for mark, kind in OTHER_KINDS.items():
+        if start.startswith(mark):
+            raise fail(str(buffered.name), "a text, as it is or packed by gzip", kind)
     return gzip.GzipFile(fileobj=file) if buffered.peek(len(GZIP)).startswith(GZIP) else buffered
 
 

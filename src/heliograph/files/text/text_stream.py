@@ -3,18 +3,11 @@
 import codecs
 import zlib
 
-from heliograph.files.text.text_file import GZIP, WIDE, guess_encoding
+from heliograph.files.text.text_file import GZIP, OTHER_KINDS, WIDE, guess_encoding
 from heliograph.numerics.check import fail
 
 AT_ONCE = 1 << 23  # bytes that are unpacked at a time
-NO_TEXT = {
-    b"PAR1": "a Parquet file",
-    b"\x89MCAP": "a bag",
-    b"SQLite format 3": "a bag",
-    b"#ROSBAG": "a bag",
-    b"PK\x03\x04": "a file of zip",
-}
-LONGEST_START = max(map(len, NO_TEXT))
+LONGEST_START = max(map(len, OTHER_KINDS))
 
 
 class TextStream:
@@ -65,15 +58,15 @@ class TextStream:
     @staticmethod
     def _may_be_no_text(start: bytes) -> bool:
         """Return whether more bytes may show that these are no text in UTF-8."""
-        marks = (*NO_TEXT, GZIP, *WIDE, codecs.BOM_UTF8)
+        marks = (*OTHER_KINDS, GZIP, *WIDE, codecs.BOM_UTF8)
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
     def _begin_decoding(self, start: bytes) -> bytes:
         """Choose how bytes are read, from the first of them; return these without UTF-8's byte order mark.
 
-        NO_TEXT maps the first bytes of other kinds of files to the name of the kind. Packed files begin with GZIP.
+        OTHER_KINDS maps the first bytes of other kinds of files to the name of the kind. Packed files begin with GZIP.
         """
-        for mark, kind in NO_TEXT.items():
+        for mark, kind in OTHER_KINDS.items():
             if start.startswith(mark):
                 came = f"{kind}: heliograph replay sends it as messages"
                 raise fail(self.source, "text: CSV, lines of JSON, a log", came)

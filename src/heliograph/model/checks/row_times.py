@@ -30,6 +30,10 @@ def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
             continue
         if common_dates is None:
             first_table, common_dates = name, dates
+        elif dates.dtype.kind != common_dates.dtype.kind:
+            kinds = {"M": "dates"}
+            came, there = (kinds.get(times.dtype.kind, "spans of time") for times in (dates, common_dates))
+            raise fail(f"times of {name}", f"{there}, as {first_table} has", came)
         elif len(dates) == len(common_dates) and (dates != common_dates).any():  # other lengths are refused as such
             row = int(np.argmax(dates != common_dates))
             got = f"{dates[row]} in row {row + 1}, not {common_dates[row]}"

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from heliograph.numerics.check import REAL, check_columns, check_numbers, fail, report_domain, show_value
-from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked, holds_texts_or_dates
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 
@@ -23,7 +23,10 @@ def check_rows(
         raise fail(name, f"shape ({steps}, {length})", "none")
     check_columns(name, value, names)
     try:
-        values = np.asarray(fill_masked(value), dtype=np.float64)
+        values = np.asarray(fill_masked(value))
+        if holds_texts_or_dates(values):
+            raise ValueError
+        values = values.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError):
         raise fail(name, "an array of numbers", show_value(value)) from None
     values = values[:, None] if values.ndim == 1 and length in (1, None) else values

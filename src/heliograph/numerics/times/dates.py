@@ -19,6 +19,7 @@ MONTH = re.compile(r"(?P<year>\d{4})-(?:(?P<month>\d\d)|Q(?P<quarter>[1-4]))|(?P
 YEAR = re.compile(r"\d{4}")  # where a date is expected; anywhere else it is a number
 UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MISSING = np.iinfo(np.int64).min  # NumPy's NaT
+CALENDARS = ("standard", "gregorian", "proleptic_gregorian")  # of CF, which are ours from 1678 on
 YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
 
@@ -48,6 +49,10 @@ def parse_dates(texts: Iterable[object], name: str) -> np.ndarray:
         if not text or text == "NaT":
             results.append(MISSING)
             continue
+        # Of climate models: years of 365 or 360 days, whose dates are others than ours of the same name.
+        calendar = str(getattr(element, "calendar", CALENDARS[0]))
+        if calendar not in CALENDARS:
+            raise fail(f"{name}, row {row}", f"a date of the calendar {CALENDARS[0]}", f"{text} of {calendar}")
         # Nanoseconds since 1970 in UTC.
         moment, zoned = parse_moment(text, f"{name}, row {row}")
         results.append(moment)

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked, find_packing
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates, round_to_nanoseconds
 from heliograph.numerics.types import ArrayLike
@@ -124,10 +124,11 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
 
     Args:
         name: name of the rows, for errors.
-        rows: the rows; an index (pandas) or a coordinate of the first dimension (xarray) labels them.
+        rows: the rows; an index (pandas) or a coordinate of the first dimension (xarray) labels them. Spans of time
+            become seconds.
 
     Raises:
-        ValueError: dates that are missing or go backwards.
+        ValueError: dates that are missing or go backwards, or that are not decoded (numbers "days since 2000-01-01").
     """
     labels = getattr(rows, "index", None)
     if hasattr(rows, "dims") and hasattr(rows, "coords"):
@@ -135,7 +136,12 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
         labels = rows.coords.get(next(iter(dims))) if dims else None
     if labels is None or callable(labels):  # a list has a function of that name
         return None
+    if packing := find_packing(labels):
+        came = f"{packing!r} of {getattr(labels, 'attrs', {})[packing]!r}"
+        raise fail(f"dates of {name}", "decoded ones, as xarray.decode_cf makes them", came)
     label_array = np.asarray(labels)
+    if label_array.dtype.kind == "m":
+        return check_times(f"times of {name}", label_array / np.timedelta64(1, "s"), len(label_array))
     if label_array.dtype.kind != "M":
         is_filled_list = label_array.ndim == 1 and len(label_array) > 0
         if not is_filled_list or not all(_is_date_label(label) for label in label_array):
@@ -156,6 +162,28 @@ def is_mix_of_units(earlier: Any, later: Any) -> Any:
     Of a clock that has counted for long (seconds since 1970 are 1.7e9) a hundredfold leap is no time that went by.
     """
     return (earlier >= LONG_AGO) & (later > LEAP * earlier)
+
+
+COARSE = 0.01  # of a step, from which on the distance of doubles is an error of it
+
+
+def find_lost_digits(clock: np.ndarray) -> tuple[float, float] | None:
+    """Return the distance of neighbouring doubles at these times and the median step, if steps lost digits to it.
+
+    They did where the distance is more than COARSE of the median step and the times go to their last digit: not all
+    are multiples of two distances. Doubles that are all of single precision, as of a column of float32, have the
+    distance of these. None of dates and of whole numbers.
+    """
+    if clock.dtype.kind != "f" or len(clock) < 2:
+        return None
+    largest = np.abs(clock).max()
+    is_single = largest < np.finfo(np.float32).max and np.array_equal(clock.astype(np.float32), clock)
+    distance = float(np.spacing(np.float32(largest) if is_single else largest))
+    steps = np.abs(np.diff(clock))
+    steps = steps[steps > 0]
+    if not steps.size or distance <= COARSE * np.median(steps) or not np.any(np.remainder(clock, 2 * distance)):
+        return None
+    return distance, float(np.median(steps))
 
 
 def find_backwards_row(clock: np.ndarray) -> int | None:

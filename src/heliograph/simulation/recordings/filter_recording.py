@@ -80,8 +80,8 @@ def run(
         time: (steps,), numbers or dates (datetime64, datetimes, texts of ISO 8601, periods of pandas), stored in the
             record; by default the dates by which the rows of the measurements are known (the index of pandas, the
             coordinate of xarray), else 0, 1, ... Where steps differ and the plant has no input dt, there is a warning.
-        truth: true states (steps, n) where they are known, NaN where they are not; no filter sees them. None by
-            default.
+        truth: true states (steps, n) where they are known, NaN where they are not; no filter sees them. Angles of
+            estimates are then within half a turn of them, and else between -pi and pi. None by default.
         smooth: smoothing as in `monte_carlo`; None by default.
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
             at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each

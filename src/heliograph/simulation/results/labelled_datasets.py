@@ -325,13 +325,20 @@ def read_labels(dataset: "xr.Dataset", axis: str) -> list[str]:
 def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
     """Return the values of a field with its axes in the order of `list_axes`; raise ValueError if it has other axes.
 
-    `lead`: the axes of rows, such as run and time, which stand first.
+    `lead`: the axes of rows, such as run and time, which stand first. Both axes of a covariance have the states of the
+    dataset, in their order.
     """
     axes = list_axes(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
         found = list(dataset[name].dims) if name in dataset else "no such variable"
         raise fail(f"dataset, variable {name!r}", f"the dimensions {axes}", found)
-    return np.asarray(dataset[name].transpose(*axes).values)
+    values = np.asarray(dataset[name].transpose(*axes).values)
+    if "other" not in axes:
+        return values
+    states, others = read_labels(dataset, "state"), read_labels(dataset, "other")
+    if not set(states) <= set(others):
+        raise fail("dataset, dimension 'other'", f"the states, {', '.join(states)}", ", ".join(others))
+    return np.take(values, [others.index(state) for state in states], axis=axes.index("other"))
 
 
 def read_units(dataset: "xr.Dataset") -> dict[str, str]:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:  # an extra
     import xarray as xr
 
 NETCDF, ZARR = ".nc", ".zarr"
-MARK = "zarr.json"  # what a Zarr folder has, and nothing else
 
 
 class SavableResults:
@@ -105,7 +104,7 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
         encoding["time"] = {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
     # A folder, or a file, that replaces an earlier one when it is complete.
     if package == "zarr":
-        check_replaceable(path, MARK)
+        check_replaceable(path)
         with whole_folder(path) as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the format's text does not have strings or consolidation yet
             plain.to_zarr(folder, mode="w", encoding=encoding)

@@ -64,9 +64,12 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
     runs = len(frame.index.unique("run")) if "run" in frame.index.names else None
     steps = len(frame) // (runs or 1)
     leading_axes = (steps,) if runs is None else (runs, steps)
+    if runs is not None:
+        _check_rows_of_runs(frame, runs, steps)
     places: _Places = {}
     for i, (node, name, quantity, _, _) in enumerate(frame.columns):
         places.setdefault((node, name, quantity), []).append(i)
+    _sort_places(frame, places)
     values = {key: frame.iloc[:, columns].to_numpy().reshape(*leading_axes, -1) for key, columns in places.items()}
     # States as the truth, else the first mean, has them.
     named = next((columns for (_, _, quantity), columns in places.items() if quantity in ("truth", "mean")), [])
@@ -83,6 +86,46 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
         "estimates": estimates,
         "uplinks": _read_uplinks(values),
     }
+
+
+def _check_rows_of_runs(frame: "pd.DataFrame", runs: int, steps: int) -> None:
+    """Raise ValueError unless the rows of each run follow one another, and every run has the same times in order."""
+    run, time = (np.asarray(frame.index.get_level_values(level)) for level in ("run", "time"))
+    whole = len(frame) == runs * steps
+    if whole:
+        of_first_step, of_first_run = run.reshape(runs, steps)[:, :1], time.reshape(runs, steps)[:1]
+        whole = bool(
+            (run.reshape(runs, steps) == of_first_step).all() and (time.reshape(runs, steps) == of_first_run).all()
+        )
+    if not whole:
+        expected = "the same times of each run, one run after another (sort_index)"
+        raise fail("table, rows", expected, f"{len(frame)} of {runs} runs, some in another order or missing")
+
+
+def _sort_places(frame: "pd.DataFrame", places: _Places) -> None:
+    """Put the columns of each quantity into one order, by what they say of themselves: states as the first of them has.
+
+    `places`: of each key, the places of its columns, which are changed. Components that are no states are numbered.
+
+    Raises:
+        ValueError: a quantity without some of the states.
+    """
+    labels = [(str(column[3]), str(column[4])) for column in frame.columns]  # component and other
+    states = next(
+        ([labels[i][0] for i in found] for (*_, kind), found in places.items() if kind in ("truth", "mean")), []
+    )
+    for (node, name, quantity), found in places.items():
+        if quantity == "measurement" or quantity == MODES:
+            found.sort(key=lambda i: int(labels[i][0].removeprefix("z")))
+            continue
+        others = states if quantity in COVARIANCE else [""]
+        there = {(labels[i][0], labels[i][1] if quantity in COVARIANCE else ""): i for i in found}
+        wanted = [(state, other) for state in states for other in others]
+        if len(found) != len(wanted) or not set(wanted) <= there.keys():
+            raise fail(
+                f"table, {quantity} of {node}/{name}", f"a column for each of {', '.join(states)}", sorted(there)
+            )
+        found[:] = [there[label] for label in wanted]
 
 
 def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
