@@ -35,7 +35,7 @@ SINGLE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
 NETWORK = hg.Network(PLANT, {"a": NODE, "b": NODE}, {"all": hg.Fusion("f", fusion.MatrixWeights())})
 RECORD = Later(lambda: hg.monte_carlo(hg.Network(PLANT, {"a": NODE}), 3, 2, 0))
 GROWTH = h_infinity.growth_system(
-    3, [[0.2], [0.1]], [[0.3]], EYE, HOP, 0.0, transition=0.9 * EYE, output=[[1.0, 0.5]], initial_weight=5.0
+    3, [[0.2], [0.1]], [[0.3]], EYE, HOP, 0.0, transition=0.9 * EYE, output=[[1.0, 0.0]], initial_weight=5.0
 )
 START = 5.0 * np.eye(4)
 DESIGN = Later(lambda: h_infinity.recursive_design(GROWTH, 5.0))

@@ -1,6 +1,7 @@
 """Backtests: scores against formulas, honest forecasts pass, and those that trust a mean gain do not."""
 
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -73,6 +74,58 @@ def test_standard_errors_know_the_overlap():
     true = series.mean(axis=1).std()
     assert said == pytest.approx(true, rel=0.15)  # of which Bartlett's weights take a tenth
     assert series.std() / np.sqrt(1000) < true / 2.5
+
+
+@pytest.mark.parametrize(("horizon", "rows"), [(1, 3), (1, 20), (12, 20), (12, 60)])
+def test_standard_errors_of_short_recordings_are_not_too_small(horizon, rows):
+    """Sums of `horizon` neighbours in few rows, some of which are missing: the error of their mean over 2,000 series.
+
+    What is said of one series is scattered, so that its root mean square is compared; 5 % are four of its own errors.
+    """
+    generator = np.random.default_rng(0)
+    noise = generator.normal(size=(2000, rows + horizon - 1))
+    series = np.stack([np.convolve(row, np.ones(horizon), "valid") for row in noise])
+    series[:, rows // 2] = np.nan
+    said = np.sqrt(np.mean([average_overlapping(row, horizon).error ** 2 for row in series]))
+    assert said == pytest.approx(np.nanmean(series, axis=1).std(), rel=0.05)
+
+
+def test_of_one_comparison_no_standard_error_is_known():
+    found = hg.backtest(world(), {"a": [*[np.nan] * 20, 0.3, np.nan]}, [1]).of("a", "f", "y", 1)
+    assert found.compared == 1
+    assert np.isnan([found.bias.error, found.mse.error, found.log_score.error, found.crps.error]).all()
+    assert [share.error for share in found.coverage] == pytest.approx(np.sqrt([0.25, 0.16, 0.0475]))
+
+
+def test_a_coverage_of_all_or_nothing_has_an_error():
+    """Of few rows all within 95 %, which an honest filter has most of the time: their scatter is 0, their error not."""
+    network = world()
+    z = np.zeros((25, 1))  # always what is expected
+    share = hg.backtest(network, {"a": z}, [1]).of("a", "f", "y", 1).coverage[2]
+    assert share.value == 1.0
+    assert share.error == pytest.approx(np.sqrt(0.95 * 0.05 / 14))
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0])
+def test_what_is_known_exactly_is_forecast_without_error(level):
+    """A state of variance 0: it came as it was said, so that no interval missed it; another value is off for ever."""
+    plant = hg.LinearPlant(
+        np.diag([1.0, 0.9]), np.diag([0.0, 0.5]), [level, 0.0], np.diag([0.0, 2.0]), states=["c", "x"]
+    )
+    sensor = hg.LinearSensor([[0.0, 1.0]], 0.3, outputs=["y"])
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(1), {"f": hg.kalman_filter(plant, sensor)})})
+    drawn = hg.simulate(network, 40, 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        right = hg.backtest(network, drawn.measurements, [1], truth=drawn.truth).of("a", "f", "c", 1)
+        other = drawn.truth + np.array([0.25, 0.0])
+        wrong = hg.backtest(network, drawn.measurements, [1], truth=other).of("a", "f", "c", 1)
+    assert np.isnan([share.value for share in right.coverage]).all()  # it is no trial of any interval
+    assert right.crps.value == pytest.approx(0.0, abs=1e-13)
+    assert right.log_score.value > 25.0
+    assert [share.value for share in wrong.coverage] == [0.0, 0.0, 0.0]
+    assert wrong.crps.value == pytest.approx(0.25, rel=1e-12)
+    assert wrong.log_score.value < -1e20
 
 
 @pytest.mark.parametrize(

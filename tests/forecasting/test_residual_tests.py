@@ -77,6 +77,20 @@ def test_tests_are_those_of_the_textbook():
     assert found.ljung_box[0] == pytest.approx(stats.chi2.sf(q, 5), rel=1e-9)
 
 
+def test_missing_rows_do_not_hide_a_correlation():
+    """A filter that believes in too little noise of the plant, with half of the rows: the same correlation, within 0.1.
+
+    Of 2,000 rows a half has pairs for an error of some 0.05.
+    """
+    slow = hg.kalman_filter(*hg.state_space([[0.9]], [[1.0]], 0.01, 5.0, [0.0], 2.0))
+    z = drawn(2000, 4)
+    whole = residuals(slow, z).autocorrelation[:3, 0]
+    z[np.random.default_rng(0).random(len(z)) < 0.5] = np.nan
+    some = residuals(slow, z)
+    assert np.all(whole > 0.3)
+    np.testing.assert_allclose(some.autocorrelation[:3, 0], whole, atol=0.1)
+
+
 def test_filters_without_residuals_are_refused():
     plant = hg.LinearPlant([[0.9]], 0.5, [0.0], 2.0)
     with pytest.raises(ValueError, match="residuals: expected a filter that claims a covariance of what arrives"):

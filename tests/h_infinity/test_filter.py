@@ -80,3 +80,67 @@ def test_parts_that_do_not_fit_are_refused():
     three = hg.Plant(lambda x, u: x, 0.0, np.zeros(3), np.eye(3))
     with pytest.raises(ValueError, match=r"system: expected 3 states"):
         hg.h_infinity.h_infinity_filter(three, hg.LinearSensor(np.ones((1, 3)), 0.0), node(0), design)
+
+
+A_OVER_TIME = np.array([0.2, 1.6, 0.2, 1.6, 0.2, 1.6])[:, None, None]
+SENSOR = hg.LinearSensor([[1.0]], 0.25)
+
+
+def varying_system(**changes):
+    given = {"transition": hg.model.OverTime(A_OVER_TIME), "growth": 0.0, "output": [[1.0]]}
+    return hg.h_infinity.growth_system(
+        6, disturbance=[[1.0, 0.0]], feedthrough=[[0.0, 0.5]], target=[[1.0]], channel=hg.perfect(), **(given | changes)
+    )
+
+
+def plants(matrices):
+    return hg.model.over_time([hg.LinearPlant(a, [[1.0]], [0.0], [[1.0]]) for a in matrices])
+
+
+def test_a_plant_that_varies_moves_into_the_next_row_by_the_step_before():
+    """The norm of the map to the errors is the level; of a plant that is one step ahead it is 7.5 times the level."""
+    system = varying_system()
+    design = hg.h_infinity.horizon_design(system)
+    item = hg.h_infinity.h_infinity_filter(plants([A_OVER_TIME[0], *A_OVER_TIME[:-1]]), SENSOR, system, design, [1.0])
+    gains = design.gains[:, 0, 0]
+
+    def norm(transitions):
+        """Norm of the map from the error in row 0 and all disturbances to the errors in all rows."""
+        errors, row = [], np.zeros(13)
+        row[0] = 1.0
+        for k in range(6):
+            errors.append(row)
+            row = (transitions[k] - gains[k]) * row
+            row[1 + 2 * k : 3 + 2 * k] = 1.0, -0.5 * gains[k]
+        return np.linalg.norm(errors, 2)
+
+    # Without disturbances and data the estimates fall as errors do.
+    means = item.run(np.zeros((6, 1))).means[:, 0]
+    a = A_OVER_TIME[:, 0, 0]
+    np.testing.assert_allclose(means[1:], (a - gains)[:-1] * means[:-1], rtol=1e-12, atol=1e-17)
+    assert norm(a) == pytest.approx(design.level, rel=1e-5)
+    assert norm([*a[1:], a[-1]]) > 7 * design.level
+    with pytest.raises(
+        hg.InputError, match=r"plant in row 1: expected A x \+ f\(x\) of the system's step 0, which leads"
+    ):
+        hg.h_infinity.h_infinity_filter(plants(A_OVER_TIME), SENSOR, system, design)
+
+
+def test_models_that_are_not_the_systems_are_refused():
+    """No level holds of them; what the growth constants allow is accepted."""
+    system = varying_system(transition=[[0.9]], growth=0.05)
+    design = hg.h_infinity.horizon_design(system)
+
+    def make(slope, shown=1.0):
+        plant = hg.Plant(lambda x, u: 0.9 * x + slope * jnp.sin(x), [[1.0]], [0.0], [[1.0]])
+        return hg.h_infinity.h_infinity_filter(plant, hg.LinearSensor([[shown]], 0.25), system, design)
+
+    assert make(0.05).claim == "none"
+    with pytest.raises(
+        hg.InputError, match=r"got 0.0841 from it where state 0 changes by 1, the growth constant being 0.0"
+    ):
+        make(0.1)
+    with pytest.raises(
+        hg.InputError, match=r"sensor in row 0: expected C x \+ h\(x\) of the system's step 0, got 1 from it"
+    ):
+        make(0.05, shown=2.0)

@@ -69,6 +69,48 @@ def test_more_bits_are_never_worse():
     assert np.all(np.diff(errors) < 0)
 
 
+def lone(encoder, plant=None, rate=0.0, **options):
+    """One sender of words over +-8 of a plant that is seldom beyond +-4."""
+    moving = hg.LinearPlant([[0.95]], 0.1, [0.0], 1.0) if plant is None else plant
+    node = hg.Node(hg.LinearSensor([[1.0]], 0.05), hg.decode_and_forward([rate]), {}, encoder=encoder, **options)
+    return hg.Network(moving, {"a": node})
+
+
+WIDE = hg.Words(bits=1, low=-8.0, high=8.0)
+
+
+def test_bits_that_are_flipped_half_of_the_time_are_worth_nothing():
+    found = hg.planning.design_bits(lone(WIDE, rate=0.5), 4)
+    assert found.bits == {"a": 0} and found.encoders == {}
+    assert found.error == pytest.approx(0.1 / (1 - 0.95**2), rel=1e-12)
+
+
+def test_no_bits_are_spent_on_rounding():
+    """The second state dies out, so that a word of it says nothing of the steady state, to the last digit."""
+    plant = hg.LinearPlant([[0.95, 0.0], [0.0, 0.5]], np.diag([0.1, 0.0]), [0.0, 0.0], np.eye(2))
+    node = hg.Node(hg.LinearSensor([[0.0, 1.0]], 0.1), hg.perfect(), {}, encoder=WIDE)
+    assert hg.planning.design_bits(hg.Network(plant, {"a": node}), 4).bits == {"a": 0}
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        lambda: lone(hg.Words(bits=1, low=-0.5, high=0.5)),  # half of the steady law is beyond
+        lambda: lone(hg.Words(bits=1, low=20.0, high=22.0)),
+        lambda: lone(WIDE, hg.LinearPlant([[0.95]], hg.Gaussian([[0.1]], [5.0]), [0.0], 1.0)),  # of mean 100
+    ],
+)
+def test_a_range_that_the_steady_state_leaves_is_refused(network):
+    """Its words overload, and their error is not that of rounding: 0.036 was said where the filter is refused."""
+    with pytest.raises(hg.InputError, match="node 'a' of a design of bits: range of the words: expected an overload"):
+        hg.planning.design_bits(network(), 6)
+
+
+def test_a_sender_that_decides_is_refused():
+    with pytest.raises(hg.InputError, match="expected senders that transmit at each step, got triggers of"):
+        hg.planning.design_bits(lone(WIDE, trigger=hg.Periodic(3)), 6)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -232,3 +232,22 @@ def test_a_sensor_that_varies_sends_its_designed_power_at_every_step():
     best = hg.design(network, budget=1.0, error=Error(horizon=3))
     sent = hg.power(best.network, horizon=3).over_time["node.hop1"]
     np.testing.assert_allclose(sent, best.powers["node.hop1"], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "got"),
+    [({"trigger": hg.Periodic(3)}, "a trigger"), ({"encoder": hg.Words(bits=2, low=-8.0, high=8.0)}, "words")],
+)
+def test_senders_that_decide_or_round_are_refused(options, got):
+    """A design took them for senders of all that they measure: two bits of +-8 said as much as the number itself."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.05)
+
+    def build(amplification):
+        free = hg.Node(sensor, hg.hop(1.0, 0.2, amplification=amplification), {})
+        return hg.Network(plant, {"free": free, "b": hg.Node(sensor, hg.perfect(), {}, **options)})
+
+    message = f"node 'b' of a design: expected a sensor that sends what it measures at each step, got {got}"
+    with pytest.raises(hg.InputError, match=message):
+        hg.design(build(1.0), budget=1.0)
+    with pytest.raises(hg.InputError, match=message):
+        hg.design(build, free={"amplification": (0.5, 0.01, 2.0)}, budget=0.3, starts=1)

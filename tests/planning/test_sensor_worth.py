@@ -101,8 +101,12 @@ def test_what_cannot_be_asked_is_said_in_one_line(network):
     with pytest.raises(ValueError, match="additions: expected nodes of other names than the network's, got gnss"):
         worth_of_sensors(network, additions={"gnss": node("gnss")})
     asking = hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.1), hg.perfect(1), {}, trigger=hg.SendOnDelta(0.5))
-    with pytest.raises(ValueError, match="node 'a': expected a sensor that sends what it measures at each step"):
+    with pytest.raises(ValueError, match="node 'a' of a comparison of sensors: expected a sensor that sends what it"):
         worth_of_sensors(hg.Network(network.plant, {"a": asking}))
+    with pytest.raises(ValueError, match="node 'mast' of the additions: expected a sensor that sends what it measures"):
+        worth_of_sensors(network, additions={"mast": asking})
+    with pytest.raises(ValueError, match="runs: expected a whole number of at least 2, got 1"):
+        worth_of_sensors(network, runs=1)  # of which the uncertainty would be 0, as if it were computed
 
 
 def test_gains_that_are_told_make_an_exact_error_random():

@@ -47,3 +47,64 @@ def test_a_sender_that_decides_when_to_transmit_is_refused(result, trigger):
     """A trigger was ignored: a sender of every third step "sent" three times its power."""
     with pytest.raises(hg.InputError, match=r"expected senders that transmit at each step, got triggers of"):
         RESULTS[result](trigger)
+
+
+WORDS = {
+    "cross covariances": lambda net: hg.simulation.cross_covariances(net, "f", 3),
+    "fused": lambda net: hg.simulation.fused_covariances(net, 3),
+    "mesh": lambda net: hg.simulation.mesh_errors(net, "m", 3),
+    "mean mesh": lambda net: hg.simulation.mean_mesh_errors(net, "m", 3),
+    "best": lambda net: hg.simulation.best_possible(net, "m", 3),
+}
+
+
+def rounded(**fusions):
+    """Two nodes whose filters know nothing of the words of two bits, 2.7 apart, over a perfect link."""
+    encoder = hg.Words(bits=2, low=-4.0, high=4.0)
+    plain = {"f": hg.linear_filter(PLANT, SENSOR, hg.perfect())}
+    nodes = {name: hg.Node(SENSOR, hg.perfect(), plain, encoder=encoder) for name in NEIGHBOURS}
+    return hg.Network(PLANT, nodes, fusions)
+
+
+@pytest.mark.parametrize("result", WORDS)
+def test_words_are_refused_by_results_for_numbers(result):
+    """The rounding was left out: the covariance was that of the numbers themselves."""
+    network = rounded(w=fuse(hg.fusion.MatrixWeights()), m=fuse(hg.fusion.MatrixWeights(), neighbours=NEIGHBOURS))
+    with pytest.raises(hg.InputError, match="expected senders of the numbers themselves, got an encoder of words at"):
+        WORDS[result](network)
+
+
+def test_a_fusion_that_knows_nothing_of_words_claims_no_more_than_nominal():
+    """It follows the errors by sensors and channels alone; "exact" and "upper" were claimed, 18 times too small."""
+    rules = hg.fusion.MatrixWeights(), hg.fusion.TraceIntersection()
+    network = rounded(
+        w=fuse(rules[0]), m=fuse(rules[1], neighbours=NEIGHBOURS), n=fuse(rules[0], neighbours=NEIGHBOURS)
+    )
+    claims = network.claims()
+    assert claims["fused"] == {"w": "nominal"}
+    assert claims["a"] == claims["b"] == {"f": "nominal", "m": "nominal", "n": "nominal"}
+    fused = hg.monte_carlo(network, 20, 500, key=0).estimates["fused"]["w"]
+    assert fused.claim == "nominal"
+
+
+def test_an_intersection_of_filters_that_know_the_words_is_an_upper_bound():
+    encoder = hg.Words(bits=3, low=-8.0, high=8.0, dither="triangular")
+    knows = {"f": hg.linear_filter(PLANT, SENSOR, hg.perfect(), encoder=encoder)}
+    nodes = {name: hg.Node(SENSOR, hg.perfect(), knows, encoder=encoder) for name in NEIGHBOURS}
+    network = hg.Network(PLANT, nodes, {"w": fuse(hg.fusion.EqualIntersection())})
+    assert network.claims()["fused"] == {"w": "upper"}
+
+
+DATA = {"a": np.arange(50.0)[:, None]}
+
+
+@pytest.mark.parametrize("learn", [hg.learning.identifiable, lambda build: hg.fit(build, DATA)])
+def test_words_are_no_numbers_to_learn_from(learn):
+    """Their rounding counted as noise of the sensor."""
+
+    def build():
+        sensor, encoder = hg.LinearSensor([[1.0]], hg.free(0.1)), hg.Words(bits=2, low=-4.0, high=4.0)
+        return hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), {}, encoder=encoder)})
+
+    with pytest.raises(hg.InputError, match="network to be learned: expected senders of the numbers themselves"):
+        learn(build)

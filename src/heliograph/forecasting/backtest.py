@@ -18,9 +18,11 @@ from heliograph.forecasting.scores import (
     LEVELS,
     MixtureLaws,
     ScoreMean,
+    average_coverage,
     average_overlapping,
     compute_probability_below,
     crps,
+    is_known_and_came,
     log_score,
     select_law,
 )
@@ -55,11 +57,12 @@ class Score(NamedTuple):
         part: "state", against the true state, or "received", against what arrived.
         name: of the number.
         horizon: rows ahead.
-        compared: number of forecasts whose number came.
+        compared: number of forecasts whose number came; standard errors are NaN of a single one.
         bias: mean of what came less what was forecast.
         mse: mean square of it.
-        coverage: share within the central intervals of 50, 80 and 95 %.
-        log_score: mean log density of what came, in nats; the larger the better.
+        coverage: share within the central intervals of 50, 80 and 95 %; its error is at least that of intervals that
+            hold what they claim. A value that is known exactly, and comes, does not count.
+        log_score: mean log density of what came, in nats; the larger the better; infinite of what is known exactly.
         crps: mean continuous ranked probability score, in the number's unit; the smaller the better.
     """
 
@@ -321,14 +324,16 @@ def _score_number(
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)
     error, probability_below = came - law.mean, compute_probability_below(law, came)
     nan_if_absent = np.where(np.isnan(error), np.nan, 0.0)  # added to 0 or 1, so that absent rows do not count
-    in_middle = [(np.abs(probability_below - 0.5) <= level / 2) + nan_if_absent for level in LEVELS]
+    # Whoever knows a value holds all of it within any interval: it is no trial of the share.
+    absent_or_known = np.where(is_known_and_came(law, came), np.nan, nan_if_absent)
+    in_middle = {level: (np.abs(probability_below - 0.5) <= level / 2) + absent_or_known for level in LEVELS}
     return Score(
         *number,
         horizon=horizon,
         compared=int(np.sum(~np.isnan(error))),
         bias=average_overlapping(error, horizon),
         mse=average_overlapping(error**2, horizon),
-        coverage=tuple(average_overlapping(is_inside, horizon) for is_inside in in_middle),
+        coverage=tuple(average_coverage(is_inside, horizon, level) for level, is_inside in in_middle.items()),
         log_score=average_overlapping(log_score(law, came), horizon),
         crps=average_overlapping(crps(law, came), horizon),
     )

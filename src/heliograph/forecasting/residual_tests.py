@@ -16,6 +16,7 @@ from heliograph.forecasting.residual_figure import ResidualQuantiles, compare_wi
 from heliograph.forecasting.start_states import find_origin
 from heliograph.numerics.angles.angle import Angles, wrap_near
 from heliograph.numerics.check import check_count, fail, instance, show_value
+from heliograph.numerics.confidence_intervals import correlate_over_steps
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.results.record import Record
@@ -40,7 +41,7 @@ class Residuals:
         names: of the outputs, m of them.
         values: residuals (steps, m), NaN where nothing arrived.
         predicted: what was predicted at each row.
-        autocorrelation: over the first lags (lags, m).
+        autocorrelation: over the first lags (lags, m), of the pairs that came; NaN where none did.
         band: half-width of the interval of 95 % about zero for one of them (m,).
         ljung_box: p-values (m,) that all are zero.
         normality: p-values (m,) of skewness and kurtosis together, by Jarque and Bera.
@@ -169,13 +170,13 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
     deviation = np.where(np.isfinite(law.deviation), law.deviation, np.nan)
     values = (wrap_near(rows, law.mean, angles) - law.mean) / deviation
     columns = [values[:, i] for i in range(values.shape[1])]
-    counts = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)  # that came, at least 1 to divide by
+    correlations, errors = zip(*(correlate_over_steps(_subtract_mean(e)[None], lags) for e in columns), strict=True)
     return Residuals(
         names=law.names,
         values=values,
         predicted=predicted,
-        autocorrelation=np.stack([_compute_autocorrelation(e, lags) for e in columns], axis=1),
-        band=NORMAL / np.sqrt(counts),
+        autocorrelation=np.stack(correlations, axis=1),
+        band=NORMAL * np.array(errors),
         ljung_box=np.array([_test_correlation(e, lags) for e in columns]),
         normality=np.array([_test_normality(e) for e in columns]),
         variance=np.array([_test_same_variance(e) for e in columns]),
@@ -188,26 +189,25 @@ def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
     return np.asarray(products[~np.isnan(products)])
 
 
-def _compute_autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
-    """Return r_l = sum e_t e_(t+l) / sum e_t^2 (lags,) for lags from 1 on, over pairs that are not NaN."""
-    e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
-    sum_of_squares = np.nansum(e**2)
-    if not sum_of_squares > 0:
-        return np.full(lags, np.nan)
-    return np.array([_multiply_pairs(e, lag).sum() / sum_of_squares for lag in range(1, lags + 1)])
+def _subtract_mean(e: np.ndarray) -> np.ndarray:
+    """Return residuals (steps,) less the mean of those that are not NaN."""
+    return e - np.nanmean(e) if np.any(~np.isnan(e)) else e
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
     """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, which is chi-squared if all correlations r_l are zero.
 
-    n residuals are not NaN, and n_l pairs of them have lag l. The result is NaN for n below LEAST.
+    r_l = sum e_t e_(t+l) / sum e_t^2 over what came: n residuals, and n_l pairs of lag l. The result is NaN for n below
+    LEAST.
     """
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
         return float("nan")
-    counts = np.array([max(len(_multiply_pairs(e, lag)), 1) for lag in range(1, lags + 1)])
-    statistic = n * (n + 2) * np.sum(_compute_autocorrelation(e, lags) ** 2 / counts)
-    return float(chi2.sf(statistic, df=lags))
+    e = _subtract_mean(e)
+    pairs = [_multiply_pairs(e, lag) for lag in range(1, lags + 1)]
+    r = np.array([products.sum() for products in pairs]) / np.nansum(e**2)
+    counts = np.array([max(len(products), 1) for products in pairs])
+    return float(chi2.sf(n * (n + 2) * np.sum(r**2 / counts), df=lags))
 
 
 def _test_normality(e: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from heliograph.numerics.gaussian_density import LOG_TURN
 
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the central intervals whose coverage is counted
 BANDWIDTH = 1.3  # times the root of the number of rows
+ROUNDING = 1e-13  # of a value: a deviation that is no larger is that of rounding, added up over steps
 
 
 class MixtureLaws(NamedTuple):
@@ -37,21 +38,48 @@ def select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
 
 
 def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return P(less than what came) of each row (rows,): uniform on (0, 1) where the laws are right."""
-    return np.asarray(np.sum(law.weights * ndtr((values[:, None] - law.means) / np.sqrt(law.variances)), axis=1))
+    """Return P(less than what came) of each row (rows,): uniform on (0, 1) where the laws are right.
+
+    Of a value that a part knows exactly (variance 0) it is P(less) + P(equal) / 2: 1/2 where that is what came.
+    """
+    return np.asarray(np.sum(law.weights * ndtr(_standardise(values[:, None] - law.means, law.variances)), axis=1))
+
+
+def _standardise(difference: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return the difference in deviations; where the variance is 0, none is 0 and any other is infinite."""
+    deviation = np.sqrt(variance)
+    is_known = deviation == 0
+    in_deviations = difference / np.where(is_known, 1.0, deviation)
+    return np.asarray(
+        np.where(is_known & (difference != 0) & ~np.isnan(difference), np.copysign(np.inf, difference), in_deviations)
+    )
+
+
+def is_known_and_came(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
+    """Return in which rows the law knows the value, but for rounding, and it came (rows,).
+
+    An interval about it holds all of what comes, however small the share that it claims.
+    """
+    rounding = ROUNDING * np.abs(law.mean)
+    is_known = (np.sqrt(law.variances) <= rounding[:, None]).all(axis=1)
+    return np.asarray(is_known & (np.abs(values - law.mean) <= rounding))
 
 
 def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return the log density (rows,) of the values, in nats; larger is better.
 
-    The largest term is taken out of the sum, so that not every exponential is 0. LOG_TURN: log(2 pi).
+    The largest term is taken out of the sum, so that not every exponential is 0. Of what is known exactly (variance 0)
+    the density is infinite where it came, and 0 elsewhere. LOG_TURN: log(2 pi).
     """
-    squares = (values[:, None] - law.means) ** 2 / law.variances
-    with np.errstate(divide="ignore"):  # a part may have weight 0
-        log_weights = np.log(law.weights)
-    log_terms = log_weights - (squares + np.log(law.variances) + LOG_TURN) / 2
+    squares = _standardise(values[:, None] - law.means, law.variances) ** 2
+    with np.errstate(divide="ignore"):  # a part may have weight 0, or variance 0
+        log_weights, log_variances = np.log(law.weights), np.log(law.variances)
+    # An infinite square is no density, however small the variance.
+    log_terms = log_weights - (squares + np.where(np.isinf(squares), 0.0, log_variances) + LOG_TURN) / 2
     largest = log_terms.max(axis=1)
-    return np.asarray(largest + np.log(np.sum(np.exp(log_terms - largest[:, None]), axis=1)))
+    finite = np.where(np.isinf(largest), 0.0, largest)
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.asarray(finite + np.log(np.sum(np.exp(log_terms - finite[:, None]), axis=1)))
 
 
 def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
@@ -73,9 +101,8 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
 def _compute_mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return E|Y| = m (2 Phi(t) - 1) + 2 s phi(t) with t = m / s, for a Gaussian Y of mean m and deviation s."""
-    deviation = np.sqrt(variance)
-    t = mean / deviation
-    return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * deviation * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))
+    t = _standardise(mean, variance)
+    return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * np.sqrt(variance) * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))
 
 
 class ScoreMean(NamedTuple):
@@ -89,20 +116,53 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     """Return the mean of the values (rows,) that are not NaN, and its standard error; both NaN if there are none.
 
     Forecasts from neighbouring rows share what happens in between, so errors at horizon h are correlated over at least
-    h - 1 rows. The squared error is n^-2 sum_l w_l sum_t d_t d_(t+l), with deviations d from the mean and Bartlett's
-    weights w over max(h - 1, 1.3 sqrt(n)) lags. BANDWIDTH: 1.3.
+    h - 1 rows. With deviations d from the mean and Bartlett's weights W over max(h - 1, 1.3 sqrt(n)) lags, d' W d / n^2
+    is the squared error. It is too small in short recordings, since d are deviations from the mean of these very
+    values: by E[d' W d] / 1' S 1 for errors that overlap, correlated by S = 1 - lag / h. That factor is taken off. One
+    value says nothing of its error, which is NaN. BANDWIDTH: 1.3.
 
     Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
     """
     came = ~np.isnan(values)
-    count = int(came.sum())
-    if not count:
+    n = int(came.sum())
+    if not n:
         return ScoreMean(float("nan"), float("nan"))
     mean = float(values[came].mean())
+    if n == 1 or not np.isfinite(mean):
+        return ScoreMean(mean, float("nan"))
+    lags = min(max(horizon - 1, int(BANDWIDTH * n**0.5)), len(values) - 1)
+    bartlett, overlap, one = _fall_over_lags(lags + 1), _fall_over_lags(horizon), came.astype(float)
+    # tr(M W M S), M = I - 1 1' / n, of rows that came.
+    weights_of_rows, overlaps_of_rows = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
+    shortest = min(len(bartlett), len(overlap))
+    expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])
+    total_overlap = one @ overlaps_of_rows
+    expected += (one @ weights_of_rows) * total_overlap / n**2 - 2 / n * (weights_of_rows * one) @ overlaps_of_rows
     d = np.where(came, values - mean, 0.0)
-    lags = min(max(horizon - 1, int(BANDWIDTH * count**0.5)), len(values) - 1)
-    total = d @ d
-    for lag in range(1, lags + 1):
-        bartlett_weight = 1 - lag / (lags + 1)
-        total += 2 * bartlett_weight * (d[lag:] @ d[:-lag])
-    return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / count))
+    total = d @ _weigh_neighbours(d, bartlett) * total_overlap / expected
+    return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / n))
+
+
+def average_coverage(is_inside: np.ndarray, horizon: int, level: float) -> ScoreMean:
+    """Return the mean of what is 1 inside an interval of probability `level`, 0 outside, and NaN where nothing came.
+
+    Its standard error is at least that of an interval that holds what it claims: where all or none were inside, their
+    scatter would say 0.
+    """
+    share, error = average_overlapping(is_inside, horizon)
+    came = (~np.isnan(is_inside)).astype(float)
+    overlap = came @ _weigh_neighbours(came, _fall_over_lags(horizon))
+    if not overlap:
+        return ScoreMean(share, error)
+    return ScoreMean(share, float(np.fmax(error, np.sqrt(level * (1 - level) * overlap) / came.sum())))
+
+
+def _fall_over_lags(count: int) -> np.ndarray:
+    """Return 1 - lag / count of the lags 0 to count - 1."""
+    return np.asarray(1 - np.arange(count) / count)
+
+
+def _weigh_neighbours(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return at each row the sum of its neighbours' values (rows,), weighted by their distance: `weights[distance]`."""
+    kernel, reach = np.concatenate([weights[:0:-1], weights]), len(weights) - 1
+    return np.asarray(np.convolve(values, kernel)[reach : reach + len(values)])

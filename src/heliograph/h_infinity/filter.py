@@ -1,6 +1,7 @@
 """H-infinity filter: gains designed for a level, run on any plant and sensor."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +11,15 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimat
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.error_system import GrowthSystem
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import WITHOUT_ATTITUDE
 from heliograph.model.sensor import AnySensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
+
+ROUNDING = 1e-9  # relative difference of two transitions that are the same, written in other ways
 
 
 class PendingCorrection(NamedTuple):
@@ -93,8 +96,9 @@ def h_infinity_filter(
     """Return the H-infinity filter with designed gains, over the steps of the system.
 
     Args:
-        plant: the plant, n states, whose transition must be the system's A x + f(x).
-        sensor: its sensor, without angles.
+        plant: the plant, n states, whose transition must be the system's A x + f(x): into row k + 1 that of its step k,
+            so that a plant that varies is an `OverTime` of the system's matrices behind any first one.
+        sensor: its sensor, without angles, the system's C x + h(x) of the same step.
         system: the error system, with the moments of the channel that the filter assumes (`growth_system`).
         design: a feasible design of gains (`recursive_design`).
         initial_mean: initial estimate (n,); the plant's initial mean by default.
@@ -102,7 +106,8 @@ def h_infinity_filter(
     Claim: "none" for a covariance; `certify_level` checks the level that it does guarantee.
 
     Raises:
-        ValueError: a design that is not feasible, or a plant, sensor and system that do not fit.
+        ValueError: a design that is not feasible, or a plant, sensor and system that do not fit: by their sizes, or, of
+            models without inputs, by a change of one state that the growth constants do not allow.
 
     Source: H-infinity fusion over amplify-and-forward relays, equation (6).
     """
@@ -113,6 +118,7 @@ def h_infinity_filter(
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
     _check_sizes(plant, sensor, system, design)
+    _check_models(plant, sensor, system)
     plant_0, outputs = first(plant), system.output.shape[1]
     shape = (system.states,)
     mean = plant_0.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, shape)
@@ -143,3 +149,57 @@ def _check_sizes(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, desig
     refuse_angles("H-infinity filter", plant, sensor)
     if len(first(sensor).outputs) != outputs:
         raise fail("sensor", f"the system's {outputs} outputs", len(first(sensor).outputs))
+
+
+def _check_models(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem) -> None:
+    """Raise ValueError if plant or sensor is seen not to be the system's: no level holds of another one.
+
+    By each unit vector x: |f(x) - f(0) - A x| <= a |x| of the plant's transition into row k + 1, the system's A and
+    a of step k, and likewise of what is measured in row k. Models with inputs, which are not known, are passed over.
+    """
+    if first(plant).inputs or first(sensor).inputs:
+        return
+    rows = min(system.steps, steps_covered((plant, sensor)) or system.steps)
+    moved = _list_changes(plant, lambda of_step: lambda x: of_step.transition(x, jnp.zeros(0)), system.states)
+    shown = _list_changes(sensor, lambda of_step: of_step.measure, system.states)
+    for k in range(rows):
+        if k + 1 < rows:
+            expected = f"A x + f(x) of the system's step {k}, which leads to it"
+            _compare(f"plant in row {k + 1}", expected, moved(k + 1), system.transition[k], system.growth.error[k])
+        expected = f"C x + h(x) of the system's step {k}"
+        _compare(f"sensor in row {k}", expected, shown(k), system.output[k], system.output_growth.error[k])
+
+
+def _list_changes(
+    model: AnyPlant | AnySensor, choose: Callable[[Any], Callable[[jax.Array], jax.Array]], n: int
+) -> Callable[[int], Float[np.ndarray, "_ n"]]:
+    """Return a function of a step that gives f(x) - f(0) of the model at all unit vectors x, one in each column.
+
+    `choose`: from the model of a step its function f. `n`: number of states.
+    """
+
+    def compute(k: int) -> Float[np.ndarray, "_ n"]:
+        """Return the changes of the model of step k."""
+        f = choose(at(model, k))
+        with jax.enable_x64(True):
+            return np.asarray(jax.vmap(f)(jnp.eye(n)) - f(jnp.zeros(n))).T
+
+    if isinstance(model, OverTime):
+        return compute
+    same = compute(0)
+    return lambda k: same
+
+
+def _compare(
+    name: str, expected: str, changes: Float[np.ndarray, "_ n"], matrix: Float[np.ndarray, "_ n"], growth: float
+) -> None:
+    """Raise ValueError if a change of one state by 1 differs from the matrix's by more than the growth constant allows.
+
+    ROUNDING: the difference, relative to the change, that counts as rounding.
+    """
+    difference = np.linalg.norm(changes - matrix, axis=0)
+    allowed = float(growth) * (1 + ROUNDING) + ROUNDING * np.linalg.norm(matrix, axis=0)
+    if np.any(difference > allowed):
+        i = int(np.argmax(difference - allowed))
+        got = f"{difference[i]:.3g} from it where state {i} changes by 1, the growth constant being {float(growth):.3g}"
+        raise fail(name, expected, got)

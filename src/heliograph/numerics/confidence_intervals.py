@@ -1,4 +1,4 @@
-"""Shares that were counted, and of values correlated in time their independent number and the error of their mean."""
+"""Shares that were counted, and of values correlated in time their correlation and the error of their mean."""
 
 from typing import NamedTuple
 
@@ -70,6 +70,32 @@ def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     width = int(np.ceil(len(values) ** (1 / 3))) + 1
     moving_sums = np.convolve(deviations, np.ones(width))
     return mean, float(np.sqrt(np.mean(moving_sums**2) * (len(moving_sums) / width)) / count)
+
+
+def correlate_over_steps(
+    deviations: Float[np.ndarray, "series steps"], lags: int
+) -> tuple[Float[np.ndarray, " lags"], float]:
+    """Return correlations r_t over t = 1, ..., `lags` steps, and the largest standard error of one that is zero.
+
+    Of N steps n values and n_t pairs of them came: r_t = (1 - t / N) (n / n_t) sum e_k e_(k+t) / sum e_k^2, so that
+    pairs that did not come do not count as uncorrelated ones. Where all came the first factors are 1, and the error is
+    1 / sqrt(n). r_t is NaN where no pair came, or where nothing varies.
+
+    Args:
+        deviations: e, from the mean, NaN for what did not come.
+        lags: number of lags.
+    """
+    is_known = ~np.isnan(deviations)
+    e, steps, count = np.where(is_known, deviations, 0.0), deviations.shape[1], int(is_known.sum())
+    power = float(np.sum(e**2))
+    correlations, errors = np.full(lags, np.nan), [1 / np.sqrt(max(count, 1))]
+    for t in range(1, min(lags, steps - 1) + 1):
+        pairs = int(np.sum(is_known[:, :-t] & is_known[:, t:]))
+        if pairs and power > 0:
+            share = (1 - t / steps) * count / pairs
+            correlations[t - 1] = share * np.sum(e[:, :-t] * e[:, t:]) / power
+            errors.append((1 - t / steps) / np.sqrt(pairs))
+    return correlations, float(max(errors))
 
 
 def round_to(value: float, error: float) -> str:

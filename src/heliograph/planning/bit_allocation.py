@@ -1,16 +1,17 @@
 """Allocation of bits to senders' words under a total rate, for the least steady error of the filter of all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
+from heliograph.filters.linear.linear import linear_filter
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.model.words.encoder import Words
-from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.check import InputError, check_count, fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
@@ -23,6 +24,7 @@ from heliograph.simulation.node import Node
 
 MOST = 24  # bits of a word
 STEPS = 300  # of the relaxation
+ROUNDING = 1e-13  # relative decrease of the error that is rounding's
 
 
 @readable
@@ -40,6 +42,26 @@ class BitsDesign(NamedTuple):
     error: float
     bound: float
     encoders: dict[str, Words]
+
+
+def _refuse_overload(network: Network, encoders: Mapping[str, Words]) -> None:
+    """Raise ValueError if words of these senders overload in more than 1 of 1000 steps of the steady state.
+
+    Their error is not that of rounding then. The linear filter of the words judges it, from the steady law on.
+    """
+    plant = network.plant
+    assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
+    A = np.asarray(plant.matrix)
+    steady_mean = np.linalg.solve(np.eye(len(A)) - A, np.asarray(plant.noise.mean))
+    steady_covariance = solve_discrete_lyapunov(A, np.asarray(plant.noise.covariance))
+    steady = LinearPlant(A, plant.noise, steady_mean, (steady_covariance + steady_covariance.T) / 2)
+    for name, encoder in encoders.items():
+        node = network.nodes[name]
+        assert isinstance(node, Node)
+        try:
+            linear_filter(steady, node.sensor, node.channel, encoder=encoder)
+        except ValueError as error:
+            raise InputError(f"node {name!r} of a design of bits: {error}") from None
 
 
 class _PlantAndSenders(NamedTuple):
@@ -70,12 +92,14 @@ def design_bits(network: Network, total: int) -> BitsDesign:
         total: bits that all nodes together send at a step.
 
     Raises:
-        ValueError: no network of senders of words with one output each behind constant error rates, a plant that is not
-            linear or not stable, no bit.
+        ValueError: no network of senders of words with one output each behind constant error rates, a sender that
+            decides when to transmit, a plant that is not linear or not stable, a range that the steady state leaves in
+            more than 1 of 1000 steps, no bit.
 
     Source: Frank and Wolfe (1956), for the bound; the concave envelope of an S-shaped utility.
     """
-    senders = _collect_plant_and_senders(instance("network", network, Network, "a Network"))
+    instance("network", network, Network, "a Network").check_sends_each_step("design of bits")
+    senders = _collect_plant_and_senders(network)
     budget, names = check_count("total bits", total), list(network.names)
     bits = _add_bits_greedily(senders, budget)
     error = _compute_steady_error(senders, _information_of_bits(senders, bits))
@@ -85,6 +109,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
         for name, node, count in zip(names, nodes, bits, strict=True)
         if count and node.encoder is not None
     }
+    _refuse_overload(network, encoders)
     return BitsDesign(
         bits={name: int(count) for name, count in zip(names, bits, strict=True)},
         error=error,
@@ -132,8 +157,9 @@ def _compute_word_information(variance: float, encoder_range: float, gain: float
     """
     counts = np.arange(1, MOST + 1)
     step = encoder_range / (2.0**counts - 1)
-    noise = variance + step**2 / 12 * (1 + (4.0**counts - 1) * (1 / gain**2 - 1))
-    return np.concatenate([[0.0], 1 / noise])
+    # Of gain 0, bits that are flipped half of the time, a word says nothing.
+    noise = gain**2 * (variance + step**2 / 12) + step**2 / 12 * (4.0**counts - 1) * (1 - gain**2)
+    return np.concatenate([[0.0], gain**2 / noise])
 
 
 def _find_bit_gain(name: str, node: Node) -> float:
@@ -212,10 +238,11 @@ def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarra
                 tried[i] += more
                 lower = _compute_steady_error(senders, _information_of_bits(senders, tried))
                 best = max(best, ((error - lower) / more, i, more, lower))
-        decrease, sender, more, error = best
-        if decrease <= 0:
+        decrease, sender, more, lower = best
+        if decrease * more <= ROUNDING * error:
             return bits
         bits[sender] += more
+        error = lower
     return bits
 
 

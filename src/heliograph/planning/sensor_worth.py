@@ -16,6 +16,7 @@ from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, items, table
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.planning.transmitters import require_plain_senders
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -111,13 +112,13 @@ def worth_of_sensors(
         outages: for how many steps at the end of the run a node is out, by node; none by default.
         additions: nodes that are tried beside those there are, each by itself, such as one sensor at several places;
             none by default.
-        runs: number of runs, 200 by default.
+        runs: number of runs, at least 2; 200 by default.
         key: a seed, 0 by default.
         inputs: (steps, inputs), common to all runs; by default a plant without inputs is assumed.
 
     Raises:
         ValueError: a node that is not there, an outage longer than the run, an addition of a name that is taken, nodes
-            with triggers or words, relays that filter.
+            or additions with triggers or words, relays that filter, a single run.
     """
     instance("network", network, Network, "a Network")
     nodes, added = _require_plain_nodes(network), table("additions", additions or {}, "nodes")
@@ -127,10 +128,12 @@ def worth_of_sensors(
     cases = list(_list_cases([*nodes], [*added], steps, without, table("outages", outages or {}, "steps")))
     # One filter of all that is received, additions included, and one set of draws, by nodes without their own filters.
     added = {name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}
+    require_plain_senders("the additions", added)
     bare = {name: Node(node.sensor, node.channel, {}) for name, node in {**nodes, **added}.items()}
     filter_of_all = _make_filter_of_all(network, bare)
     is_exact = filter_of_all.claim == "exact"
-    drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs), key, inputs=inputs)
+    # Of fewer than two runs no spread is known.
+    drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs, 2), key, inputs=inputs)
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
     z, truth = np.concatenate([drawn.measurements[name] for name in bare], axis=-1), np.asarray(drawn.truth)
     # The error of each case, in which what is not used is NaN. The first case is that of all nodes.
@@ -155,8 +158,8 @@ def _make_error_of_case(
         complete: error with all nodes (n,); None if this is the case of all nodes.
     """
     error = np.sqrt(squares.mean(axis=0))
-    # The standard error of a root is sd(sqrt(m)) = sd(m) / (2 sqrt(m)).
-    spread = squares.std(axis=0) / np.sqrt(len(squares))
+    # The standard error of a root is sd(sqrt(m)) = sd(m) / (2 sqrt(m)). One row stands for all runs, which agree.
+    spread = squares.std(axis=0, ddof=min(1, len(squares) - 1)) / np.sqrt(len(squares))
     uncertainty = np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)
     of_all = error if complete is None else complete
     increase = np.divide(error, of_all, out=np.full_like(error, np.nan), where=of_all > 0)
@@ -170,9 +173,7 @@ def _require_plain_nodes(network: Network) -> dict[str, Node]:
     """
     if network.relays is not None or network.common is not None:
         raise fail("network", "nodes that receive sensors through channels of their own", "relays that filter")
-    for name, node in network.nodes.items():
-        if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
-            raise fail(f"node {name!r}", "a sensor that sends what it measures at each step", "a trigger or words")
+    require_plain_senders("a comparison of sensors", network.nodes)
     return {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
 
 

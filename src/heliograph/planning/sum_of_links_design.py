@@ -29,6 +29,7 @@ from heliograph.planning.transmitters import (
     amplify_transmitter,
     compute_sent_powers,
     find_free_transmitters,
+    require_plain_senders,
     transmitter_names,
 )
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -169,6 +170,7 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
     Raises:
         ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
     """
+    require_plain_senders("a design", network.nodes)
     ((name, node),) = network.nodes.items()
     error = problem.criterion
     assert isinstance(node, Node)  # by `is_sum_of_links`

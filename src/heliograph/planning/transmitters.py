@@ -21,8 +21,25 @@ from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.markov_chain_and_autoregression import find_stationary_law
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Second, SignalMoment, Visit
+from heliograph.simulation.node import Node
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
+
+
+def require_plain_senders(what: str, nodes: Mapping[str, object]) -> None:
+    """Raise ValueError unless all senders among the nodes transmit what they measure, at each step.
+
+    One with a trigger is silent at times, and one with an encoder sends words, which are rounded: what is designed for
+    numbers at each step is not true of them.
+
+    Args:
+        what: what needs such senders, for the message.
+        nodes: nodes of a network by name.
+    """
+    for name, node in nodes.items():
+        if isinstance(node, Node) and (node.trigger is not None or node.encoder is not None):
+            got = "words" if node.trigger is None else "a trigger"
+            raise fail(f"node {name!r} of {what}", "a sensor that sends what it measures at each step", got)
 
 
 def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment | None = None) -> AbstractRandomAffine:

@@ -240,11 +240,17 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
     for name, mesh in network.meshes.items():
         claim_of_mesh = find_claim_of_mesh(name, mesh, network)
         claims |= {(node, name): claim_of_mesh for node in network.mesh_nodes(name)}
-    # Where data decide what arrives, no fusion can claim more than "nominal".
-    do_data_decide = any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
+    # Where data decide what arrives, no fusion can claim more than "nominal"; nor, where words are sent, one that
+    # follows the nodes' errors by their sensors and channels. One of estimates alone claims what their filters do.
+    nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
+    do_data_decide = any(node.chosen_by_value for node in nodes)
+    is_disturbed = any(node.disturbs_what_is_sent for node in nodes)
     for name, fusion in network.fused.items():
         claim = _find_claim_of_fusion(network, fusion)
-        claims[FUSED, name] = lower_claim(claim) if do_data_decide and isinstance(fusion, Fusion) else claim
+        if isinstance(fusion, Fusion):
+            is_informed = isinstance(fusion.rule, AbstractInformedFusion)
+            claim = lower_claim(claim) if do_data_decide or (is_disturbed and is_informed) else claim
+        claims[FUSED, name] = claim
     return claims
 
 

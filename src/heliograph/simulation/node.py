@@ -129,6 +129,11 @@ class Node(Module):
         return self.trigger is not None or (self.limits is not None and self.limits.bounded)
 
     @property
+    def disturbs_what_is_sent(self) -> bool:
+        """Whether a filter gets something else than sensor and channel say: data choose it, or words stand for it."""
+        return self.chosen_by_value or self.encoder is not None
+
+    @property
     def predictor(self) -> str | None:
         """Name of the filter whose prediction the sender compares with its measurement, to decide whether to send.
 

@@ -22,6 +22,18 @@ def compares_with_prediction(filter: AbstractFilter, trigger: AbstractTrigger) -
     return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
 
 
+def refuse_words(what: str, nodes: Mapping[str, object]) -> None:
+    """Raise ValueError if a sender rounds to words, of which `what` knows nothing: it is for the numbers themselves.
+
+    Args:
+        what: what is asked for, for the message.
+        nodes: nodes of a network by name, of any kind.
+    """
+    for name, node in nodes.items():
+        if getattr(node, "encoder", None) is not None:
+            raise fail(what, "senders of the numbers themselves", f"an encoder of words at node {name!r}")
+
+
 def check_trigger(
     trigger: AbstractTrigger, sensor: AbstractSensor, channel: AbstractRandomAffine, filters: Mapping[str, object]
 ) -> None:

@@ -201,6 +201,15 @@ def test_a_law_is_a_channel_with_its_losses(learned, name):
     assert law["recover"].estimate == pytest.approx(truth, abs=0.09)
 
 
+@pytest.mark.parametrize(("fate", "lost"), [(0.0, 0.0), (1.0, 1.0)])
+def test_a_chain_that_was_never_left_is_a_channel(fate, lost):
+    """What follows the fate that never came has even odds, as for the longer chain; it was a message about NaN."""
+    law = hg.learning.learn_losses(np.full(50, fate)).laws["markov"]
+    chain = hg.random_affine.joint_modes(law.channel(hg.hop(1.0, 0.01)))
+    np.testing.assert_allclose(chain.transition, [[1 - lost, lost], [0.5, 0.5]] if not lost else [[0.5, 0.5], [0, 1]])
+    np.testing.assert_allclose(chain.initial, [1 - lost, lost], atol=1e-12)
+
+
 def test_a_drifting_rate_is_no_channel(learned):
     with pytest.raises(ValueError, match="channel with RunningRateLosses: expected a law with finitely many states"):
         learned.laws["running"].channel(hg.perfect())

@@ -81,6 +81,61 @@ def test_exact_moments_are_right_where_a_heading_is_unknown():
     np.testing.assert_allclose(np.sqrt(np.diagonal(moved.covariances[-1])[:2]), [41.65, 42.42], atol=0.1)
 
 
+def tumbling(deviation, make=hg.extended_filter):
+    """A body that sees two directions of the world to 0.05, and turns at a known rate."""
+    directions = np.array([[0.0, 0.43, -0.9], [0.0, 0.0, 1.0]])
+    plant = hg.Plant(
+        lambda x, u: hg.models.turn_attitude(x, jnp.array([0.02, 0.05, -0.03])),
+        1e-4 * np.eye(3),
+        np.zeros(3),
+        deviation**2 * np.eye(3),
+        states=["rx", "ry", "rz"],
+        attitude=["rx", "ry", "rz"],
+    )
+    seen = hg.Sensor(lambda x: (directions @ hg.models.rotation_matrix(x)).ravel(), 0.05**2 * np.eye(6))
+    return hg.Network(plant, {"n": hg.Node(seen, hg.perfect(6), {"f": make(plant, seen, hg.perfect(6))})})
+
+
+@pytest.mark.slow
+def test_an_attitude_that_is_known_too_roughly_is_said():
+    """Before data, in the rows of a recording, and sample by sample; at the +- 0.3 rad of the docs it is not."""
+    network = tumbling(1.0)
+    lines = said_before_data(network)
+    assert [line.split("; ")[0] for line in lines] == [
+        f"wide angle: 'f' of 'n' starts with {axis!r} known to +- 1 rad" for axis in ("rx", "ry", "rz")
+    ]
+    assert all("turns so wide are no Gaussian about one attitude any more" in line for line in lines)
+    nothing = np.full((3, 6), np.nan)
+    with pytest.warns(UserWarning) as said:
+        hg.run(network, {"n": nothing})
+    expected = "n/f: 'rx' is known to +- 1 rad in 3 of 3 rows, first in row 1; turns so"
+    assert sum(str(warning.message).startswith(expected) for warning in said) == 1
+    watch = hg.simulation.WideAngles(network.nodes["n"].filters["f"])
+    assert [row for row, _ in watch.said_of(np.ones((2, 3)))] == [0, 0, 0]
+    assert watch.said_of(np.ones((2, 3))) == []  # each once
+    known = tumbling(0.3)
+    assert not said_before_data(known)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hg.run(known, {"n": nothing[:1]})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [hg.extended_filter, hg.cubature_filter])
+def test_errors_of_an_attitude_that_is_known_too_roughly_are_not_as_claimed(make):
+    """Squared errors over the claim after the first row: 2 from +- 0.3 rad, 7 or 12 from 0.5, 60 or 240 from 1."""
+
+    def after_first_row(deviation):
+        network = tumbling(deviation, make)
+        record = hg.monte_carlo(network, 1, 400, key=0)
+        claimed = record.estimates["n"]["f"].covariance
+        return hg.nees(record.truth, record.estimates["n"]["f"].mean, claimed, network.plant).mean() / 3
+
+    assert after_first_row(0.3) < 3.0
+    assert after_first_row(0.5) > 5.0
+    assert after_first_row(1.0) > 40.0
+
+
 @pytest.mark.slow
 def test_what_is_known_well_enough_is_not():
     """Points of 4 states lie 2 deviations away: at 0.9 rad still before half a turn; of more than 9 states at less."""

@@ -202,8 +202,8 @@ class MarkovLosses(AbstractLossLaw):
         """
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
-            shares = self.shares()
-            return gilbert_elliott(arrives, lost, shares["fail"].estimate, shares["recover"].estimate)
+            fail, recover = (0.5 if np.isnan(share.estimate) else share.estimate for share in self.shares().values())
+            return gilbert_elliott(arrives, lost, fail, recover)
         # P(lost | past) for each past, a number whose bits are the last fates, the latest one lowest.
         total = self.counts.sum(axis=1)
         p = np.where(total > 0, self.counts[:, 1], 0.5) / np.where(total > 0, total, 1.0)

@@ -31,6 +31,7 @@ from heliograph.planning.free_numbers.reception_by_mode import (
 )
 from heliograph.planning.plant_moments import check_stable
 from heliograph.planning.sequential_quadratic_programming import DescentProblem, Evaluation
+from heliograph.planning.transmitters import require_plain_senders
 from heliograph.simulation.network import Network
 
 Build = Callable[..., Network]
@@ -292,7 +293,9 @@ class FreeNumberProblem:
             if name != YOUNG
         }
         with jax.enable_x64(True):
-            return instance("network of free numbers", self.build(**values), Network, "a Network")
+            network = instance("network of free numbers", self.build(**values), Network, "a Network")
+        require_plain_senders("a design", network.nodes)
+        return network
 
     def check_ends(self) -> None:
         """Raise ValueError if no network exists with a number near an end of its range, the others at their starts.

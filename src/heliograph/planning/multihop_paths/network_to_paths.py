@@ -17,7 +17,7 @@ from heliograph.planning.plant_moments import (
     require_design_plant,
     steady_moment_with_one,
 )
-from heliograph.planning.transmitters import compute_sent_powers
+from heliograph.planning.transmitters import compute_sent_powers, require_plain_senders
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.mixture import Mixture
@@ -87,13 +87,13 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 
 
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders that decide."""
+    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, triggers or words."""
     if network.relays is not None:
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
         raise _make_no_paths_error("nodes that share a channel (give a function of free numbers)")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    network.check_sends_each_step("design")
+    require_plain_senders("a design", nodes)
     return nodes
 
 

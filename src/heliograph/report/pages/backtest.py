@@ -8,6 +8,7 @@ import matplotlib
 import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.special import bdtr, bdtrc, ndtr
 
 from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.diagnosis.sensor_output_health import round_to
@@ -38,6 +39,18 @@ class CoverageMiss:
         """The share that was inside less the share that was claimed."""
         return self.score.coverage[self.level].value - CLAIMED[self.level]
 
+    @property
+    def chance(self) -> float:
+        """Probability that an interval which holds what it claims is off as far to this side.
+
+        Of forecasts h rows ahead one in h is independent of the others; how many are inside has a binomial law.
+        """
+        count = max(self.score.compared // self.score.horizon, 1)
+        claimed, inside = CLAIMED[self.level], self.score.coverage[self.level].value * count
+        if self.excess < 0:
+            return float(bdtr(np.ceil(inside), count, claimed))
+        return float(bdtrc(np.floor(inside) - 1, count, claimed)) if inside >= 1 else 1.0
+
     def describe(self) -> str:
         """Return in words what share of the values an interval held, and what this says of the forecast.
 
@@ -58,7 +71,12 @@ class FilterVerdict:
     misses: Sequence[CoverageMiss]
 
     def summarise(self) -> str:
-        """Return what its forecasts are worth in words: "hold", "are off", "are too sure" or "are too cautious"."""
+        """Return what its forecasts are worth in words: "hold", "are off", "are too sure" or "are too cautious".
+
+        They "are not judged" where nothing came that an interval could miss.
+        """
+        if not self.compared:
+            return "are not judged"
         if not self.misses:
             return "hold"
         if all(miss.excess < 0 for miss in self.misses):
@@ -67,6 +85,8 @@ class FilterVerdict:
 
     def describe(self) -> str:
         """Return a sentence on what the filter's forecasts are worth, with numbers and the interval furthest off."""
+        if not self.compared:
+            return f"{self.name}: nothing came that an interval could miss."
         if not self.misses:
             return f"{self.name}: all {self.compared} intervals held what they claim, as far as chance lets tell."
         worst = max(self.misses, key=lambda miss: abs(miss.excess))
@@ -93,13 +113,17 @@ def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list
     """Return the verdict on each filter's forecast intervals, the filter with the largest share of misses first.
 
     An interval claims to hold a share (SHARES) of what comes. It misses if the share that it held is more than FAR (3)
-    standard errors off.
+    standard errors off, and if chance alone is off as far as seldom as such a distance.
     """
     verdicts = []
     for name in dict.fromkeys(f"{score.node}/{score.filter}" for score in found.scores):
-        scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
+        scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and np.isfinite(s.coverage[0].value)]
         intervals = [CoverageMiss(score, level) for score in scores for level in range(len(SHARES))]
-        misses = [miss for miss in intervals if abs(miss.excess) > FAR * miss.score.coverage[miss.level].error]
+        misses = [
+            miss
+            for miss in intervals
+            if abs(miss.excess) > FAR * miss.score.coverage[miss.level].error and miss.chance < ndtr(-FAR)
+        ]
         verdicts.append(FilterVerdict(name, len(intervals), misses))
     return sorted(verdicts, key=lambda verdict: len(verdict.misses) / max(verdict.compared, 1), reverse=True)
 
@@ -198,7 +222,7 @@ def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",
          round_to(s.rmse, s.mse.error / (2 * s.rmse) if s.rmse > 0 else np.nan),
          round_to(s.bias.value, s.bias.error),
-         *(f"{share.value:.1%} ± {share.error:.1%}" for share in s.coverage),
+         *("–" if np.isnan(share.value) else f"{share.value:.1%} ± {share.error:.1%}" for share in s.coverage),
          round_to(s.log_score.value, s.log_score.error), round_to(s.crps.value, s.crps.error)]
         for s in found.scores
     ]  # fmt: skip

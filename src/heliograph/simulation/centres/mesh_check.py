@@ -100,13 +100,14 @@ def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
 
     `name`: the name of `fusion`, a fusion between neighbours, in the network. The claim is weaker if laws are known
     only up to a radius, if weights are frozen means over losses, or if data decide what arrives. Data decide if a
-    sender chooses by what it measured, limits refuse values, or a quantizer saturates.
+    sender chooses by what it measured, limits refuse values, or a quantizer saturates; so it is with words, whose
+    rounding no weight knows.
     """
     claim_of_errors = find_claim_of_errors(name, fusion, network)
     nodes = [network.nodes[node] for node in network.mesh_nodes(name)]
     senders = [node for node in nodes if isinstance(node, Node)]
-    do_data_decide = fusion.quantizer is not None or any(sender.chosen_by_value for sender in senders)
-    if do_data_decide or isinstance(fusion.rule, FrozenWeights):
+    is_disturbed = fusion.quantizer is not None or any(sender.disturbs_what_is_sent for sender in senders)
+    if is_disturbed or isinstance(fusion.rule, FrozenWeights):
         return weakest([claim_of_errors, "nominal"])
     return claim_of_errors if fusion.rule.needs_joint else weakest([claim_of_errors, "upper"])
 

@@ -1,6 +1,7 @@
-"""Doubts about angles: one that is known no better than a good part of the circle, and degrees among radians."""
+"""Doubts about angles and attitudes that are known no better than a good part of a turn, and about degrees."""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,11 @@ from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.record import Record
 
 WIDE = 1.0  # rad: a Gaussian of this deviation has E cos = 0.61, and what lies beyond pi is not on the circle any more
+# rad: a body that is turned by so much about each axis. Two directions measured to 0.05 leave the errors of an extended
+# filter 12, of a cubature filter 7 times the variance that they claim, after one row; one direction 4 and 3 for ever.
+WIDE_ATTITUDE = 0.5
 REMEDY = "on the circle that is no Gaussian any more: start from an angle that data show"
+REMEDY_OF_ATTITUDE = "turns so wide are no Gaussian about one attitude any more: start from one that data show"
 
 
 def find_largest_usable_deviation(filter: AbstractFilter) -> float:
@@ -43,35 +48,55 @@ def find_largest_usable_deviation(filter: AbstractFilter) -> float:
     return WIDE
 
 
+class _Usable(NamedTuple):
+    """Largest deviation (rad) of an angle or attitude at which a filter can use it, and what to do beyond it."""
+
+    deviation: float
+    remedy: str
+
+
+def _list_usable_deviations(filter: AbstractFilter) -> dict[int, _Usable]:
+    """Return by its place each state of a filter that is an angle or part of an attitude, and what the filter can use.
+
+    There is none where the filter claims no covariance, or does not say which states are angles.
+    """
+    used = filter.angles_used()
+    if used is None or filter.claim == "none":
+        return {}
+    angle = _Usable(find_largest_usable_deviation(filter), REMEDY) if used.states else None
+    attitude = _Usable(WIDE_ATTITUDE, REMEDY_OF_ATTITUDE)
+    return {**({i: angle for i in used.states} if angle else {}), **{i: attitude for i in filter.attitude}}
+
+
 def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
-    """Yield a line for each angle whose standard deviation at the start is larger than the filter can use."""
-    nodes_by_angle: dict[tuple[str, str, float], list[str]] = {}
+    """Yield a line for each angle, and each axis of an attitude, that starts wider than the filter can use."""
+    nodes_by_angle: dict[tuple[str, str, float, str], list[str]] = {}
     for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(filter.estimate(filter.init()).covariance)
-        for name, deviation in _yield_deviations(network, filter, covariance):
-            if deviation > find_largest_usable_deviation(filter):
-                nodes_by_angle.setdefault((name, label, float(deviation)), []).append(node)
-    for (name, label, deviation_at_start), nodes in nodes_by_angle.items():
+        for name, deviation, usable in _yield_deviations(network, filter, covariance):
+            if deviation > usable.deviation:
+                nodes_by_angle.setdefault((name, label, float(deviation), usable.remedy), []).append(node)
+    for (name, label, deviation_at_start, remedy), nodes in nodes_by_angle.items():
         first_nodes = ", ".join(map(repr, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
         known = f"{name!r} known to +- {deviation_at_start:.2g} rad"
-        yield f"wide angle: {label!r} of {first_nodes} starts with {known}; {REMEDY}"
+        yield f"wide angle: {label!r} of {first_nodes} starts with {known}; {remedy}"
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each filter and angle whose standard deviation was in some row too large for the filter."""
+    """Yield a line for each filter and angle, or axis of an attitude, that was too wide in some row for the filter."""
     for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(record.estimates[node][label].covariance)
-        for name, deviation in _yield_deviations(network, filter, covariance):
-            wide = np.flatnonzero(deviation > find_largest_usable_deviation(filter))
+        for name, deviation, usable in _yield_deviations(network, filter, covariance):
+            wide = np.flatnonzero(deviation > usable.deviation)
             if wide.size:
                 finding = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
                 rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
-                yield f"{node}/{label}: {finding} {rows}; {REMEDY}"
+                yield f"{node}/{label}: {finding} {rows}; {usable.remedy}"
 
 
 @readable
 class WideAngles:
-    """Watch the variances of a filter's states, in rows of an array, for an angle known less well than it can use.
+    """Watch a filter's variances, in rows of an array, for angles and attitudes known less well than it can use.
 
     Each angle is said once, and each received one that is beyond a full turn, as degrees are. `states` and `received`
     are the names of those that are watched, by their places.
@@ -88,12 +113,12 @@ class WideAngles:
         """Name the angles among the filter's states and received numbers; find the largest deviation it can use."""
         instance("filter", filter, AbstractFilter, "a filter")
         angles = None if filter.claim == "none" else filter.angles_used()
-        self.states = {} if angles is None else {i: filter.states[i] for i in angles.states}
+        self._usable = _list_usable_deviations(filter)
+        self.states = {i: filter.states[i] for i in self._usable}
         if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
         self.received = {} if angles is None else {i: names[i] for i in angles.received}
-        self._largest_usable = find_largest_usable_deviation(filter) if self.states else np.inf
 
     def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
         """Return a row and a line for each received angle that first goes beyond a full turn (TURN) in these values.
@@ -114,16 +139,18 @@ class WideAngles:
         """
         doubts = []
         for i in list(self.states):
-            rows_of_wide = np.flatnonzero(variances[:, i] > self._largest_usable**2)
+            usable = self._usable[i]
+            rows_of_wide = np.flatnonzero(variances[:, i] > usable.deviation**2)
             if rows_of_wide.size:
                 finding = f"{self.states.pop(i)!r} is known to +- {variances[rows_of_wide[0], i] ** 0.5:.2g} rad"
-                doubts.append((int(rows_of_wide[0]), f"{finding}; {REMEDY}"))
+                doubts.append((int(rows_of_wide[0]), f"{finding}; {usable.remedy}"))
         return doubts
 
 
 def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
-    """Yield (node, name, filter) of each filter that has angles; the node of central filters is FUSED."""
-    if not first(network.plant).circular:
+    """Yield (node, name, filter) of each filter that has angles or attitudes; the node of central ones is FUSED."""
+    plant = first(network.plant)
+    if not plant.circular and not plant.attitude:
         return
     for node, network_node in network.nodes.items():
         yield from ((node, label, filter) for label, filter in network_node.filters.items() if filter.angles_used())
@@ -134,13 +161,13 @@ def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, Abs
 
 def _yield_deviations(
     network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
-) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
-    """Yield the name and the standard deviation (radians) of each angle of a filter that claims this covariance."""
-    used = filter.angles_used()
-    if used is None or filter.claim == "none":
-        return
-    for i in used.states:
-        yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
+) -> Iterator[tuple[str, Float[np.ndarray, "*steps"], _Usable]]:
+    """Yield the name of each angle or axis of an attitude, its standard deviation (rad), and what the filter can use.
+
+    `covariance` is that which the filter claims.
+    """
+    for i, usable in _list_usable_deviations(filter).items():
+        yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0)), usable
 
 
 def doubt_degrees_at_start(network: Network) -> Iterator[str]:

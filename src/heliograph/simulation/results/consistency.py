@@ -13,6 +13,7 @@ from heliograph.model.plant import AnyPlant, read_manifold
 from heliograph.model.sensor import AnySensor, angles_of_outputs
 from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar, standard_deviations
+from heliograph.numerics.confidence_intervals import correlate_over_steps
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -35,7 +36,8 @@ class Consistency:
         intervals: (low, high) of each step's mean over the runs (steps, 2), whose independence does not rest on the
             steps'.
         autocorrelation: of the values over 1, 2, ... steps (lags,): near 0 for the NIS of a filter that uses all that
-            it receives; the NEES of one run is always correlated, and its interval then too narrow.
+            it receives; the NEES of one run is always correlated, and its interval then too narrow. NaN where no two
+            values are so far apart, or all are equal.
         autocorrelation_bound: half-width of the interval about 0 that holds each of them with the confidence.
     """
 
@@ -213,8 +215,8 @@ def consistency(
     ends = _bound_mean(degrees.sum(), present.sum(), quantiles)
     ends_by_step = np.stack([_bound_mean(d, c, quantiles) for d, c in zip(degrees.sum(axis=0), count, strict=True)])
     # Correlation over the steps of deviations from the mean of all.
-    deviations = np.where(present, rows - filled.sum() / present.sum(), 0.0)
-    correlation = _correlate_over_steps(deviations, min(check_count("lags", lags), len(count) - 1))
+    deviations = rows - filled.sum() / present.sum()
+    correlation, error = correlate_over_steps(deviations, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
         mean=float(filled.sum() / present.sum()),
         expected=float(degrees.sum() / present.sum()),
@@ -222,7 +224,7 @@ def consistency(
         means=by_step,
         intervals=ends_by_step,
         autocorrelation=correlation,
-        autocorrelation_bound=float(scipy.special.ndtri(quantiles[1]) / np.sqrt(present.sum())),
+        autocorrelation_bound=float(scipy.special.ndtri(quantiles[1])) * error,
     )
 
 
@@ -246,13 +248,3 @@ def _broadcast_degrees(
 def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
     """Return quantiles of the mean of `count` chi-squared values with so many degrees of freedom in all."""
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
-
-
-def _correlate_over_steps(deviations: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
-    """Return the correlations over 1, 2, ..., `lags` steps of values whose deviations from the mean are given.
-
-    Missing values have deviation 0, and so add nothing.
-    """
-    power = np.sum(deviations**2)
-    products = [np.sum(deviations[:, :-t] * deviations[:, t:]) for t in range(1, lags + 1)]
-    return np.asarray([product / power if power > 0 else 0.0 for product in products])
