@@ -20,16 +20,22 @@ from heliograph.filters.event.gaussian_sum import (
     log_total_weight,
     merge_groups,
     reduce_to_count,
+    restore_if_impossible,
 )
 from heliograph.filters.event.joint_gaussian import (
     LinkMoments,
     augment_by_signal,
     condition_parts_on_received,
-    predict_received,
+    predict_sent_value,
     predict_with_reference,
     set_known_components,
 )
-from heliograph.filters.event.sender_status_probabilities import SilenceByCause, status_after_sending
+from heliograph.filters.event.sender_status_probabilities import (
+    SilenceByCause,
+    append_losses,
+    split_by_obligation,
+    status_after_sending,
+)
 from heliograph.filters.event.silent_region import SilentRegion
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
@@ -48,11 +54,12 @@ COUNTED = 16  # lost transmissions that are counted; more are as many
 
 
 class EventFilter(AbstractSizedFilter):
-    """The Gaussian sum of `event_filter`.
+    """The Gaussian sum of `event_filter`: each Gaussian is over (x, r), the plant's state and the senders' reference.
 
-    known: parts of the interval in which y - r lay last, one Gaussian each; lost: Gaussians whose reference is a value
-    that was lost; loses: transmissions may be lost; delivers: what arrives is y itself; alike: what arrives has the
-    same law in every mode; outputs: length of y; ages: numbers of steps since the last transmission that labels count.
+    A sender transmits its signal y if |y - r| > delta. known: pieces of that interval, one Gaussian for each piece in
+    which y - r lay last; lost: Gaussians whose reference is a value that was lost; loses: transmissions may be lost;
+    delivers: what arrives is y itself; alike: what arrives has the same law in every mode of the link; outputs: length
+    of y; ages: the largest number of steps since a transmission that is counted, plus 1.
     """
 
     plant: AnyPlant
@@ -101,50 +108,62 @@ class EventFilter(AbstractSizedFilter):
         x = from_covariance(start.initial_mean, start.initial_covariance)
         known_reference = WeightedColumns(np.eye(m), jnp.zeros(m))
         joint = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), known_reference)  # r = 0
+        # Probabilities of each sender's status: link mode, steps since it sent, transmissions lost (S, M, A, C).
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
         prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], joint), label[None])
+        # Before its first transmission a sender that needs a reference must send.
         has_sent = jnp.full(len(self.senders), not self.trigger.needs_reference)
         return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
 
     def _pad_sum(self, single: GaussianSum) -> GaussianSum:
-        """Return a sum of one Gaussian, padded with copies of weight zero to the filter's number of Gaussians."""
-        lost_references = self.lost if self.reference_may_be_lost else 0
-        count = self._known_reference_count + lost_references
+        """Return the one Gaussian of `single`, followed by copies of weight 0.
+
+        All steps then have as many: first those with a known reference r, then those whose r is a value that was lost.
+        """
+        count = self._known_reference_count + self.reference_may_be_lost * self.lost
         copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
         return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))
 
     @property
     def region(self) -> SilentRegion:
-        """Where y - r lies as long as a sender is silent."""
+        """The region |y - r| <= delta, of signal y and reference r, in which a sender is silent, in `known` pieces."""
         return SilentRegion(len(self.states), self.trigger, self.outputs, self.known)
 
     @property
     def _known_reference_count(self) -> int:
-        """Number of Gaussians of known reference: one for each piece inside, and outside if values may be lost."""
-        if not self.loses or self.reference_may_be_lost:
-            return self.known
-        return self.known + self.region.count_outside_parts(self.senders[0])
+        """Number of Gaussians whose reference r the filter knows.
+
+        Silence leaves one Gaussian for each of the `known` pieces of |y - r| <= delta. If a value may be lost and does
+        not become the reference, silence leaves another one for each piece of |y - r| > delta.
+        """
+        outside = self.region.count_outside_parts(self.senders[0])
+        return self.known + (outside if self.loses and not self.reference_may_be_lost else 0)
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
-        """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
+        """Predict each Gaussian of (x, r), and the probabilities of each sender's status, one step ahead.
+
+        x is the plant's state. The senders' reference r stays, or is set to the prediction of y.
+        """
         plant, u, start = at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant)
-        both = jax.vmap(lambda x: predict_with_reference(plant, self.transform, x, u, start))(state.gaussian)
+        x_and_r = jax.vmap(lambda x: predict_with_reference(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
             expected = self.predict_reference(self._merge_state(state).mean, u, k)
-            of_reference = len(self.states) + np.arange(self.outputs)
-            both = jax.vmap(lambda x: set_known_components(x, of_reference, expected))(both)
-        # The modes move from the second step on: the initial law is that of the first step.
-        rows = jnp.asarray(at(self.channel, k).transition)
-        label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
-        # Ages grow by one, but for the heartbeat's, which the last value keeps until another one is sent.
+            indices_of_r = len(self.states) + np.arange(self.outputs)
+            x_and_r = jax.vmap(lambda x: set_known_components(x, indices_of_r, expected))(x_and_r)
+        # Status of sender s in Gaussian h: link mode i (or j), age a (steps since it sent), c transmissions lost.
+        # P(mode = j) = sum_i P(mode = i) Pi_ij, but at the first step the modes have their initial law.
+        transition = jnp.asarray(at(self.channel, k).transition)
+        transition = jnp.where(state.moved, transition, jnp.eye(len(transition)))
+        status = jnp.einsum("hsiac,ij->hsjac", state.label, transition)
+        # Ages grow by one. An age that has reached the heartbeat stays there until the sender sends again.
         if self.trigger.heartbeat is not None:
-            older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
+            older = jnp.concatenate([jnp.zeros_like(status[..., :1, :]), status[..., :-1, :]], axis=-2)
             age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
-            label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
-        return EventBelief(weight=state.weight, gaussian=both, label=label, begun=state.begun, moved=jnp.asarray(True))
+            status = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, status, 0.0)
+        return EventBelief(state.weight, gaussian=x_and_r, label=status, begun=state.begun, moved=jnp.asarray(True))
 
     def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""
@@ -159,195 +178,195 @@ class EventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
-        mixture, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
-        log_likelihood, differences, covariances = jnp.zeros(()), [], []
-        # Senders one after the other, each with its value or its silence, given the senders before it.
+        mixture, has_sent, start = state.parts, state.begun, second_moments_at_start(self.plant)
+        log_likelihood, innovations, covariances = jnp.zeros(()), [], []
+        # Senders one after the other, each given those before it.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
-            lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            augmented = augment_by_signal(plant, sensor, self.transform, mixture, start)
-            arrived = jnp.any(~jnp.isnan(received))
-            after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
-            log_likelihood_of_sender = log_total_weight(after.log_weight)
+            reported_losses = losses[s] if len(losses) else jnp.asarray(jnp.nan)
+            xry = augment_by_signal(plant, sensor, self.transform, mixture, start)  # joint Gaussians of (x, r, y)
+            posterior, mean_of_value, covariance_of_value = self._condition_on_sender(
+                xry, channel, received, reported_losses, s, has_sent[s]
+            )
+            # The weights, normalised; their sum was p(what came from s | what came before).
+            log_likelihood_of_sender = log_total_weight(posterior.log_weight)
             log_likelihood += log_likelihood_of_sender
-            mixture = after.scale_weights(-log_likelihood_of_sender)
-            # From now on the sender has a reference; where it is acknowledged, once a value arrived.
-            begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
-            differences.append(received - expected)
-            covariances.append(spread)
-        innovation = Innovation(*_append_losses(jnp.concatenate(differences), covariances, losses), log_likelihood)
-        return EventBelief.from_sum(mixture, begun, state.moved), innovation
+            mixture = posterior.scale_weights(-log_likelihood_of_sender)
+            # By now the sender has a reference, or once a value arrived if it waits for an acknowledgement.
+            arrived = jnp.any(~jnp.isnan(received))
+            has_sent = has_sent.at[s].set(has_sent[s] | (arrived if self.trigger.reference == "acknowledged" else True))
+            innovations.append(received - mean_of_value)
+            covariances.append(covariance_of_value)
+        innovation = Innovation(*append_losses(jnp.concatenate(innovations), covariances, losses), log_likelihood)
+        return EventBelief.from_sum(mixture, has_sent, state.moved), innovation
 
     def _condition_on_sender(
-        self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+        self,
+        xry: GaussianSum,
+        channel: ChannelByPattern,
+        z: jax.Array,
+        losses: jax.Array,
+        s: int,
+        has_sent: jax.Array,
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition the sum over (x, r, y) on what came from sender s, a value z or nothing (z all NaN).
+        """Condition the sum on what came from sender s: a value z, or nothing (z all NaN).
 
-        Arguments as of `_condition_on_silence`, and z, the sender's part of what is received. Returns the sum over
-        (x, r), and the mean and covariance that were predicted of a value, zero where none came.
+        `xry`: Gaussians of the plant's state x, the senders' reference r and their signal y. `losses`: losses
+        reported by the sender, NaN if none are. `has_sent`: whether the sender has a reference to compare y with.
+        Returns the sum over (x, r), and the predicted mean and covariance of a value, 0 where none came.
         """
 
-        def update_by_silence(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
+        def update_by_silence(xry: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
             """Return the sum given silence of sender s; no value is expected, so zeros as its mean and covariance."""
-            after = self._condition_on_silence(augmented, channel, lost, s, begun)
-            return after, jnp.zeros_like(z), jnp.zeros((len(z), len(z)))
+            posterior = self._condition_on_silence(xry, channel, losses, s, has_sent)
+            return posterior, jnp.zeros_like(z), jnp.zeros((len(z), len(z)))
 
-        def update_by_value(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
+        def update_by_value(xry: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
             """Return the sum given the value z of sender s, and the value's predicted mean and covariance."""
-            return self._condition_on_value(augmented, channel, z, lost, s, begun)
+            return self._condition_on_value(xry, channel, z, losses, s, has_sent)
 
-        used: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(
-            jnp.any(~jnp.isnan(z)), update_by_value, update_by_silence, augmented
+        corrected: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(
+            jnp.any(~jnp.isnan(z)), update_by_value, update_by_silence, xry
         )
-        return used
+        return corrected
 
     def _condition_on_silence(
-        self, augmented: GaussianSum, channel: ChannelByPattern, lost: jax.Array, s: int, begun: jax.Array
+        self, xry: GaussianSum, channel: ChannelByPattern, losses: jax.Array, s: int, has_sent: jax.Array
     ) -> GaussianSum:
-        """Condition the sum on silence: nothing was sent, or it was sent and lost.
+        """Return the sum over (x, r) given silence of sender s: it sent nothing, or what it sent was lost.
 
         Args:
-            augmented: law of (x, r, y), r what the sender compares y with.
+            xry: Gaussians of the plant's state x, the senders' reference r and their signal y.
             channel: the link, by mode.
-            lost: whether the receiver was told of a loss, or how many; NaN where it was not.
+            losses: 1 if the sender reports that its value was lost, 0 if none was; NaN if nothing is reported.
             s: number of the sender.
-            begun: whether the sender has something to compare with.
-
-        Returns:
-            The sum of (x, r), y taken off: first the Gaussians with a known reference, then those whose reference was
-            lost.
+            has_sent: whether the sender has a reference to compare y with.
         """
-        # Why it may be silent, as labels (K, M, A, C) of each Gaussian: link mode, steps since the last transmission,
-        # transmissions lost.
-        unsent, due = self._split_label_by_sending(augmented.label[:, s], begun)
-        loss = self._loss_probability(channel, s)[:, None, None]
-        dropped, forced = (status_after_sending(sent * loss, is_lost=True) for sent in (unsent, due))
-        if self.trigger.losses == "known":  # told of a loss: it was sent; told of none: it was not
-            unsent = jnp.where(lost > 0, 0.0, unsent)
-            dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
+        # Probabilities (K, M, A, C) of the status (link mode, steps since sent, losses) and of a cause of silence:
+        #   unsent: y was not sent;  dropped: y was sent by the rule |y - r| > delta, and lost;
+        #   forced: y had to be sent wherever it lay (first value or heartbeat), and was lost.
+        unsent, must_send = split_by_obligation(xry.label[:, s], has_sent, self.trigger.heartbeat)
+        loss_probability = self._loss_probability(channel, s)[:, None, None]
+        dropped, forced = (
+            status_after_sending(status * loss_probability, is_lost=True) for status in (unsent, must_send)
+        )
+        if self.trigger.losses == "known":  # a reported loss says that y was sent, and no loss that it was not
+            unsent = jnp.where(losses > 0, 0.0, unsent)
+            dropped, forced = (jnp.where(losses > 0, status, 0.0) for status in (dropped, forced))
         truncate = (
             self._truncate_with_lost_references if self.reference_may_be_lost else self._truncate_with_known_reference
         )
-        return self._restore_if_impossible(truncate(augmented, s, SilenceByCause(unsent, dropped, forced)), augmented)
+        return restore_if_impossible(truncate(xry, s, SilenceByCause(unsent, dropped, forced)), xry)
 
-    def _truncate_with_known_reference(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
+    def _truncate_with_known_reference(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, where its reference r is known.
 
-        The sender sends y if |y - r| > delta. So every Gaussian is cut to each piece of |y - r| <= delta. If values may
-        be lost, it is also cut to each piece of |y - r| > delta. Then the Gaussians of each piece are joined.
+        The sender sends y if |y - r| > delta. So each Gaussian of (x, r, y) is cut to the pieces of |y - r| <= delta
+        and, if values may be lost, to those of |y - r| > delta. The Gaussians in one piece are merged. `by_cause`:
+        probabilities of each Gaussian's sender status, jointly with each cause of silence.
         """
-        sender, state_and_reference = self.senders[s], np.arange(len(self.states) + self.outputs)
-        inside = augmented.relabel_sender(s, labels.unsent + labels.forced if self.loses else labels.unsent)
-        pieces, _ = self.region.truncate_inside(inside, inside.select_range(0, 0), sender)  # an empty sum beside it
+        sender, x_and_r = self.senders[s], np.arange(len(self.states) + self.outputs)
+        # |y - r| <= delta: it was not sent, or it had to be sent nevertheless and was lost.
+        inside = xry.relabel_sender(s, by_cause.unsent + by_cause.forced if self.loses else by_cause.unsent)
+        no_lost_references = inside.select_range(0, 0)
+        pieces, _ = self.region.truncate_inside(inside, no_lost_references, sender)
         if self.loses:
-            sent = augmented.relabel_sender(s, labels.dropped + labels.forced)
+            # |y - r| > delta: it was sent and lost.
+            sent = xry.relabel_sender(s, by_cause.dropped + by_cause.forced)
             outside = self.region.truncate_outside(sent, sender, scale=1.0)
             pieces = concatenate_sums([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
-        return pieces.select_components(state_and_reference)
+        return pieces.select_components(x_and_r)
 
-    def _truncate_with_lost_references(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
-        """Return the sum over (x, r) given silence of sender s, where a value that was lost is the next reference.
+    def _truncate_with_lost_references(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
+        """Return the sum over (x, r) given silence of sender s, if a value y that was lost is its next reference r.
 
-        First the Gaussians of known reference, joined piece by piece, then at most `lost` whose reference was lost.
-        `augmented`: the sum over (x, r, y), the first `known` of them with a known reference r.
+        `xry`: Gaussians of (x, r, y), the first `known` with a reference that the filter knows. `by_cause`:
+        probabilities of each Gaussian's sender status, jointly with each cause of silence. Returned are `known`
+        Gaussians with a known reference, one for each piece of |y - r| <= delta, then `lost` with a lost one.
         """
         n, sender = len(self.states), self.senders[s]
-        state_and_reference = np.arange(n + self.outputs)
-        # Not sent: the reference as it was.
-        unsent = augmented.relabel_sender(s, labels.unsent)
-        known, others = self.region.truncate_inside(
+        x_and_r = np.arange(n + self.outputs)
+        # Not sent: |y - r| <= delta, and r stays.
+        unsent = xry.relabel_sender(s, by_cause.unsent)
+        known, lost_before = self.region.truncate_inside(
             unsent.select_range(0, self.known), unsent.select_range(self.known), sender
         )
-        # Sent and lost: y is the new reference, outside of the region, or anywhere where a heartbeat was due.
+        # Sent by the rule and lost: |y - r| > delta. Forced and lost: y anywhere. In both cases y is the new r.
         outside = merge_groups(
-            self.region.truncate_outside(augmented.relabel_sender(s, labels.dropped), sender, 1.0),
+            self.region.truncate_outside(xry.relabel_sender(s, by_cause.dropped), sender, 1.0),
             self.region.count_outside_parts(sender),
         )
-        anywhere = merge_groups(augmented.relabel_sender(s, labels.forced))
-        fresh = concatenate_sums([outside, anywhere]).select_components(self._find_new_reference(sender))
-        # Of all with a lost reference the pairs nearest in r are joined.
-        few = reduce_to_count(
-            concatenate_sums([others.select_components(state_and_reference), fresh]),
+        anywhere = merge_groups(xry.relabel_sender(s, by_cause.forced))
+        lost_now = concatenate_sums([outside, anywhere]).select_components(self._find_new_reference(sender))
+        # Of all Gaussians with a lost reference, those nearest in r are merged until `lost` remain.
+        few_lost = reduce_to_count(
+            concatenate_sums([lost_before.select_components(x_and_r), lost_now]),
             self.lost,
             slice(n + sender.start, n + sender.stop),
         )
-        return concatenate_sums([known.select_components(state_and_reference), few])
+        return concatenate_sums([known.select_components(x_and_r), few_lost])
 
     def _condition_on_value(
-        self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+        self,
+        xry: GaussianSum,
+        channel: ChannelByPattern,
+        z: jax.Array,
+        losses: jax.Array,
+        s: int,
+        has_sent: jax.Array,
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition on a value z: a Kalman update of each Gaussian, weighed by its density and by why it was sent.
+        """Return the sum over (x, r) given a value z of sender s, and the predicted mean and covariance of z.
 
-        Returns the sum over (x, r), one Gaussian padded with others of no weight, and the mean and covariance predicted
-        of a value that comes; arguments as of `_condition_on_silence`.
+        Each Gaussian of `xry`, over (x, r, y), gets a Kalman update, is cut to where the sender sends, and all are
+        merged. `losses`: number of losses that the sender reports, NaN if none; `has_sent`: it has a reference r.
         """
-        # Probability that this pattern of values arrives, by mode of the link: the first axis of a Gaussian's label.
+        # Status probabilities (K, M, A, C), by link mode, steps since sent and losses, times P(z's pattern | mode).
         sender, arrived = self.senders[s], ~jnp.isnan(z)
         pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
         kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
         chance = jnp.asarray(channel.chance)[:, kind]
-        arrives = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
-        label = augmented.label[:, s] * arrives[:, None, None]
+        arrival_probability = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
+        status = xry.label[:, s] * arrival_probability[:, None, None]
         if self.trigger.losses == "numbered":  # the sender's counter says how many were lost before
-            number = jnp.clip(jnp.where(jnp.isnan(lost), 0.0, lost).astype(int), 0, COUNTED - 1)
-            label = label * (jnp.isnan(lost) | (jnp.arange(COUNTED) == number))
-        # For each mode the Gaussians before the value and updated by it; for all modes at once where their law is one.
-        updated, before, links = [], [], []
-        for j in range(1 if self.alike else label.shape[1]):
-            label_of_mode = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
+            number = jnp.clip(jnp.where(jnp.isnan(losses), 0.0, losses).astype(int), 0, COUNTED - 1)
+            status = status * (jnp.isnan(losses) | (jnp.arange(COUNTED) == number))
+        # The Gaussians before z and updated by z, for each mode, or once if all modes have the same law.
+        updated, prior, links = [], [], []
+        for j in range(1 if self.alike else status.shape[1]):
+            status_of_mode = status if self.alike else jnp.zeros_like(status).at[:, j].set(status[:, j])
             mode = jnp.argmax(chance > 0) if self.alike else j
             moments = channel.mean, channel.gain_spread, channel.noise
-            link = LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments))
-            prior = augmented.relabel_sender(s, label_of_mode)
-            links.append(link)
-            before.append(prior)
-            updated.append(condition_parts_on_received(prior, z, arrived, link, sender, self.outputs, self.delivers))
-        # Restricted to where the sender had to send. The result holds several such blocks [updated, before] one after
-        # the other, each in blocks of `size` by mode: they are sorted by mode again.
-        count, size = len(links), len(label)
-        sent = self._restrict_to_sent(concatenate_sums([*updated, *before]), s, begun)
-        pieces = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
-        by_part = [concatenate_sums(pieces[j :: 2 * count]) for j in range(2 * count)]  # all blocks' piece j together
-        sent_updated, sent_before = by_part[:count], by_part[count:]
-        # One Gaussian again, with a new reference.
+            links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
+            prior.append(xry.relabel_sender(s, status_of_mode))
+            updated.append(
+                condition_parts_on_received(prior[j], z, arrived, links[j], sender, self.outputs, self.delivers)
+            )
+        # Cut to where the sender sends: several times the blocks [updated, prior], each by mode. Sorted by mode again.
+        count, size = len(links), len(status)
+        sent = self._restrict_to_sent(concatenate_sums([*updated, *prior]), s, has_sent)
+        blocks = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
+        sorted_blocks = [concatenate_sums(blocks[j :: 2 * count]) for j in range(2 * count)]
+        sent_updated, sent_prior = sorted_blocks[:count], sorted_blocks[count:]
+        # All merged to one Gaussian of (x, y), since y is the next reference.
         merged = merge_groups(concatenate_sums(sent_updated).select_components(self._find_new_reference(sender)))
         merged = merged.relabel_sender(s, status_after_sending(merged.label[:, s], is_lost=False))
-        signal = self._predict_sent_value(sent_before, links, sender)
-        return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
+        predicted_z = predict_sent_value(sent_prior, links, sender, self.outputs)
+        return self._pad_sum(merged), predicted_z.mean[0], predicted_z.covariance[0]
 
-    def _predict_sent_value(self, sent: Sequence[GaussianSum], links: Sequence[LinkMoments], sender: slice) -> Gaussian:
-        """Return the Gaussian (1, ...) of a value that arrives, from the sums over (x, r, y) given that it is sent.
+    def _restrict_to_sent(self, xry: GaussianSum, s: int, has_sent: jax.Array) -> GaussianSum:
+        """Restrict each Gaussian of (x, r, y) to where sender s sends: |y - r| > delta, or anywhere if it must send.
 
-        `sent` and `links` hold for each mode of the link the sum over (x, r, y), and the link's moments.
+        Returns three groups in one sum: each Gaussian cut to the pieces of |y - r| > delta; each uncut, as a fallback,
+        with P(sent) = FLOOR if |y - r| > delta is less probable, else 0; each uncut where the sender must send.
         """
-        received_by_mode = []
-        for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
-            received = predict_received(sum_of_mode.gaussian, link, sender, self.outputs)
-            received_by_mode.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
-        return merge_groups(concatenate_sums(received_by_mode)).gaussian
-
-    def _restrict_to_sent(self, used: GaussianSum, s: int, has_sent: jax.Array) -> GaussianSum:
-        """Restrict each Gaussian to where sender s sends: |y - r| > delta, or anywhere at a heartbeat.
-
-        Returns one sum: the pieces of |y - r| > delta, a floor where these have no mass, and those at a heartbeat.
-        """
-        waiting, due = self._split_label_by_sending(used.label[:, s], has_sent)
-        before_event = used.relabel_sender(s, waiting)
-        outside = self.region.truncate_outside(before_event, self.senders[s], scale=1 - RIM)  # RIM: for rounding
-        log_mass_outside = jnp.max(
-            outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0
-        )
-        lowest = before_event.log_weight + np.log(FLOOR)  # FLOOR: least probability of sending, 1e-6
-        floor = before_event._replace(log_weight=jnp.where(log_mass_outside < lowest, lowest, -jnp.inf))
-        return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
-
-    def _split_label_by_sending(self, label: jax.Array, has_sent: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Split a sender's label (K, M, A, C) into parts: where |y - r| > delta decides, and where it must send."""
-        heartbeat = self.trigger.heartbeat
-        # The axis A counts steps since it sent. It must send if it never has, and at a heartbeat if there is one.
-        is_heartbeat = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
-        due = jnp.where(~has_sent | is_heartbeat, label, 0.0)
-        return label - due, due
+        by_rule, must_send = split_by_obligation(xry.label[:, s], has_sent, self.trigger.heartbeat)
+        sent_by_rule, sender = xry.relabel_sender(s, by_rule), self.senders[s]
+        # 1 - RIM: y was compared before it was rounded, and may lie inside by as much.
+        outside = self.region.truncate_outside(sent_by_rule, sender, scale=1 - RIM)
+        log_mass_outside = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(sender), -1), axis=0)
+        least = sent_by_rule.log_weight + np.log(FLOOR)
+        fallback = sent_by_rule._replace(log_weight=jnp.where(log_mass_outside < least, least, -jnp.inf))
+        return concatenate_sums([outside, fallback, xry.relabel_sender(s, must_send)])
 
     def _loss_probability(self, channel: ChannelByPattern, s: int) -> jax.Array:
         """Return the probability that what a sender transmits is lost, for each mode of the link (M,)."""
@@ -364,14 +383,6 @@ class EventFilter(AbstractSizedFilter):
             indices[n + sender.start : n + sender.stop] = np.arange(n + m + sender.start, n + m + sender.stop)
         return indices
 
-    def _restore_if_impossible(self, mixture: GaussianSum, before: GaussianSum) -> GaussianSum:
-        """Return the updated sum, or the sum `before` with the likelihood FLOOR (1e-6) if all updated weights are 0."""
-        unchanged = before.select_components(np.arange(mixture.gaussian.mean.shape[1]))
-        unchanged = unchanged._replace(log_weight=unchanged.log_weight + np.log(FLOOR))
-        is_impossible = ~jnp.isfinite(log_total_weight(mixture.log_weight))
-        restored: GaussianSum = jax.tree.map(lambda old, new: jnp.where(is_impossible, old, new), unchanged, mixture)
-        return restored
-
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
         """Return the mean and covariance of the whole sum."""
@@ -379,7 +390,7 @@ class EventFilter(AbstractSizedFilter):
         return Estimate(merged.mean, merged.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of one Gaussian with the moments of each sum around the update."""
+        """Return the smoother step of one Gaussian, to which each sum around the update is merged by its moments."""
         return smoother_step_by_transform(self, step.map_states(self._merge_state), first(self.plant))
 
     def _merge_state(self, state: EventBelief) -> Gaussian:
@@ -387,14 +398,3 @@ class EventFilter(AbstractSizedFilter):
         stack_of_one = take_leading(merge_groups(state.parts).gaussian, len(self.states))
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], stack_of_one)
         return x
-
-
-def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Append reported losses to an innovation: known numbers have value and covariance 0, missing ones NaN."""
-    loss_values = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
-    value = jnp.concatenate([value, loss_values])
-    arrived = ~jnp.isnan(value)
-    covariance = jax.scipy.linalg.block_diag(
-        *(jnp.nan_to_num(block) for block in blocks), jnp.zeros((len(losses),) * 2)
-    )
-    return value, jnp.where(arrived[:, None] & arrived, covariance, jnp.nan)

@@ -10,10 +10,11 @@ from heliograph.filters.event.gaussian_sum import GaussianSum, safe_log
 
 
 class EventBelief(NamedTuple):
-    """The sum: Gaussians of (x, r), r the sender's reference, and labels (mode, steps since sent, number lost).
+    """A sum of H Gaussians of (x, r): x (n,) is the plant's state, r (m,) the value that the senders compare y with.
 
-    Shapes: weight (H,), the Gaussians (H, n + m), label (H, S, M, A, C) with S = 1 where y is sent as a whole, else m;
-    `begun` (S,) once there is a reference, `moved` once the chain was used.
+    `weight` (H,), `gaussian` of n + m components. `label` (H, S, M, A, C): probabilities of each sender's status given
+    the Gaussian, by link mode, steps since it sent and transmissions lost; S = 1 if y is sent as a whole, else m.
+    `begun` (S,): the sender has a reference. `moved`: a step was predicted, so the link's modes have left the first.
     """
 
     weight: jax.Array
@@ -24,7 +25,7 @@ class EventBelief(NamedTuple):
 
     @property
     def components(self) -> tuple[jax.Array, Gaussian]:
-        """Weights (H,), and the Gaussians of (x, r)."""
+        """Weights (H,), and the H Gaussians of (x, r): x is the plant's state, r the senders' reference."""
         return self.weight, self.gaussian
 
     @property
@@ -36,8 +37,8 @@ class EventBelief(NamedTuple):
     def from_sum(mixture: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """Return the state that holds a sum of Gaussians, with weights in place of their logarithms.
 
-        A stored state should be finite, which log 0 is not. `begun` is True for the senders that have sent. `moved` is
-        True once a step was predicted.
+        A stored state should be finite, which log 0 is not. `begun` (S,) is True for senders that have a reference to
+        compare with. `moved` is True once a step was predicted.
         """
         return EventBelief(
             weight=jnp.exp(mixture.log_weight), gaussian=mixture.gaussian, label=mixture.label, begun=begun, moved=moved

@@ -105,26 +105,28 @@ def event_filter(
 
 
 def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:
-    """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities.
+    """Return the law of what arrives, by mode of the channel and by pattern of arrivals, and the modes' initial law.
 
-    A pattern of arrivals says which components arrive. A channel that drifts has no finite number of modes, and is
-    refused.
+    A pattern of arrivals says which components of a message arrive. A channel whose memory drifts (a state on a
+    continuum, such as a gain that is a Gauss-Markov process) has no finite number of modes, and is refused.
     """
     drifting = [memory for memory in memories(first(channel)).values() if memory.drifts]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
-    # The receiver is told nothing of the mode: every mode has the same flag, with probability 1.
+    # Nothing of the mode is reported to the receiver: every mode has the same flag, with probability 1.
     by_pattern = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return vary_over_steps(by_pattern, channel), np.asarray(steps[0].initial)
 
 
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
-    """Return the claim of the one-Gaussian filter: "exact" if it is the posterior, else "nominal".
+    """Return what the filter of one Gaussian says its covariance is: "exact" if that of the posterior, else "nominal".
 
-    Behind a schedule (`Periodic`) it is exact if mean and covariance are those of the posterior.
+    Behind a schedule (`Periodic`) silence says nothing of x, so that the Kalman filter's conditions are enough: linear
+    models and known gains. Behind a random trigger the noise must be Gaussian too.
     """
-    steps = unstack(_describe_channel(channel)[0])
+    described, _ = _describe_channel(channel)
+    steps = unstack(described)
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
@@ -132,8 +134,8 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
     # Given silence x stays Gaussian, unless silence may also be a loss. Given a value x stays Gaussian if the value
     # determines y: then the fact that it was sent says nothing more.
     losses_are_hidden = trigger.losses == "unknown" and any(_may_lose_components(step) for step in steps)
-    determined = all(_arrival_determines_y(step) for step in steps)
-    is_exact = determined and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
+    value_determines_y = all(_arrival_determines_y(step) for step in steps)
+    is_exact = value_determines_y and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
     return "exact" if is_exact else "nominal"
 
 

@@ -50,31 +50,37 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
 
 
 def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """Return the moments at each node e_1 = radius sin(t), (node, ...), with the log of the node's share of the mass.
+    """Return the moments of e ~ N(centre, diag(variance)), inside or outside the ball |e| <= radius, at nodes of e_1.
 
-    Arguments as `ball_moments`. |e_1| <= radius at all nodes.
+    With e_1 = radius sin(t) and density p of e_1, the mass where |e_1| <= radius is the integral over t of
+
+        p(e_1) (de_1 / dt) P(the other components lie inside, or outside, the ball of radius sqrt(radius^2 - e_1^2))
+
+    At a node t, e_1 has no variance. The log mass (32,) holds the node's term of this sum, mean is (32, m) and
+    covariance (32, m, m).
     """
-    # t only where e_1 has its probability: within REACH deviations of the point of [-radius, radius] that is nearest to
-    # its mean.
-    first, deviation = centre[0], jnp.sqrt(variance[0])
-    near = jnp.clip(first, -radius, radius)
-    low, high = (jnp.arcsin(jnp.clip((near + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
-    angle = low + (high - low) * NODES
-    e = radius * jnp.sin(angle)
-    # The other components, given e_1.
-    others = jax.lax.map(lambda r: ball_moments(centre[1:], variance[1:], r, inside), radius * jnp.cos(angle))
-    # log of the node's weight in t, of de_1 / dt = radius cos(t), and of the density of e_1.
-    weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(angle) / deviation) - np.log(2 * np.pi) / 2
-    weight = weight - ((e - first) / deviation) ** 2 / 2
-    mean = jnp.concatenate([e[:, None], others.mean], axis=1)
-    covariance = jnp.zeros((len(e), *variance.shape * 2)).at[:, 1:, 1:].set(others.covariance)
+    # Integrate where e_1 has its probability: within REACH deviations of the point of [-radius, radius] that is nearest
+    # to its mean.
+    mean_1, deviation = centre[0], jnp.sqrt(variance[0])
+    nearest = jnp.clip(mean_1, -radius, radius)
+    low, high = (jnp.arcsin(jnp.clip((nearest + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
+    t = low + (high - low) * NODES
+    e_1 = radius * jnp.sin(t)
+    # The other components given e_1: sqrt(radius^2 - e_1^2) = radius cos(t).
+    others = jax.lax.map(lambda r: ball_moments(centre[1:], variance[1:], r, inside), radius * jnp.cos(t))
+    # log of (quadrature weight) (de_1 / dt) p(e_1), with de_1 / dt = radius cos(t).
+    weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(t) / deviation) - np.log(2 * np.pi) / 2
+    weight = weight - ((e_1 - mean_1) / deviation) ** 2 / 2
+    mean = jnp.concatenate([e_1[:, None], others.mean], axis=1)
+    m = len(variance)
+    covariance = jnp.zeros((len(t), m, m)).at[:, 1:, 1:].set(others.covariance)
     return BallMoments(weight + others.log_mass, mean, covariance)
 
 
 def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Array, radius: jax.Array) -> BallMoments:
-    """Append the two pieces e_1 < -radius and e_1 > radius, in which the other components may lie anywhere.
+    """Append the moments of e where e_1 < -radius and where e_1 > radius: there the other components lie anywhere.
 
-    `pieces` are the moments (piece, ...) where |e_1| <= radius. The components of e are independent.
+    `pieces` are the moments (piece, ...) of e ~ N(centre, diag(variance)) outside the ball where |e_1| <= radius.
     """
     tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
@@ -103,24 +109,25 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
 
     def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
         """Return the log probability of the region under one Gaussian, and the Gaussian cut to it."""
-        # e = V' D x: rows of its slopes, means and variances.
-        rows, centre = directions @ x.root, directions @ x.mean
-        variance, turn = eigh(WeightedColumns(rows, x.variances).covariance)
+        # x = m + L xi, so D x = D m + slopes xi; Cov(D x) = V diag(s) V' with s = `variance`, and e = V' D x.
+        slopes, centre = directions @ x.root, directions @ x.mean
+        variance, eigenvectors = eigh(WeightedColumns(slopes, x.variances).covariance)
         # Components without variance, up to rounding, stay where they are.
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
-        rows, centre = turn.T @ rows, turn.T @ centre
+        slopes, centre = eigenvectors.T @ slopes, eigenvectors.T @ centre
         variance_or_least = jnp.maximum(variance, least)
         moments = ball_moments(centre, variance_or_least, radius, inside)
         varies = (variance > least) & jnp.isfinite(moments.log_mass)
-        gain = jnp.where(varies, (x.root * x.variances) @ rows.T / variance_or_least, 0.0)
-        # x given e, without noise; then what e itself still varies in the region.
-        given, _ = condition_on_observation(x, rows, jnp.zeros(len(rows)), zero_covariance(len(rows)), varies)
+        # K = Cov(x, e) diag(s)^-1
+        gain = jnp.where(varies, (x.root * x.variances) @ slopes.T / variance_or_least, 0.0)
+        # m + K (E e - V' D m), and Cov(x | e) + K Cov(e) K'
+        given_e, _ = condition_on_observation(x, slopes, jnp.zeros(len(slopes)), zero_covariance(len(slopes)), varies)
         mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)
-        spread = eliminate(moments.covariance).through(gain)
-        return moments.log_mass, from_columns(mean, join_columns(given.columns, spread))
+        explained_by_e = eliminate(moments.covariance).through(gain)
+        return moments.log_mass, from_columns(mean, join_columns(given_e.columns, explained_by_e))
 
-    log_mass, after = jax.lax.map(truncate_one, parts.gaussian)
-    return GaussianSum(parts.log_weight + log_mass, after, parts.label)
+    log_mass, truncated = jax.lax.map(truncate_one, parts.gaussian)
+    return GaussianSum(parts.log_weight + log_mass, truncated, parts.label)
 
 
 def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:

@@ -26,7 +26,7 @@ class GaussianSum(NamedTuple):
     """Gaussians of a sum, with what is known of the sender in each.
 
     log_weight (K,), gaussian of N components with a leading axis K, label (K, senders, ...): probabilities of each
-    sender's label given the Gaussian.
+    sender's status (such as link mode, steps since it sent, transmissions lost) given the Gaussian.
     """
 
     log_weight: Float[jax.Array, " K"]
@@ -34,14 +34,14 @@ class GaussianSum(NamedTuple):
     label: Float[jax.Array, "K senders ..."]
 
     def relabel_sender(self, s: int, label: jax.Array) -> "GaussianSum":
-        """Give sender s these labels (K, ...), probabilities of its states in each of the K Gaussians.
+        """Give sender s the status probabilities `label` (K, ...), one array for each of the K Gaussians.
 
-        The labels need not sum to 1: their sum multiplies the Gaussian's weight. If the sum is 0, the old label stays.
+        They need not sum to 1: their sum multiplies the Gaussian's weight. If the sum is 0, the old ones stay.
         """
-        beside_label = (-1, *[1] * (label.ndim - 1))
+        one_per_gaussian = (-1, *[1] * (label.ndim - 1))  # shape of totals (K,) that broadcasts against `label`
         total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
-        normalised = label / jnp.where(total > 0, total, 1.0).reshape(beside_label)
-        normalised = jnp.where((total > 0).reshape(beside_label), normalised, self.label[:, s])
+        normalised = label / jnp.where(total > 0, total, 1.0).reshape(one_per_gaussian)
+        normalised = jnp.where((total > 0).reshape(one_per_gaussian), normalised, self.label[:, s])
         return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(normalised))
 
     def scale_weights(self, log_factor: Array | float) -> "GaussianSum":
@@ -90,8 +90,8 @@ def concatenate_sums(sums: Sequence[GaussianSum]) -> GaussianSum:
 @jax.jit
 def truncate_between(mixture: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
     """Truncate each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
-    row, centre = _project_on_direction(mixture, direction)
-    return _truncate(mixture, centre, row, [jnp.broadcast_to(end, centre.shape) for end in (lower, upper)])
+    slopes, mean = _project_on_direction(mixture, direction)
+    return _truncate(mixture, mean, slopes, [jnp.broadcast_to(end, mean.shape) for end in (lower, upper)])
 
 
 @jax.jit
@@ -108,14 +108,17 @@ def truncate_outside(mixture: GaussianSum, direction: jax.Array, edge: jax.Array
 
 
 def _project_on_direction(mixture: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the row f (K, N) of d'x = d'm + f xi, and d'm (K,)."""
+    """Return slopes f (K, N) and means d'm (K,) of d'x = d'm + f xi, for Gaussians x = m + L xi and a direction d."""
     return direction @ mixture.gaussian.root, mixture.gaussian.mean @ direction
 
 
-def _truncate(mixture: GaussianSum, centre: jax.Array, row: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
-    """Truncate to where d'x = centre + row xi is above the first end, and below the second if there is one."""
-    log_mass, after = truncate_gaussians(mixture.gaussian, centre, row, ends)
-    return GaussianSum(mixture.log_weight + log_mass, after, mixture.label)
+def _truncate(mixture: GaussianSum, mean: jax.Array, slopes: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
+    """Truncate Gaussians to where d'x = mean + slopes xi is above the first end, and below the second if there is one.
+
+    Each weight is multiplied by the probability of that region.
+    """
+    log_mass, truncated = truncate_gaussians(mixture.gaussian, mean, slopes, ends)
+    return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.label)
 
 
 def merge_groups(mixture: GaussianSum, groups: int = 1) -> GaussianSum:
@@ -144,6 +147,18 @@ def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
         jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), mixture)
     )
     return few
+
+
+def restore_if_impossible(mixture: GaussianSum, prior: GaussianSum) -> GaussianSum:
+    """Return the corrected sum `mixture`, or `prior` with the likelihood FLOOR (1e-6) if all corrected weights are 0.
+
+    Then the data contradict the rule of the sender. The prior may have more components, of which it keeps the leading.
+    """
+    unchanged = prior.select_components(np.arange(mixture.gaussian.mean.shape[1]))
+    unchanged = unchanged._replace(log_weight=unchanged.log_weight + np.log(FLOOR))
+    is_impossible = ~jnp.isfinite(log_total_weight(mixture.log_weight))
+    restored: GaussianSum = jax.tree.map(lambda old, new: jnp.where(is_impossible, old, new), unchanged, mixture)
+    return restored
 
 
 def reduce_to_count(mixture: GaussianSum, count: int, places: slice) -> GaussianSum:
@@ -190,10 +205,10 @@ def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int]) -> Gaussia
     def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:
         """Return `values` (K, ...) of the Gaussians after two are joined, (K - 1, ...).
 
-        `joined`, the value of the joined pair, goes to the place of the pair's first one. The last Gaussian's value
-        goes to the place of the second. The masks `is_first` and `is_second` (K,) are True at these places.
+        `joined`, the value of the joined pair, replaces the value of the pair's first Gaussian. The last Gaussian's
+        value replaces that of the second one. The masks `is_first` and `is_second` (K,) say which two these are.
         """
-        one_each = (-1, *[1] * (values.ndim - 1))  # a mask of Gaussians, beside their numbers
+        one_each = (-1, *[1] * (values.ndim - 1))  # shape of a mask (K,) that broadcasts against `values`
         with_last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)
         return jnp.where(is_first.reshape(one_each), joined, with_last_moved)[:-1]
 

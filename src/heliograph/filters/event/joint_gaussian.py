@@ -1,5 +1,6 @@
 """Joint Gaussians of state, sender's reference and measurement: predicted, augmented, conditioned on a value."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from heliograph.factors.factored_gaussian import (
     take_leading,
 )
 from heliograph.factors.repeated_measurements import triangularise_noise
-from heliograph.filters.event.gaussian_sum import GaussianSum
+from heliograph.filters.event.gaussian_sum import GaussianSum, concatenate_sums, merge_groups
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import Signal, factor_gain_noise, find_signal_moments
@@ -133,10 +134,10 @@ def condition_parts_on_received(
 def _condition_on_received(
     x: Gaussian, z: jax.Array, arrived: jax.Array, link: LinkMoments, sender: slice, m: int, delivers: bool
 ) -> tuple[Gaussian, jax.Array]:
-    """Return one Gaussian x of (state, r, y) given z = G y + n, and the log density of z.
+    """Return one Gaussian `x` of (plant's state, reference r, signal y) given z = G y + n, and the log density of z.
 
     z is what a sender's message brought, and `arrived` says which of its numbers came. `link` holds the moments of G
-    and n, `sender` the sender's components of y (m,). If `delivers`, z is y itself.
+    and n, `sender` the components of y (m,) that it sends. If `delivers`, z is y itself.
     """
     expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
     after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
@@ -162,13 +163,27 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
     return received
 
 
-def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
-    """Return the mean, the slopes and the noise of z = G y + n, with y = centre + rows xi the last m components of x.
+def predict_sent_value(sent: Sequence[GaussianSum], links: Sequence[LinkMoments], sender: slice, m: int) -> Gaussian:
+    """Return the one Gaussian, with a leading axis of length 1, of the value z = G y + n that arrives.
 
-    The slopes are E[G] rows. The noise is n and (G - E G) y, since the gain's spread about its mean acts like noise.
+    `sent`: for each mode of the link, Gaussians of (x, r, y) given that y is sent, with x the plant's state and r the
+    reference; `links`: moments of G and n in each mode; `sender`: the components that are sent of y (m,).
     """
-    centre, rows = x.mean[-m:], x.root[-m:]
+    received_by_mode = []
+    for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
+        received = predict_received(sum_of_mode.gaussian, link, sender, m)
+        received_by_mode.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
+    return merge_groups(concatenate_sums(received_by_mode)).gaussian
+
+
+def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
+    """Return the mean, the slopes and the noise of z = G y + n, where y are the last m components of x.
+
+    With x = mean + root xi, y = mean_y + slopes_y xi. So z = E[G] mean_y + E n + E[G] slopes_y xi + noise, and the
+    noise is (n - E n) + (G - E G) y: a random gain acts like noise with a covariance that depends on E[y y'].
+    """
+    mean_y, slopes_y = x.mean[-m:], x.root[-m:]
     gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n
-    second_moment = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
-    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second_moment, centre))
-    return gain @ centre + offset, gain @ rows, noise
+    second_moment = WeightedColumns(slopes_y, x.variances).covariance + outer(mean_y, mean_y)  # E[y y']
+    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second_moment, mean_y))
+    return gain @ mean_y + offset, gain @ slopes_y, noise

@@ -147,12 +147,12 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         Args:
             innovation: of the value, as if it were sent always.
-            link: mean gain and spread, as `_average_link_moments` returns.
+            link: E G (m, p) and Cov of (G, n) (m, m, p + 1, p + 1), for z = G y + n.
             signal: moments of y before the value.
             reference: r, with which the sender compares y (m,).
             log_silent: log P(silent) before the value.
         """
-        # How z's predicted moments change by it; where a component is missing nothing does, and any numbers will do.
+        # If a component is missing, the innovation stays, and any numbers may stand in for it.
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._find_moment_changes_given_sent(link, signal, reference, log_silent)
@@ -169,29 +169,35 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _mix_silence_and_outage(
         self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: ChannelByPattern, down: jax.Array
     ) -> GaussianSum:
-        """Mix the update by silence (link up) with the prior (link down), by their weights given that no value came.
+        """Return one Gaussian given that no value came: the sender was silent (link up), or the link was down.
 
-        `law`: probabilities of the modes of the link (M,); `lost`: probability in each mode that nothing arrives.
-        `down`: what the receiver is told, 1 that the link is down; empty if nothing is told.
+        It merges `silent`, the Gaussian given silence, of weight P(up) P(silent), and `prior`, of weight P(down).
+
+        Args:
+            prior: Gaussian of x before the step's data. That the link is down says nothing of x.
+            silent: a sum of one Gaussian, with weight P(silent).
+            law: probabilities of the link's M modes.
+            channel: the link, by mode and pattern of arrivals.
+            down: a flag that the receiver gets, (1,): 1 if the link is down; (0,) if it gets none.
         """
+        # P(nothing arrives | mode) (M,). A label holds P(mode, link up or down), whose sum multiplies the weight.
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
-        parts = [silent.relabel_sender(0, law[None] * (1 - lost))]
-        if self.loses:
-            parts.append(_sum_of_one_gaussian(jnp.zeros(()), prior, law).relabel_sender(0, law[None] * lost))
-        # A flag that says which of the two it was leaves one of them.
-        if len(down):
-            by_silence, *by_outage = parts
-            is_down = down[0] > 0
-            parts = [by_silence.scale_weights(jnp.where(is_down, -jnp.inf, 0.0))]
-            parts += [part.scale_weights(jnp.where(is_down, 0.0, -jnp.inf)) for part in by_outage]
-        return merge_groups(concatenate_sums(parts))
+        while_up = silent.relabel_sender(0, law[None] * (1 - lost))
+        if len(down):  # weight 0 if the flag says that the link is down
+            while_up = while_up.scale_weights(jnp.where(down[0] > 0, -jnp.inf, 0.0))
+        if not self.loses:
+            return merge_groups(while_up)
+        while_down = _sum_of_one_gaussian(jnp.zeros(()), prior, law).relabel_sender(0, law[None] * lost)
+        if len(down):  # weight 0 if the flag says that the link is up
+            while_down = while_down.scale_weights(jnp.where(down[0] > 0, 0.0, -jnp.inf))
+        return merge_groups(concatenate_sums([while_up, while_down]))
 
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the link's mean gain (m, p) and spread (m, m, p+1, p+1), given that all components arrive.
+        """Return E G (m, p), and Cov((G, n)_ik, (G, n)_jl) [i, j, k, l] (m, m, p + 1, p + 1), for z = G y + n.
 
-        The spread is that of (G, n) in z = G y + n. `law` (M,) holds the probabilities of the modes.
-        `joint_probability` (M, patterns) is that of a mode and a pattern of arrivals, 0 unless all arrives.
+        Both are averages over the M modes, of probabilities `law`, given that all components arrive.
         """
+        # P(mode, pattern of arrivals), 0 unless all components arrive.
         joint_probability = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
             jnp.tensordot(joint_probability, jnp.asarray(moment), 2) / jnp.sum(joint_probability)
@@ -202,24 +208,28 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _find_moment_changes_given_sent(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return how z's predicted mean (m,) and covariance (m, m) change given that it was sent: far from r.
+        """Return by how much the mean (m,) and covariance (m, m) of z = G y + n change given that y was sent.
 
-        Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
-        m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).
+        Let y ~ N(m, S), s = P(silent), and m + d and S_s the mean and covariance of y given silence. Law of total
+        probability: (moment of y) = s (moment given silence) + (1 - s) (moment given sent). `link`: E G, and the
+        covariance C of the entries of (G, n); `reference`: what the sender compares y with.
         """
-        (gain, spread), mean, total = link, signal.mean, signal.covariance
-        # Of y.
-        silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
+        (gain, gain_covariance), m, S = link, signal.mean, signal.covariance
+        s = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)  # so that 1 - s is not 0
         y = _law_of_signal(signal)
-        _, given_silence = self._observe_silence(y, y.root, zero_covariance(len(mean)), mean, reference)
-        d = given_silence.mean - mean
-        shift = -silent * d / (1 - silent)
-        change_about_m = (total - silent * (given_silence.covariance + jnp.outer(d, d))) / (1 - silent) - total
-        # Of z: the mean gain, and the spread, which acts on second moments of (y, 1); these change by `second`.
-        second = change_about_m + jnp.outer(mean, shift) + jnp.outer(shift, mean)
-        second = jnp.block([[second, shift[:, None]], [shift, jnp.zeros(1)]])
-        change_of_covariance = change_about_m - jnp.outer(shift, shift)
-        change = gain @ change_of_covariance @ gain.T + jnp.einsum("ijkl,kl->ij", spread, second)
+        _, given_silence = self._observe_silence(y, y.root, zero_covariance(len(m)), m, reference)
+        d = given_silence.mean - m
+        # E[y | sent] - m = -s d / (1 - s)
+        shift = -s * d / (1 - s)
+        # E[(y - m)(y - m)' | sent] - S = (S - s (S_s + d d')) / (1 - s) - S
+        change_about_m = (S - s * (given_silence.covariance + jnp.outer(d, d))) / (1 - s) - S
+        # E[y y' | sent] - E[y y'], and with it the change of the second moment of (y, 1).
+        change_of_yy = change_about_m + jnp.outer(m, shift) + jnp.outer(shift, m)
+        change_of_second_moment = jnp.block([[change_of_yy, shift[:, None]], [shift, jnp.zeros(1)]])
+        # Cov z = E[G] Cov(y) E[G]' + sum_kl C_ijkl E[(y, 1)(y, 1)']_kl
+        change_of_covariance = change_about_m - jnp.outer(shift, shift)  # Cov(y | sent) - S
+        change = gain @ change_of_covariance @ gain.T
+        change += jnp.einsum("ijkl,kl->ij", gain_covariance, change_of_second_moment)
         return gain @ shift, symmetrize(change)
 
     def _log_probability_sent(
@@ -284,12 +294,12 @@ class StochasticEventFilter(AbstractSizedFilter):
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the Gaussian around the update."""
+        """Return the smoother step from the Gaussians before and after one update."""
         return smoother_step_by_transform(self, step, first(self.plant))
 
 
 def _law_of_signal(signal: Signal) -> Gaussian:
-    """Return the Gaussian of the signal y before z: mean, slopes on the state's columns, and the noise beside them."""
+    """Return the Gaussian of the signal y = mean + slopes xi + noise, where x = m + L xi is the state before z."""
     return from_columns(signal.mean, join_columns(WeightedColumns(signal.slopes, signal.prior.variances), signal.noise))
 
 

@@ -4,10 +4,10 @@ The mean gain of a sum of links given their modes is a sum of functions of one l
 E[H | modes] = Hbar + sum_a D_a phi_a, with phi_a = 1{mode of a link = j} - P(j) for all its modes j but the first,
 D_a = H_j - H_first and Hbar = E[H]. The phi_a follow a linear recursion of their own, link by link,
 E[phi_j+ | modes] = sum_i (Pi_ij - Pi_first,j) phi_i, so that a Kalman filter of zeta = (x~, x~ phi_1, x~ phi_2, ...) is
-the best linear filter of x: 1 + sum_i (m_i - 1) parts, where the joint modes of the links are prod_i m_i.
+the best linear filter of x: 1 + sum_i (m_i - 1) blocks, where the joint modes of the links are prod_i m_i.
 
-With Gamma = E[phi phi'] of (1, phi_1, ...), which independent links make block-diagonal, all covariances are sums of
-products Gamma x E[x~ x~'], x~ = (x - c, 1) with c = E[x] before data.
+With Gamma = E[phi phi'] of phi = (1, phi_1, ...), which independent links make block-diagonal, all covariances are sums
+of Kronecker products Gamma (x) E[x~ x~'], x~ = (x - c, 1) with c = E[x] before data.
 """
 
 from collections.abc import Sequence
@@ -36,11 +36,15 @@ from heliograph.filters.modes.jump_linear_filter import (
     claim_of_modes,
     concatenate_modes,
     condition_modes_on_received,
+)
+from heliograph.filters.modes.linear_by_mode import (
+    centred_measurement,
+    centred_transition,
     covariance_of_mode,
     kron,
-    predict_by_mode,
+    multiply_by_transition,
+    pad_with_zeros,
 )
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, pad_with_zeros
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
@@ -85,17 +89,22 @@ class AdditiveModalFilter(AbstractModalFilter):
 
     @compile_on_call
     def init(self) -> AdditiveBelief:
-        """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
+        """Return the prior of zeta = phi (x) x~, Kronecker's product, where x~ and the modes are independent.
+
+        x~ = (x - c, 1) with c = E[x]. phi holds 1, and 1{mode = j} - P(j) for each link's modes j but the first. Since
+        these have mean 0, Cov zeta is block-diagonal: Cov x~ for the function 1, Cov(indicators) (x) E[x~ x~'] for each
+        link.
+        """
         start = at(self.plant, k=0)
-        spread = pad_with_zeros(jnp.asarray(start.initial_covariance))
+        covariance = pad_with_zeros(jnp.asarray(start.initial_covariance))  # Cov x~
+        second_moment = covariance.at[-1, -1].set(1.0)  # E[x~ x~'], as E x~ = (0, 1)
         laws = tuple(jnp.asarray(law) for law in self.initial)
-        second = spread.at[-1, -1].set(1.0)
-        parts = [spread, *(jnp.kron(_indicator_covariance(law), second) for law in laws if len(law) > 1)]
+        blocks = [covariance, *(jnp.kron(_indicator_covariance(law), second_moment) for law in laws if len(law) > 1)]
         centre = jnp.asarray(start.initial_mean)
         mean = self._embed_first_block(jnp.append(centre, 1.0))
         return AdditiveBelief(
-            gaussian=from_covariance(mean, block_diag(*parts)),
-            second=second,
+            gaussian=from_covariance(mean, block_diag(*blocks)),
+            second=second_moment,
             laws=laws,
             centre=centre,
             moved=jnp.asarray(False),
@@ -103,53 +112,52 @@ class AdditiveModalFilter(AbstractModalFilter):
 
     @predicts
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
-        """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law.
+        """Predict zeta+ = F zeta + noise, for zeta = phi (x) x~ and F = T (x) A~ (Kronecker's product).
 
-        x~ = (x - centre, 1); zeta: x~ times 1 and times each indicator of a mode, less its probability;
-        `second_moment`: E[x~ x~'] before data.
+        x~ = (x - c, 1) with the centre c = E[x] before any data. phi holds 1, and 1{mode = j} - P(j) for each link's
+        modes j but the first, with E[phi+ | phi] = T phi. At the first prediction the modes keep their initial law.
         """
-        matrix, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
+        A, Q, next_centre = centred_transition(at(self.plant, k), u, state.centre)  # A~ and Q~
         transitions = self._transition_matrices(state, k)
-        # F zeta about the moving centre.
+        # The mean of zeta counts x from 0: its first block is (c, 0) plus that of `deviation`, which F moves.
         deviation = state.gaussian.mean - self._mean_from_centre(state.centre)
-        predicted_deviation = predict_by_mode(deviation[:, None], matrix, _function_transition(transitions).T)[:, 0]
-        mean = predicted_deviation + self._mean_from_centre(centre)
-        root, noise_of_zeta = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise_of_zeta))
-        second_moment = matrix @ state.second @ matrix.T + noise
+        T = _function_transition(transitions)
+        mean = multiply_by_transition(deviation[:, None], A, T.T)[:, 0] + self._mean_from_centre(next_centre)
+        # Cov zeta = L diag(variances) L' becomes F L diag(variances) (F L)' + Cov noise.
+        slopes, noise = self._transition_factors(state, u, k)
+        predicted = from_columns(mean, join_columns(WeightedColumns(slopes, state.gaussian.variances), noise))
         return AdditiveBelief(
-            gaussian=after,
-            second=second_moment,
+            gaussian=predicted,
+            second=A @ state.second @ A.T + Q,  # E[x~+ x~+']
             laws=_next_laws(state.laws, transitions),
-            centre=centre,
+            centre=next_centre,
             moved=jnp.asarray(True),
         )
 
     @corrects
     def correct(self, state: AdditiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdditiveBelief, Innovation]:
-        """Correct with the components of z that arrived.
+        """Correct with the components of z that arrived: the Kalman update of z = common + H zeta + v.
 
-        The estimate is that of zeta, the products of x~ = (x - centre, 1) and functions of the modes. Given zeta,
-        Cov z = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n. T is the mean spread of the gains given
-        the modes, D_a is the gain by function a (D_0 = Hbar), and Gamma holds the functions' second moments.
+        zeta holds the products of x~ = (x - centre, 1) and functions of the modes of the links.
         """
-        output, x = self._measurement_model(state, k), state.gaussian
-        deviation = x.mean - self._mean_from_centre(state.centre)
-        after, innovation = condition_modes_on_received(x, deviation, output, z)
-        return state._replace(gaussian=after), innovation
+        model, zeta = self._measurement_model(state, k), state.gaussian
+        # The mean of zeta counts x from 0, the model of z from the centre: `deviation` is the mean of products of x~.
+        deviation = zeta.mean - self._mean_from_centre(state.centre)
+        corrected, innovation = condition_modes_on_received(zeta, deviation, model, z)
+        return state._replace(gaussian=corrected), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of zeta+ = F zeta + noise, zeta the products of x~ and functions of the modes.
+        """Return the smoother step of zeta+ = F zeta + noise.
 
-        x~ = (x - centre, 1). `slopes` is F L, with L the factor of Cov zeta. The projection maps zeta to the plant's
-        state x.
+        zeta holds the products of x~ = (x - centre, 1) and functions of the modes, the first of which is 1. `slopes` is
+        F L for zeta = E zeta + L xi. The projection to the first block of zeta returns the plant's state x.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         slopes_and_noise = slopes, triangularise(noise)
         return smoother_step_of(step, slopes_and_noise, self.claim, projection=self._projection_to_state())
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """Return the matrix (n, N) that maps zeta to x."""
+        """Return the matrix (n, N) that maps zeta, whose first block is (x, 1), to x."""
         return np.eye(len(self.states), (len(self.states) + 1) * self._function_count)
 
     @property
@@ -162,7 +170,10 @@ class AdditiveModalFilter(AbstractModalFilter):
         return jnp.pad(first, (0, (self._function_count - 1) * len(first)))
 
     def _mean_from_centre(self, centre: jax.Array) -> jax.Array:
-        """Return the part of E zeta that the centre c makes: (c, 0) in the first block."""
+        """Return (c, 0) in the first block, and 0 in the others: what the mean of zeta gains if x counts from 0, not c.
+
+        The first block is (x, 1). The others are its products with functions of the modes that have mean 0.
+        """
         return self._embed_first_block(jnp.append(centre, 0.0))
 
     def _transition_matrices(self, state: AdditiveBelief, k: Step) -> Laws:
@@ -171,59 +182,63 @@ class AdditiveModalFilter(AbstractModalFilter):
         return tuple(jnp.where(state.moved, chain, jnp.eye(len(chain))) for chain in chains)
 
     def _transition_factors(self, state: AdditiveBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
-        """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta).
+        """Return F L, and columns of the noise's covariance, of zeta+ = F zeta + noise for zeta = E zeta + L xi.
 
-        They are those of C x A~ E[x~ x~'] A~' + Gamma+ x Q~, with C = sum_i P(i) Cov(1{next} | i) of each chain.
+        zeta = phi (x) x~ (Kronecker's product) for x~ = (x - c, 1) and functions phi = (1, phi_1, ...) of the modes,
+        phi_j = 1{mode = j} - P(j). Now phi+ = T phi + e, e the draw of the next modes, and x~+ = A~ x~ + w~. So
+        F = T (x) A~, and the noise is e (x) A~ x~ + phi+ (x) w~.
         """
-        move, rows = centred_transition(at(self.plant, k), u, state.centre)[0], self._transition_matrices(state, k)
-        # C of each chain, and of all of them as columns.
-        jump_covariances = [
-            jnp.einsum("i,ijl->jl", law, covariance_of_mode(chain)[:, 1:, 1:])
-            for law, chain in zip(state.laws, rows, strict=True)
+        A, _, _ = centred_transition(at(self.plant, k), u, state.centre)  # A~
+        transitions = self._transition_matrices(state, k)
+        # Cov e of each chain: sum_i P(i) Cov(1{next mode} | mode = i) without the first mode; 0 for the function 1.
+        draw_covariances = [
+            jnp.einsum("i,ijl->jl", law, covariance_of_mode(transition)[:, 1:, 1:])
+            for law, transition in zip(state.laws, transitions, strict=True)
         ]
-        jumps = _block_diagonal_columns(np.zeros((1, 0)), jump_covariances)
-        carried = factor_spread(move @ state.second @ move.T)
-        by_jumps = WeightedColumns(
-            kron(jumps.matrix, carried.matrix), outer(jumps.weights, carried.weights).reshape(-1)
+        draw = _block_diagonal_columns(np.zeros((1, 0)), draw_covariances)
+        # Cov(e (x) A~ x~) = Cov e (x) A~ E[x~ x~'] A~'
+        moved_state = factor_spread(A @ state.second @ A.T)
+        noise_of_draw = WeightedColumns(
+            kron(draw.matrix, moved_state.matrix), outer(draw.weights, moved_state.weights).reshape(-1)
         )
-        next_gamma = _second_moment_of_functions(_next_laws(state.laws, rows))
-        noise = join_columns(by_jumps, self.process_noise_by_mode(u, k, next_gamma))
-        return predict_by_mode(state.gaussian.root, move, _function_transition(rows).T), noise
+        # Cov(phi+ (x) w~) = E[phi+ phi+'] (x) Cov w~
+        next_gamma = _second_moment_of_functions(_next_laws(state.laws, transitions))
+        noise = join_columns(noise_of_draw, self.process_noise_by_mode(u, k, next_gamma))
+        return multiply_by_transition(state.gaussian.root, A, _function_transition(transitions).T), noise
 
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
-        """Return z = common + H zeta + v: H and `common` from Hbar and the D_a, and columns whose squares sum to Cov v.
+        """Return z = common + H zeta + v, with columns of Cov v, for the products zeta = (x~, x~ phi_1, ...).
 
-        Hbar is the mean of the gains (G, n), D_a what function phi_a of a link's mode adds to it, Gamma = E[phi phi']
-        of the functions (1, phi_1, ...), and y~ = (y, 1) what is sent. Letters of the subscripts: a, b functions, c
-        columns of Gamma, m and l received numbers, p entries of y~, j modes of a link.
+        z = (G, n) y~ for the links' random gain and noise, and y~ = (y, 1) = C~ x~ + noise that is sent. Given the
+        modes (G, n) has the mean sum_a D_a phi_a, for the functions phi = (1, phi_1, ...) of the modes.
         """
         terms: tuple[ChannelByMode, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)
-        # H: the gain of each function, times C~ of the centred state.
-        measure, noise = centred_measurement(sensor, state.centre)
-        gains = _gains_by_function(terms, state.laws)
-        matrix = gains @ measure
-        common = matrix[0, :, -1]
-        # E[y~ y~'] of what is sent (p + 1, p + 1), and Gamma.
-        sent, gamma = measure @ state.second @ measure.T + noise, _second_moment_of_functions(state.laws)
-        # Sensor noise through the gains, sum_ab Gamma_ab D_a R D_b': one gain for each column c of Gamma (c, m, p + 1).
-        mean_gain_by_function = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
-        sensor_columns = jnp.asarray(mean_gain_by_function[:, :, :-1] @ sensor.noise.columns.matrix)
+        # E[z | zeta] = sum_a D_a C~ (x~ phi_a), without its constant.
+        C, R = centred_measurement(sensor, state.centre)  # C~ and R~
+        gains = _gains_by_function(terms, state.laws)  # D_a
+        output = gains @ C
+        common = output[0, :, -1]
+        # E[y~ y~'] = C~ E[x~ x~'] C~' + R~ (p + 1, p + 1), and Gamma = E[phi phi'] as weighted columns g_c.
+        signal_moment, gamma = C @ state.second @ C.T + R, _second_moment_of_functions(state.laws)
+        # The sensor's noise: sum_ab Gamma_ab D_a R D_b' = sum_c weight_c D_c R D_c' for D_c = sum_a g_ac D_a.
+        gain_by_column = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
+        sensor_columns = jnp.asarray(gain_by_column[:, :, :-1] @ sensor.noise.columns.matrix)
         weights = jnp.broadcast_to(sensor.noise.columns.weights, (len(sensor_columns), sensor_columns.shape[-1]))
         known_noise = [side_by_side(WeightedColumns(sensor_columns, weights), gamma.weights)]
-        # Noise of the links themselves, in the mean over the modes j of each.
+        # Noise of each link, sum_j P(j) Cov(n | j).
         known_noise += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
-        # Spread of the gains given the mode, on what is sent, in the mean over the modes (m, m).
+        # Gains of each link about their mean given the mode: sum_j P(j) E[(G - E G) E[y~ y~'] (G - E G)' | j].
         gain_noise = sum(
-            jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_spread), sent)
+            jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_spread), signal_moment)
             for term, law in zip(terms, state.laws, strict=True)
         )
-        # Rounding of z, by its second moments (m,).
+        # Rounding of z, whose components have second moments (m,) sum_c weight_c (D_c E[y~ y~'] D_c')_mm.
         rounding = rounding_of(
-            jnp.einsum("c,cmp,pq,cmq->m", gamma.weights, mean_gain_by_function, sent, mean_gain_by_function)
+            jnp.einsum("c,cmp,pq,cmq->m", gamma.weights, gain_by_column, signal_moment, gain_by_column)
         )
-        noise_columns = join_columns(*known_noise, rounding, factor_spread(jnp.asarray(gain_noise)))
-        return MeasurementModel(concatenate_modes(matrix.at[0, :, -1].set(0.0)), common, noise_columns)
+        noise = join_columns(*known_noise, rounding, factor_spread(jnp.asarray(gain_noise)))
+        return MeasurementModel(concatenate_modes(output.at[0, :, -1].set(0.0)), common, noise)
 
 
 def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
@@ -237,16 +252,17 @@ def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
     return jnp.concatenate([jnp.asarray(total_mean)[None], *(mean[1:] - mean[:1] for mean in means)])
 
 
-def _next_laws(laws: Laws, rows: Laws) -> Laws:
-    """Return the probabilities of each term's modes one step later."""
-    return tuple(law @ chain for law, chain in zip(laws, rows, strict=True))
+def _next_laws(laws: Laws, transitions: Laws) -> Laws:
+    """Return the probabilities of the modes of each link in the sum one step later, p Pi."""
+    return tuple(law @ transition for law, transition in zip(laws, transitions, strict=True))
 
 
 def _function_transition(transitions: Laws) -> jax.Array:
-    """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j.
+    """Return T of E[phi+ | modes] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j.
 
-    phi holds 1, and for each chain the indicators of all its modes but the first, less their probabilities. Pi is a
-    chain's transition matrix.
+    phi holds 1, and for each chain of transition matrix Pi the indicators of all its modes but the first, less their
+    probabilities. Since the indicators sum to 1, E[1{next = j} | mode] = sum_i Pi_ij 1{mode = i} is also
+    Pi_first,j + sum_{i != first} (Pi_ij - Pi_first,j) 1{mode = i}. Less its mean, this is sum_i T_ji phi_i.
     """
     blocks = [(pi[1:, 1:] - pi[:1, 1:]).T for pi in transitions if len(pi) > 1]
     matrix: jax.Array = block_diag(np.eye(1), *blocks)
@@ -259,7 +275,10 @@ def _indicator_covariance(law: jax.Array) -> jax.Array:
 
 
 def _second_moment_of_functions(laws: Laws) -> WeightedColumns:
-    """Return Gamma = E[phi phi'] of (1, phi_1, ...) as columns."""
+    """Return columns of E[phi phi'], phi holding 1, and 1{mode = j} - P(j) for each link's modes j but the first.
+
+    It is block-diagonal, as links are independent. `laws`: probabilities of each link's modes.
+    """
     return _block_diagonal_columns(np.eye(1), [_indicator_covariance(law) for law in laws])
 
 

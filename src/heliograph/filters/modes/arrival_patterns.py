@@ -39,19 +39,24 @@ class ChannelByPattern(Module):
 
     @property
     def spread(self) -> Float[Array, "M A m m p1 p1"]:
-        """E[((G, n) - mean) Y ((G, n) - mean)' | mode, pattern] as a tensor."""
+        """Covariances Cov((G, n)_ik, (G, n)_jl | mode, pattern of arrivals), for z = G y + n.
+
+        Axes: mode, pattern, i, j (components of z), k, l (components of y, and n as the last).
+        """
         return join_gain_and_noise(self.gain_spread, self.noise)
 
 
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[ChannelByPattern]:
     """Return the channel at each step by mode and by pattern of arrivals, with the same patterns at all steps.
 
-    A pattern says which components arrive. A flag is a received number that tells of the mode, and `flags` holds
-    P(flag | mode). The transition to a step is that of the step before it. The first step takes its own.
+    A pattern says which components arrive. A flag is a received number that depends on the mode, and `flags` holds
+    P(flag | mode). `JointModes` of a step hold the transition that leads from it to the next step, so the channel at
+    step k gets that of step k - 1. The first step gets its own: it may stand for all steps.
     """
+    # For each step and mode the outcomes: which components arrive, by which random map, with which probability.
     outcomes_by_step = [[mode.list_outcomes() for mode in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in outcomes_by_step for outcomes in modes for o in outcomes}
-    patterns = sorted(distinct, key=lambda pattern: (sum(pattern), pattern))  # those in which fewer arrive first
+    patterns = sorted(distinct, key=lambda pattern: (sum(pattern), pattern))  # first those with fewer arrivals
     previous_steps = [steps[0], *steps[:-1]]
     return [
         _describe_step_by_pattern(outcomes, patterns, step_before, flags)
@@ -80,14 +85,14 @@ def _describe_step_by_pattern(
     chance = np.zeros(shape)
     firsts: list[Array] = [np.zeros((m, p))] * chance.size
     seconds: list[Array] = [np.zeros((m, m, p, p))] * chance.size
-    for j, of_mode in enumerate(outcomes):
-        for outcome in of_mode:
+    for j, outcomes_of_mode in enumerate(outcomes):
+        for outcome in outcomes_of_mode:
             a = patterns.index(tuple(outcome.arrived))
             first_order, second_order = second_moments(outcome.map)
             chance[j, a] += outcome.probability
-            place = j * len(patterns) + a
-            firsts[place] = firsts[place] + outcome.probability * first_order
-            seconds[place] = seconds[place] + outcome.probability * second_order
+            index = j * len(patterns) + a
+            firsts[index] = firsts[index] + outcome.probability * first_order
+            seconds[index] = seconds[index] + outcome.probability * second_order
     # Moments given mode and pattern; where the pattern cannot occur they are 0.
     xp, divisor = library(firsts, seconds), np.where(chance > 0, chance, 1.0)
     means = [one / share for one, share in zip(firsts, divisor.flat, strict=True)]

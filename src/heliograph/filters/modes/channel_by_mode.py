@@ -11,7 +11,7 @@ from heliograph.random_affine.moments.second_moments import join_gain_and_noise,
 
 
 class ChannelByMode(Module):
-    """A channel at one step, mode by mode: E[(G, n) | mode], and what (G, n) varies by about it.
+    """A channel z = G y + n at one step, mode by mode: E[(G, n) | mode], and the covariance of (G, n) about it.
 
     transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
     gain_spread and noise: as in `SecondOrder`, for each mode.
@@ -27,7 +27,7 @@ class ChannelByMode(Module):
 
     @property
     def spread(self) -> Float[Array, "M m m p1 p1"]:
-        """E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor."""
+        """Covariances Cov((G, n)_ik, (G, n)_jl | mode) as [mode, i, j, k, l], for z = G y + n."""
         spread: Array = join_gain_and_noise(self.gain_spread, self.noise)
         return spread
 
@@ -43,13 +43,24 @@ def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array
     return steps[0].initial, vary_over_steps(models, channel)
 
 
-def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
-    """Return the channel's moments in each mode at the step `now`, with the transition from the step `before`."""
-    mean = stack_parts([affine.moments(1).mean[:-1] for affine in now.maps])
-    gains, noises = zip(*(split_off_noise(nominal_spread(affine).center) for affine in now.maps), strict=True)
+def channel_by_mode(step: JointModes, step_before: JointModes) -> ChannelByMode:
+    """Return the channel's moments in each mode of one step, with the transition of the modes to it.
+
+    Args:
+        step: joint modes of the links, and in each a random map z = G y + n.
+        step_before: those of the step before, which hold the transition to this step, and the largest error of its
+            entries (`radius`).
+    """
+    # E[(G, n)] by mode, and Cov(G, n) under the nominal law as the gains' covariance and columns of the noise.
+    mean = stack_parts([affine.moments(1).mean[:-1] for affine in step.maps])
+    gains, noises = zip(*(split_off_noise(nominal_spread(affine).center) for affine in step.maps), strict=True)
     noise = WeightedColumns(
         stack_parts([noise.matrix for noise in noises]), stack_parts([noise.weights for noise in noises])
     )
     return ChannelByMode(
-        transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise
+        transition=step_before.transition,
+        radius=step_before.radius,
+        mean=mean,
+        gain_spread=stack_parts(gains),
+        noise=noise,
     )

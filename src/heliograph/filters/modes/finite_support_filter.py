@@ -117,7 +117,7 @@ class MixtureFilter(AbstractSizedFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """True: it is a mixture over atoms."""
+        """True: z has a mixture law over finitely many gains and noises, so likelihood 0 says that it is impossible."""
         return True
 
     @compile_on_call
@@ -143,8 +143,8 @@ class MixtureFilter(AbstractSizedFilter):
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching.
 
-        A combination is one choice of the values (atoms) of all gains and noises: a gain, an offset and a Gaussian
-        noise.
+        A combination is one choice of the values of all gains and noises of finite support: it is a gain, an offset and
+        a Gaussian noise.
         """
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
         prior = state.law[c.mode] * jnp.asarray(c.weight)
@@ -196,7 +196,7 @@ class MixtureFilter(AbstractSizedFilter):
 
 
 def drop_below_point_mass(log_likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
-    """Return the log-likelihoods, with -inf for combinations that others outweigh by a point mass.
+    """Return the log-likelihoods, with -inf for combinations of gains and noises that others outweigh by a point mass.
 
     `certain` (a,) counts the components that each combination determines exactly. It has a point mass there, against
     which a density is negligible. So only combinations with the largest count among those that agree with z are kept.

@@ -37,6 +37,10 @@ from heliograph.filters.modes.linear_by_mode import (
     MotionByMode,
     centred_motion,
     centred_sensing,
+    factor_with_last_mode,
+    kron,
+    mode_transition_covariance,
+    multiply_by_transition,
     noise_by_mode,
     noise_in_mode,
     pad_with_zeros,
@@ -77,9 +81,9 @@ class ModalBelief(NamedTuple):
 
 
 class MeasurementModel(NamedTuple):
-    """Model of a measurement of zeta: z = common + H zeta + noise.
+    """Model z = common + H zeta + v of a measurement, with zeta = (x~ 1{mode = 1}, ...) for x~ = (x - centre, 1).
 
-    Shapes: matrix H (m, N), common (m,), noise (m, columns).
+    Shapes: `matrix` H (m, N), common (m,), `noise` v (m, columns).
     """
 
     matrix: jax.Array
@@ -95,7 +99,10 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """Return x, a projection of zeta, and the covariance of its error."""
+        """Return the estimate of x = `projection` zeta, and the covariance of its error.
+
+        zeta holds the products of (x, 1) and functions of the modes.
+        """
         projection, x = self._projection_to_state(), state.gaussian
         return Estimate(projection @ x.mean, WeightedColumns(projection @ x.root, x.variances).covariance, self.claim)
 
@@ -103,14 +110,21 @@ class AbstractModalFilter(AbstractSizedFilter):
         """Precompute all covariances and gains."""
         return plan_filter(self, inputs, self._projection_to_state())
 
-    def process_noise_by_mode(self, u: ArrayLike, k: Step, of_mode: WeightedColumns) -> WeightedColumns:
-        """Return columns of zeta's process noise and rounding, from `of_mode` = E[phi phi'] of the next functions."""
-        parts = noise_in_mode(at(self.plant, k), u, second_moments_at_start(self.plant))
-        return WeightedColumns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
+    def process_noise_by_mode(self, u: ArrayLike, k: Step, second_moment: WeightedColumns) -> WeightedColumns:
+        """Return columns of the process noise of zeta = phi (x) x~, Kronecker's product, with its rounding.
+
+        x~ = (x, 1) with the noise w~ = (w, 0), and phi are functions of the modes. zeta+ has the noise phi+ (x) w~, so
+        that its covariance is E[phi+ phi+'] (x) Cov w~. `second_moment`: columns of E[phi+ phi+'] one step later.
+        """
+        noise = noise_in_mode(at(self.plant, k), u, second_moments_at_start(self.plant))
+        # (a a') (x) (b b') = (a (x) b)(a (x) b)' for each column a of the one and b of the other.
+        return WeightedColumns(
+            kron(second_moment.matrix, noise.matrix), outer(second_moment.weights, noise.weights).reshape(-1)
+        )
 
     @abstractmethod
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """Return the matrix (n, N) that maps zeta to x."""
+        """Return the matrix (n, N) that maps zeta, products of (x, 1) and functions of the modes, to x."""
 
 
 class AbstractJointModalFilter(AbstractModalFilter):
@@ -120,7 +134,7 @@ class AbstractJointModalFilter(AbstractModalFilter):
     initial: Float[Array, " M"]
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """Return x = sum_j zeta^j."""
+        """Return the matrix (n, N) that maps zeta = ((x, 1) 1{mode = 1}, (x, 1) 1{mode = 2}, ...) to x, their sum."""
         return make_mode_sum_matrix(len(self.states), len(self.initial))
 
 
@@ -143,7 +157,7 @@ class ModalFilter(AbstractJointModalFilter):
     def init(self) -> ModalBelief:
         """Return the prior of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - centre, 1).
 
-        State and mode are independent at the start.
+        State and mode are independent at the start, so that E[x~ x~' 1{mode = j}] = P(j) E[x~ x~'].
         """
         start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior, second_moment = compute_initial_moments(start, self.initial)
@@ -152,124 +166,109 @@ class ModalFilter(AbstractJointModalFilter):
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
-        """Move the mode by the chain and x~ by its plant; at the first prediction the mode has its initial law.
+        """Predict zeta+ = F zeta + noise, where F has the blocks F_ji = Pi_ij A~_j.
 
-        zeta holds x~ = (x - c, 1) times each mode's indicator. With the chain Pi, the plant's A~ and Q~ in each mode
-        and E_i = E[x~ x~' 1{i}], the noise of zeta+ = F zeta + noise has the covariance, in the block of modes j and l,
-        A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
+        zeta holds x~ = (x - c, 1) times each mode's indicator, with c = E[x] before any data. The chain Pi draws the
+        next mode j, whose plant A~_j, Q~_j moves x~. At the first prediction the mode keeps its initial law (Pi = I).
         """
         transition = self._transition_matrix(state, k)
-        moments_before_motion, motion = mix_moments_of_modes(transition, state.moments), self._motion(state, u, k)
-        law = moments_before_motion[:, -1, -1]
-        # The mean of F zeta. The part that the centre has in it is moved by itself.
+        # E[x~ x~' 1{next mode = j}] = sum_i Pi_ij E[x~ x~' 1{mode = i}]
+        moments_by_next_mode, motion = mix_moments_of_modes(transition, state.moments), self._motion(state, u, k)
+        law = moments_by_next_mode[:, -1, -1]
+        # The mean of zeta is that of the products of (x, 1): P(j) (c, 0) for each mode j, plus `deviation`, that of the
+        # products of (x - c, 1), which F moves.
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        mean = predict_by_mode(deviation[:, None], motion.moves, transition)[:, 0] + mean_from_centre(
-            law, motion.centre
-        )
-        root, noise = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise))
-        moments = propagate_by_mode(motion.moves, moments_before_motion, law[:, None, None] * motion.noises)
-        return ModalBelief(gaussian=after, moments=moments, centre=motion.centre, moved=jnp.asarray(True))
+        moved_deviation = multiply_by_transition(deviation[:, None], motion.matrices, transition)[:, 0]
+        mean = moved_deviation + mean_from_centre(law, motion.centre)
+        # Cov zeta = L diag(variances) L' becomes F L diag(variances) (F L)' + Cov noise.
+        slopes, noise = self._transition_factors(state, u, k)
+        predicted = from_columns(mean, join_columns(WeightedColumns(slopes, state.gaussian.variances), noise))
+        # E[x~+ x~+' 1{j}] = A~_j E[x~ x~' 1{next mode = j}] A~_j' + P(j) Q~_j
+        moments = propagate_by_mode(motion.matrices, moments_by_next_mode, law[:, None, None] * motion.noises)
+        return ModalBelief(gaussian=predicted, moments=moments, centre=motion.centre, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
-        """Correct with the components of z that arrived.
+        """Correct with the components of z that arrived: the Kalman update of z = common + H zeta + v.
 
-        zeta holds x~ = (x - c, 1) times each mode's indicator. Mode j has the sensor C~_j, R~_j, the mean gain Hbar_j
-        and the spread T_j of gains. With E_j = E[x~ x~' 1{j}], Cov(z - E[z | zeta]) is
-        sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j).
+        zeta holds x~ = (x - c, 1) times each mode's indicator, with c = E[x] before any data.
         """
+        # The mean of zeta counts x from 0, the model of z from c: `deviation` is the mean of the products of x~.
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         output = self._measurement_model(state, k)
-        after, innovation = condition_modes_on_received(state.gaussian, deviation, output, z)
-        return state._replace(gaussian=after), innovation
+        corrected, innovation = condition_modes_on_received(state.gaussian, deviation, output, z)
+        return state._replace(gaussian=corrected), innovation
 
     def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
         """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
-        """Return F L of zeta = E zeta + L xi, zeta the state times each mode's indicator, and columns of its noise."""
-        transition, matrices, plants = (
-            self._transition_matrix(state, k),
-            self._motion(state, u, k).moves,
-            self._plants(k),
-        )
-        # The noise by which the chain draws the next mode, moved by the plant of that mode.
-        chain_noise = mode_transition_covariance(state.moments, transition)
-        by_mode = chain_noise.matrix.reshape(*matrices.shape[:2], -1)
-        moved_chain_noise = WeightedColumns((matrices @ by_mode).reshape(chain_noise.matrix.shape), chain_noise.weights)
-        initial_power = second_moments_at_start(self.plant)
-        process_noise = noise_by_mode(plants, self.plant_modes, u, initial_power, state.law @ transition)
-        return predict_by_mode(state.gaussian.root, matrices, transition), join_columns(
-            moved_chain_noise, process_noise
-        )
+        """Return F L, and columns of the noise's covariance, of zeta+ = F zeta + noise for zeta = E zeta + L xi.
+
+        zeta holds x~ = (x - c, 1) times the indicator of each mode. If the mode goes from i to j, block j of zeta+ is
+        A~_j x~ + w~_j, and of F zeta it is Pi_ij A~_j x~, so the noise has two causes: the draw of the mode, and w~_j.
+        """
+        transition, matrices = self._transition_matrix(state, k), self._motion(state, u, k).matrices
+        # The draw: blocks (j, l) of A~_j sum_i Cov(1{next = j}, 1{next = l} | i) E[x~ x~' 1{mode = i}] A~_l'.
+        draw = mode_transition_covariance(state.moments, transition)
+        draw_by_mode = draw.matrix.reshape(*matrices.shape[:2], -1)
+        moved_draw = WeightedColumns((matrices @ draw_by_mode).reshape(draw.matrix.shape), draw.weights)
+        # The plant's noise: blocks P(next mode = j) Cov w~_j on the diagonal.
+        initial_power = second_moments_at_start(self.plant)  # E[x_i^2] before any data, on which rounding acts
+        process_noise = noise_by_mode(self._plants(k), self.plant_modes, u, initial_power, law=state.law @ transition)
+        slopes = multiply_by_transition(state.gaussian.root, matrices, transition)
+        return slopes, join_columns(moved_draw, process_noise)
 
     def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
-        """Return the laws of motion of a step."""
+        """Return the different plants at step k, of which each mode has one."""
         return list_mode_models(at(self.plant, k))
 
     def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
-        """Return how the state moves about its centre in each mode of the step."""
-        arriving = mix_moments_of_modes(self._transition_matrix(state, k), state.moments)
-        return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
+        """Return the transition of x~ = (x - c, 1) in each mode j, A~_j and Q~_j, and c one step later.
+
+        c = E[x] before any data, so the next one is a mean over the modes.
+        """
+        moments_by_next_mode = mix_moments_of_modes(self._transition_matrix(state, k), state.moments)
+        means_by_next_mode = moments_by_next_mode[:, :, -1]  # E[x~ 1{next mode = j}], as the last entry of x~ is 1
+        return centred_motion(self._plants(k), self.plant_modes, u, state.centre, means_by_next_mode)
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
-        """Return the model z = common + H zeta + v, with columns of Cov v; zeta is the state times mode indicators."""
+        """Return the model z = common + H zeta + v, with columns of Cov v, for zeta = (x~ 1{mode = 1}, ...).
+
+        In mode j the sensor sends y~ = (y, 1) = C~_j x~ + noise, for x~ = (x - c, 1), and z = G y~ for a random G of
+        mean Hbar_j, whose last column is the link's noise n. So E[z | zeta] = sum_j Hbar_j C~_j x~ 1{mode = j}.
+        """
         channel, law = at(self.channel, k), state.law
         sensors = list_mode_models(at(self.sensor, k))
-        measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
+        # C~_j and R~_j, then Hbar_j C~_j with a part that is the same in all modes, as a constant, taken out.
+        sensor_matrices, sensor_noises = centred_sensing(sensors, self.sensor_modes, state.centre)
         gains = jnp.asarray(channel.mean)
-        matrix, mean_output = subtract_mean_output(gains @ measure, law)
-        # E[y~ y~' 1{mode j}] of what is sent (M, p + 1, p + 1), and the spread of the gains on it (m, m).
-        sent = propagate_by_mode(measure, state.moments, law[:, None, None] * noise)
-        gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent))
-        # Noise of sensor and links, in the mean over the modes, and rounding.
+        matrix, common = subtract_mean_output(gains @ sensor_matrices, law)
+        # Y_j = E[y~ y~' 1{mode = j}] = C~_j E[x~ x~' 1{mode = j}] C~_j' + P(j) R~_j (M, p + 1, p + 1)
+        signal_moments = propagate_by_mode(sensor_matrices, state.moments, law[:, None, None] * sensor_noises)
+        # Cov v, first the random gains: sum_j E[(G - Hbar_j) Y_j (G - Hbar_j)' | j].
+        gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), signal_moments))
+        # Then noise of sensor and links, sum_j P(j) (Hbar_j R_j Hbar_j' + Cov n_j), and rounding.
         known_noise = factor_known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
-        rounding = rounding_of_received(gains, sent)
-        return MeasurementModel(concatenate_modes(matrix), mean_output, join_columns(known_noise, rounding, gain_noise))
+        rounding = rounding_of_received(gains, signal_moments)
+        return MeasurementModel(concatenate_modes(matrix), common, join_columns(known_noise, rounding, gain_noise))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise, zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...).
 
-        `slopes` is F L, for zeta = E zeta + L xi. The projection maps zeta to the plant's state x.
+        x~ = (x - centre, 1). `slopes` is F L, for zeta = E zeta + L xi. The projection maps zeta to the state x.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         slopes_and_noise = slopes, triangularise(noise)
         return smoother_step_of(step, slopes_and_noise, self.claim, projection=self._projection_to_state())
 
 
-def predict_by_mode(columns: jax.Array, moves: jax.Array, rows: jax.Array) -> jax.Array:
-    """Multiply columns (N, c) by F, F[j, i] = Pi[i, j] A~_j: mix all parts by the chain, then move each."""
-    parts = (rows.T @ columns.reshape(len(rows), -1)).reshape(rows.shape[1], moves.shape[-1], -1)
-    return jnp.reshape(moves @ parts, columns.shape)
-
-
-def mode_transition_covariance(moments: jax.Array, rows: jax.Array) -> WeightedColumns:
-    """Return columns of sum_i Cov(1{next} | i) x E_i (N, N), what the chain draws, from the moments E_i (M, s, s)."""
-    return factor_with_last_mode(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], moments))
-
-
-def covariance_of_mode(rows: jax.Array) -> jax.Array:
-    """Return Cov(1{j}, 1{l} | i) = delta_jl Pi_ij - Pi_ij Pi_il, (M, M, M)."""
-    return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
-
-
-def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
-    """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
-
-    `covariance` (M - 1, s, M - 1, s) is that of all modes but the last. The last part is minus the sum of the others.
-    """
-    other_modes, size = covariance.shape[:2]
-    factors = factor_spread(covariance.reshape(other_modes * size, other_modes * size))
-    minus_sum = -np.tile(np.eye(size), (1, other_modes))
-    return factors.through(np.concatenate([np.eye(other_modes * size), minus_sum]))
-
-
 def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
     """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which do not depend on the signal.
 
-    Mode j has the probability P(j) and the mean gain Hbar_j. v_j is the noise of what is sent, n_j that of the link.
+    Mode j has the probability P(j) (`law`) and the mean gain Hbar_j (`channel.mean` without its last column). v_j is
+    the noise of what is sent (columns in `sent`), n_j that of the link.
     """
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
@@ -277,30 +276,31 @@ def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], 
 
 
 def rounding_of_received(gains: jax.Array, sent: jax.Array) -> WeightedColumns:
-    """Return the rounding (m, m) of z, of gains (M, m, p + 1), from E[y~ y~' 1{mode}] (M, p + 1, p + 1)."""
+    """Return columns of the rounding of z (m, m), whose components have E[z_i^2] = sum_j (Hbar_j Y_j Hbar_j')_ii.
+
+    `gains`: Hbar_j (M, m, p + 1); `sent`: Y_j = E[y~ y~' 1{mode = j}] (M, p + 1, p + 1) of y~ = (y, 1) that is sent.
+    """
     return rounding_of(jnp.einsum("jma,jab,jmb->m", gains, sent, gains))
 
 
-def kron(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the Kronecker product of a and b, by a matrix product, which keeps known zeros."""
-    a, b = jnp.asarray(a), jnp.asarray(b)
-    products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
-    # products[i, j, k, l] = a_ij b_kl goes to row (i, k), column (j, l).
-    return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
-
-
 def make_mode_sum_matrix(n: int, modes: int) -> Float[np.ndarray, "n N"]:
-    """Return the matrix (n, N) that maps zeta to x = sum_j zeta^j."""
+    """Return the matrix (n, N) that sums the first n entries of each of `modes` blocks of length n + 1.
+
+    It maps zeta = ((x, 1) 1{mode = 1}, (x, 1) 1{mode = 2}, ...) to x, since the indicators sum to 1.
+    """
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
 def condition_modes_on_received(
     x: Gaussian, deviation: jax.Array, output: MeasurementModel, z: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
-    """Return the law of zeta given the components of z that arrived, and the innovation.
+    """Return zeta given the components of z = common + H zeta + noise that arrived, and the innovation.
 
-    zeta is the state times the indicator of each mode. `output` describes z = common + matrix deviation + noise, where
-    the `deviation` is zeta less P(mode) c, with c the centre; its mean is given.
+    Args:
+        x: zeta, the products of (x, 1) and functions of the modes, as a Gaussian of mean and factor L.
+        deviation: mean of the same products of (x - c, 1), on which H acts; c is E[x] before any data.
+        output: common, H and columns of the noise.
+        z: measurement (m,), NaN for what did not arrive.
     """
     expected = output.common + output.matrix @ deviation
     slopes = output.matrix @ x.root
@@ -308,48 +308,51 @@ def condition_modes_on_received(
 
 
 def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
-    """Return the law of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...) at the start, x~ = (x - c, 1), and E[x~ x~'].
+    """Return the prior of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - c, 1), and E[x~ x~'].
 
-    x and the mode are independent at the start, and the mode has the law p. With e = E[x~] = (0, 1) and Kronecker's
-    product x, Cov(zeta) = diag(p) x Cov(x~) + (diag(p) - p p') x e e'.
+    c = E[x]. The mode has the law p and is independent of x. With e = E[x~] = (0, 1) and Kronecker's product (x),
+    Cov(zeta) = diag(p) (x) Cov(x~) + (diag(p) - p p') (x) e e'. The mean is that of the products of (x, 1).
     """
     covariance, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
     state = from_covariance(start.initial_mean, start.initial_covariance)
+    # Columns of diag(p) - p p' (M, M - 1). A last column of variance 0 makes their matrix square.
     mode = factor_with_last_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
-    # In each mode's part of the factor, x comes before the indicator. `unit_moment` is e e'.
-    unit_moment = np.zeros((len(covariance), len(covariance)))
-    unit_moment[-1, -1] = 1.0
     mode_root = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
-    root = jnp.kron(np.eye(len(law)), pad_with_zeros(state.root)) + jnp.kron(mode_root, unit_moment)
-    variances = jnp.concatenate([jnp.outer(law, state.variances), jnp.append(mode.weights, 0.0)[:, None]], axis=1)
-    prior = Gaussian(jnp.kron(law, jnp.append(state.mean, 1.0)), below_diagonal(root), variances.reshape(-1))
-    return prior, covariance + unit_moment
+    mode_variances = jnp.append(mode.weights, 0.0)
+    # In each mode's block the first n columns are those of x, and the last one, of e e', is that of the indicator.
+    outer_e = np.zeros((len(covariance), len(covariance)))
+    outer_e[-1, -1] = 1.0
+    root = jnp.kron(np.eye(len(law)), pad_with_zeros(state.root)) + jnp.kron(mode_root, outer_e)
+    variances = jnp.concatenate([jnp.outer(law, state.variances), mode_variances[:, None]], axis=1)
+    mean = jnp.kron(law, jnp.append(state.mean, 1.0))
+    prior = Gaussian(mean, below_diagonal(root), variances.reshape(-1))
+    return prior, covariance + outer_e  # E[x~ x~'] = Cov(x~) + e e'
 
 
 def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
-    """Return P(mode) c, mode after mode: the part of E zeta that the centre makes."""
+    """Return P(j) (c, 0), mode after mode: E[(x, 1) 1{mode = j}] less E[(x - c, 1) 1{mode = j}] for the centre c."""
     return jnp.kron(law, jnp.append(centre, 0.0))
 
 
 def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Subtract the mean output over the modes from every mode; return what is left, and the mean output (m,).
+    """Subtract the mean output over the modes, a constant, from the output of each mode; return both.
 
-    The modes' indicators sum to 1, so that the mean output can be added as a constant. `output` (M, m, n + 1) maps
-    (x, 1) to E z in each mode. `law` (M,) holds the probabilities of the modes.
+    The modes' indicators sum to 1, so a constant in all modes may be taken out and added to z as such (m,). `output`
+    (M, m, n + 1) maps (x, 1) to E z in each mode. `law` (M,) holds the probabilities of the modes.
     """
     mean_output = law @ output[:, :, -1] / jnp.sum(law)
     return output.at[:, :, -1].add(-mean_output), mean_output
 
 
 def concatenate_modes(output: jax.Array) -> jax.Array:
-    """Concatenate output matrices (M, m, n + 1) to one matrix (m, N) that acts on zeta."""
+    """Concatenate output matrices by mode (M, m, n + 1) to one matrix (m, N), which acts on the blocks of all modes."""
     return jnp.concatenate(list(output), axis=1)
 
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """Return the best linear filter where links, plant or sensor have modes; `linear_filter` has checked the parts."""
     models = first(plant), first(sensor)
-    # The plant's and the sensor's model in each joint mode.
+    # A joint mode is one of plant, sensor and channel together. Here, for each, its models (plant, sensor).
     by_mode = joint_modes(first(channel), beside=models).beside
     claim = lower_claim_by_noise(claim_of_modes(channel), *list_mode_models(models[0]), *list_mode_models(models[1]))
     return ModalFilter(
@@ -362,7 +365,10 @@ def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalF
 
 
 def fields_of_joint_modes(plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> dict[str, Any]:
-    """Return the channel's observation models by mode, and the sizes, of a filter of joint modes."""
+    """Return fields with which a filter is constructed: its channel by joint mode, initial law, sizes and claim.
+
+    A joint mode is one of plant, sensor and channel together. The claim is what the filter's covariance is said to be.
+    """
     initial, described = channels_by_mode(channel, (first(plant), first(sensor)))
     return {"channel": described, "initial": initial, **make_sizes(claim, first(plant), first(channel).outputs)}
 

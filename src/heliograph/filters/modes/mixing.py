@@ -27,12 +27,17 @@ class AbstractMerging(Module):
     """Rule that decides when the Gaussians of modes are merged.
 
     Components c are K Gaussians, weight[c, j] the probability of component c and present mode j of M; K is M unless a
-    rule says otherwise.
+    rule says otherwise. A step merges components to mixtures (`mixing_weights`), moves these by the modes' plants to
+    new components (`list_moves`), corrects pairs of a component and a mode with z (`list_update_pairs`), and merges
+    these to the components that are kept (`keep_components`).
     """
 
     @property
     def corrects_pairs(self) -> bool:
-        """True if what was moved is merged after its correction alone, pair by pair of modes."""
+        """True if each pair of the mode before a step and the mode after it has a Gaussian that is corrected with z.
+
+        They are merged afterwards. False if Gaussians are merged by the mode after the step before z corrects them.
+        """
         return False
 
     def initial_weights(self, law: jax.Array) -> jax.Array:
@@ -40,50 +45,74 @@ class AbstractMerging(Module):
         return jnp.diag(law)
 
     def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
-        """Return one Gaussian for each mode, of components and weights (K, M) as `keep_components` returns them."""
+        """Return one Gaussian for each mode, from the K components after a correction and their weights (K, M)."""
         return gaussians
 
-    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return how components are mixed before a move: weights (K, G) of K components in G mixtures.
+    def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return how components are merged before the plants move them, and the weights of the components afterwards.
 
-        And the weights (K, M) of the components after the move. `rows`: transition matrix (M, M) of the modes.
+        Args:
+            weight: [c, j], probability of component c and mode j before the step (K, M).
+            transition: of the modes (M, M).
+
+        Returns:
+            Weights [c, g] of component c in mixture g (K, G), whose columns need not sum to 1; and the weights (K, M)
+            after the step. Each component after the step is one mixture moved by one mode's plant.
         """
         raise unwritten(self, "mixing")
 
     def list_moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return for each component after the prediction which mixture it was before, and which mode moved it."""
-        places = np.arange(modes)
-        return places, places
+        """Return for each component after a step the mixture that it was, and the mode whose plant moved it.
+
+        Here mixture j is moved by mode j alone.
+        """
+        numbers = np.arange(modes)
+        return numbers, numbers
 
     def list_update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs (component, mode) of the measurement update: all that can have a weight."""
-        places = np.arange(modes)
-        return places, places
+        """Return the components and the modes of all pairs (component, mode) that may have a weight and are corrected.
+
+        Here component j belongs to mode j alone.
+        """
+        numbers = np.arange(modes)
+        return numbers, numbers
 
     def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
-        """Return the components after the update of all pairs, and their weights (K, M)."""
+        """Return the components after a correction and their weights (K, M).
+
+        `gaussians` and `weight` (pairs,) hold what `list_update_pairs` lists, after the correction.
+        """
         return gaussians, jnp.diag(weight)
 
 
 class MergeAll(AbstractMerging):
     """One Gaussian for all modes (GPB1)."""
 
-    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return weights (K, 1) of one mixture of all, and (M, M) of its copies in the modes after the move."""
-        return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
+    def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the weights (K, 1) of K components in one mixture, and those of the M components after the step.
+
+        `weight` (K, M) is that of components and modes before the step. Afterwards component j is the mixture moved by
+        mode j. It belongs to mode j alone, so its weights (M, M) are diagonal: P(j) = sum_ci weight_ci Pi_ij.
+        """
+        return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ transition, axis=0))
 
     def list_moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return which mixture each predicted component was and which mode moved it: each mode moves one."""
+        """Return for each component after a step its mixture, always number 0, and the mode whose plant moved it."""
         return np.zeros(modes, int), np.arange(modes)
 
 
 class MergeByNextMode(AbstractMerging):
     """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
 
-    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return weights (K, M) that mix for each next mode all that lead to it, and those (M, M) after the move."""
-        mixed = weight @ rows
-        return mixed, jnp.diag(jnp.sum(mixed, axis=0))
+    def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the weights (K, M) of K components in a mixture for each next mode, and those of the mixtures (M, M).
+
+        `weight` [c, i] is P(component c, mode i) before the step, and `transition` is the modes' matrix Pi.
+        """
+        # [c, j]: P(component c, next mode j) = sum_i weight_ci Pi_ij
+        mixing = weight @ transition
+        # After the step component j belongs to mode j alone, with P(next mode j) on the diagonal.
+        return mixing, jnp.diag(jnp.sum(mixing, axis=0))
 
 
 class MergeByMode(AbstractMerging):
@@ -91,12 +120,15 @@ class MergeByMode(AbstractMerging):
 
     @property
     def corrects_pairs(self) -> bool:
-        """Always True."""
+        """True: z corrects a Gaussian for each pair (mode before, mode after a step); these are merged afterwards."""
         return True
 
-    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return weights (K, M) that mix each mode's component alone, and the joint probabilities after the move."""
-        return weight, jnp.sum(weight, axis=0)[:, None] * rows
+    def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return weights (M, M) that merge nothing, as component i is that of mode i, and the weights after the step.
+
+        `weight` is diagonal: P(mode i). After the step weight [i, j] is P(mode i before, mode j) = P(i) Pi_ij.
+        """
+        return weight, jnp.sum(weight, axis=0)[:, None] * transition
 
     def list_update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs (component, mode) of the update: every component with every mode."""
@@ -119,11 +151,11 @@ class MergePairs(AbstractMerging):
 
     @property
     def corrects_pairs(self) -> bool:
-        """Always True."""
+        """True: z corrects a Gaussian for each pair (mode before, mode after a step); these are merged afterwards."""
         return True
 
     def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
-        """Return one Gaussian for each present mode, merged from its pairs."""
+        """Return one Gaussian for each present mode, merged from its pairs (mode before, present mode)."""
         return jax.vmap(partial(merge_mixture, gaussians), in_axes=1)(normalise_columns(weight))
 
     def initial_weights(self, law: jax.Array) -> jax.Array:
@@ -131,13 +163,18 @@ class MergePairs(AbstractMerging):
         modes = len(law)
         return self._by_mode(jnp.eye(modes).reshape(-1) * jnp.repeat(law, modes), modes)
 
-    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return weights (M^2, M) that merge what ends in one mode, and those of pairs (j, l) after it, P(j) T_jl."""
-        modes = len(rows)
-        return weight, self._by_mode((jnp.sum(weight, axis=0)[:, None] * rows).reshape(-1), modes)
+    def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the weights (M^2, M) of pairs (i, j) in a mixture for each mode j, and those of pairs after the step.
+
+        `weight` holds P(mode i before, mode j now) of pair (i, j) in column j, and so merges all pairs that end in mode
+        j. After the step the pair (j, l) is mixture j moved by mode l, with P(j, l) = P(j) Pi_jl in column l.
+        """
+        modes = len(transition)
+        pair_probability = jnp.sum(weight, axis=0)[:, None] * transition
+        return weight, self._by_mode(pair_probability.reshape(-1), modes)
 
     def list_moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return which mixture each predicted component was and which mode moved it: each mode moves all."""
+        """Return for each pair (j, l) after a step its mixture j, and the mode l whose plant moved it."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def list_update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +200,7 @@ def normalise_columns(weight: jax.Array) -> jax.Array:
 def mix_and_predict(
     plant: AbstractPlant,
     transform: AbstractTransform,
-    parts: Gaussian,
+    components: Gaussian,
     weight: jax.Array,
     u: jax.Array,
     initial_power: jax.Array,
@@ -173,28 +210,28 @@ def mix_and_predict(
     Args:
         plant: f, and the law of w.
         transform: of moments, for a nonlinear plant.
-        parts: Gaussians that are mixed, one a component.
+        components: Gaussians that are mixed, one a component.
         weight: [c, g], weight of component c in mixture g; columns need not sum to 1.
         u: input.
         initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
-    share = normalise_columns(weight)
+    shares = normalise_columns(weight)
     # Through a nonlinear plant each mixture goes as one Gaussian.
     if not isinstance(plant, LinearPlant):
-        mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
+        mixtures = jax.vmap(partial(merge_mixture, components), in_axes=1)(shares)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, initial_power))(mixtures)
-    # A linear plant moves the parts before they are mixed, each once rather than once for each mixture: their means
-    # A m + shift(u), the shift with the mean of w in it, and their covariances A P A'.
+    # A linear plant moves each component once before they are mixed, not once for each mixture: to the mean
+    # A m + B u + E w and the covariance A P A'.
     matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
-    means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
-    spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
+    means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(components.mean)
+    spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(components)
 
     def mix_moved(weights: jax.Array) -> Gaussian:
-        """Return one mixture of the moved parts, with the process noise."""
+        """Return one mixture of the moved components by these weights, with the process noise: A P A' mixed, plus Q."""
         mean, covariance = moments_of_mixture(means, spreads, weights)
         return from_covariance_by_elimination(mean, covariance + noise)
 
-    moved: Gaussian = jax.vmap(mix_moved, in_axes=1)(share)
+    moved: Gaussian = jax.vmap(mix_moved, in_axes=1)(shares)
     return moved
 
 
@@ -202,20 +239,20 @@ def mix_and_predict_by_mode(
     plants: Sequence[AbstractPlant],
     plant_of: np.ndarray,
     transform: AbstractTransform,
-    parts: Gaussian,
+    components: Gaussian,
     weight: jax.Array,
     moves: tuple[np.ndarray, np.ndarray],
     u: jax.Array,
     initial_power: jax.Array,
 ) -> Gaussian:
-    """Return the Gaussians after a step: mixtures of `parts` by weights (components, mixtures), moved by modes' plants.
+    """Return the Gaussians after a step: mixtures of the components, each moved by the plant of a mode.
 
     Args:
         plants: the different plants.
         plant_of: [j], number of the plant of mode j.
         transform: of moments, for a nonlinear plant.
-        parts: Gaussians that are mixed, one a component.
-        weight: (components, mixtures).
+        components: Gaussians that are mixed.
+        weight: [c, g], weight of component c in mixture g.
         moves: two arrays, of each Gaussian after the step the number of the mixture that it was before, and the mode
             that moves it.
         u: input.
@@ -223,24 +260,24 @@ def mix_and_predict_by_mode(
     """
     mixture_of, mode_of = moves
     if len(plants) == 1:  # each mixture is moved once, however many modes it has afterwards
-        moved = mix_and_predict(plants[0], transform, parts, weight, u, initial_power)
+        moved = mix_and_predict(plants[0], transform, components, weight, u, initial_power)
         in_order = np.array_equal(mixture_of, np.arange(weight.shape[1]))
         return moved if in_order else jax.tree.map(lambda leaf: leaf[mixture_of], moved)
-    # Plant after plant, the components that it moves; then all of them in order again.
-    mixtures = mix_moments(parts, normalise_columns(weight))
-    plant_of_component, results = plant_of[mode_of], []
+    # Plant after plant, the mixtures that it moves; then all results in the order of the components after the step.
+    mixtures = mix_moments(components, normalise_columns(weight))
+    plant_of_result, results = plant_of[mode_of], []
     for number, plant in enumerate(plants):
-        sources = mixture_of[plant_of_component == number]
-        before = jax.tree.map(lambda leaf, sources=sources: leaf[sources], mixtures)
-        results.append(_predict_each(plant, transform, before, u, initial_power))
-    moved_order = np.concatenate([np.flatnonzero(plant_of_component == number) for number in range(len(plants))])
-    place_among_results = np.argsort(moved_order)  # of each component: the inverse permutation
-    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place_among_results], *results)
+        indices = mixture_of[plant_of_result == number]
+        mixtures_of_plant = jax.tree.map(lambda leaf, indices=indices: leaf[indices], mixtures)
+        results.append(_predict_each(plant, transform, mixtures_of_plant, u, initial_power))
+    order_by_plant = np.concatenate([np.flatnonzero(plant_of_result == number) for number in range(len(plants))])
+    inverse_order = np.argsort(order_by_plant)
+    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[inverse_order], *results)
     return joined
 
 
 class MixtureMoments(NamedTuple):
-    """Means (parts, n) and covariances (parts, n, n)."""
+    """Means (mixtures, n) and covariances (mixtures, n, n)."""
 
     mean: jax.Array
     covariance: jax.Array
@@ -261,18 +298,18 @@ def mix_moments(gaussians: Gaussian, share: jax.Array) -> MixtureMoments:
 def _predict_each(
     plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, initial_power: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of f(x, u) + w for each of some moments (..., n) of x.
+    """Return the Gaussian of f(x, u) + w for the mean and covariance of each mixture `x`.
 
-    Moments of a linear plant are moved as they are, without factors before. `initial_power`: E[x_i^2] at the start,
-    for rounding.
+    A linear plant moves covariances, A P A', without factors of them. `initial_power`: E[x_i^2] at the start, for
+    rounding.
     """
     if not isinstance(plant, LinearPlant):
-        before = jax.vmap(from_covariance_by_elimination)(*x)
-        return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, initial_power))(before)
+        gaussians = jax.vmap(from_covariance_by_elimination)(*x)
+        return jax.vmap(lambda gaussian: predict_gaussian(plant, transform, gaussian, u, initial_power))(gaussians)
     matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
 
     def move(mean: jax.Array, covariance: jax.Array) -> Gaussian:
-        """Move one pair of moments."""
+        """Return the Gaussian of A m + B u + E w and A P A' + Q, from one mean m and covariance P."""
         return from_covariance_by_elimination(matrix @ mean + plant.shift(u), matrix @ covariance @ matrix.T + noise)
 
     moved: Gaussian = jax.vmap(move)(*x)

@@ -41,10 +41,10 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, describ
 
 
 class ModeObservedBelief(NamedTuple):
-    """Belief given the data, and what the last correction is repeated from once its mode is known.
+    """Estimate given the data, and what is needed to repeat the last correction once its mode is known.
 
-    `before`: its prior; `z` (m,): the measurement used then; `move`: the plant's motion since. `begun`: once there was
-    a correction.
+    `belief`: moments of x given the data, and before any data; `before`: those before the last correction; `z` (m,):
+    the measurement used in it; `move`: the plant's motion since. `begun`: True once there was a correction.
     """
 
     belief: LinearBelief
@@ -94,7 +94,10 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
-        """Predict both pairs of moments over step k."""
+        """Predict the moments of x over step k, those given the data and those before any data.
+
+        The plant's motion is kept: a late report of the mode repeats the correction before it, and then the motion.
+        """
         move = motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
         return state._replace(belief=predict_belief(state.belief, move), move=move)
 
@@ -113,48 +116,51 @@ class ModeObservedFilter(AbstractSizedFilter):
         is_known = ~jnp.any(jnp.isnan(memory_states)) | (~state.begun if self.late else False)
         states_or_zero = jnp.nan_to_num(memory_states)  # what is computed with a 0 for a NaN is not used
         if self.late:
-            # The states that came are those of the step before: use them there first.
+            # The states that came are those of the step before: repeat its correction with them first.
             redone = self._redo_last_step(state, states_or_zero, k)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
-            described = self._describe_channel_after(state.begun, states_or_zero, k)
+            channel_moments = self._predict_channel_moments(state.begun, states_or_zero, k)
         else:
-            prior, described = state.belief, _find_moments_given_states(channel, states_or_zero)
+            prior, channel_moments = state.belief, _find_moments_given_states(channel, states_or_zero)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
-        after, innovation = correct_linear(prior, sensor, described, Polytope(), z, second_moments_at_start(self.plant))
+        after, innovation = correct_linear(
+            prior, sensor, channel_moments, Polytope(), z, second_moments_at_start(self.plant)
+        )
         after = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), after, prior)
-        value, spread = innovation.value, jnp.asarray(innovation.covariance)
-        # The innovation has a place for each number that arrives, also for these; they add nothing to the likelihood.
+        value, covariance = innovation.value, jnp.asarray(innovation.covariance)
+        # The innovation has an entry for each received number, also for the states, which are given: 0 or NaN.
         for memory_state in memory_states:
-            flag_innovation, spread = append_flag(spread, memory_state)
+            flag_innovation, covariance = append_flag(covariance, memory_state)
             value = jnp.append(value, flag_innovation)
         belief = ModeObservedBelief(belief=after, before=prior, z=usable, move=state.move, begun=jnp.asarray(True))
-        return belief, Innovation(value, spread, innovation.log_likelihood)
+        return belief, Innovation(value, covariance, innovation.log_likelihood)
 
     def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:
-        """Return the prior of step k, after the last correction is made again with what was learned since.
+        """Return the prior of step k after the correction of step k - 1 is made again, with the channel's state then.
 
-        The states of the links' memories are received one step late. They give better moments of the channel for the
-        last measurement `state.z`, which corrects the belief `state.before` again.
+        `memory_states` are numbers, received one step late: for each link with memory the number of its mode, or its
+        gain, at step k - 1. Given these, `state.z` corrects `state.before` again, and the plant moves the result.
         """
         last_step = jnp.maximum(jnp.asarray(k) - 1, 0)
         channel = _find_moments_given_states(at(self.channel, last_step), memory_states)
         initial_power = second_moments_at_start(self.plant)
+        no_uncertain_laws = Polytope()
         corrected, _ = correct_linear(
-            state.before, at(self.sensor, last_step), channel, Polytope(), state.z, initial_power
+            state.before, at(self.sensor, last_step), channel, no_uncertain_laws, state.z, initial_power
         )
         return predict_belief(corrected, state.move)
 
-    def _describe_channel_after(self, has_begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
-        """Return the channel's moments at step k, given the states of the links' memories one step before.
+    def _predict_channel_moments(self, has_begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
+        """Return the mean and covariance of (G, n) in z = G y + n at step k, given the links' states at step k - 1.
 
-        A memory is what a link remembers, such as its mode. At the first step (`has_begun` is False) there are no such
-        states.
+        A link's state is what it remembers: its mode, or a gain that drifts. At the first step (`has_begun` is False)
+        no earlier states exist, and the moments are those under the initial laws.
         """
         channel, last_step = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
-        at_later_step = _find_moments_given_earlier_states(at(self.channel, last_step), channel, memory_states)
-        at_first_step = _find_moments_given_earlier_states(None, channel, memory_states)
-        moments: SecondOrder = jax.tree.map(lambda a, b: jnp.where(has_begun, a, b), at_later_step, at_first_step)
+        given_last_states = _find_moments_of_next_states(at(self.channel, last_step), channel, memory_states)
+        at_first_step = _find_moments_of_next_states(None, channel, memory_states)
+        moments: SecondOrder = jax.tree.map(lambda a, b: jnp.where(has_begun, a, b), given_last_states, at_first_step)
         return moments
 
     @estimates
@@ -164,24 +170,35 @@ class ModeObservedFilter(AbstractSizedFilter):
 
 
 def _find_moments_given_states(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
-    """Return the second moments of the channel given the memories' states, as numbers."""
+    """Return the mean and covariance of (G, n) in z = G y + n, given the present states of the links' memories.
+
+    A memory is a chain of modes or a gain that drifts, and `numbers` holds its mode's number or the gain.
+    """
     states = [m.state_from_number(number) for m, number in zip(memories(channel).values(), numbers, strict=True)]
     return _find_nominal_moments(condition_on_memories(channel, states))
 
 
-def _find_moments_given_earlier_states(
-    last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array
+def _find_moments_of_next_states(
+    last_channel: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array
 ) -> SecondOrder:
-    """Return the moments of the channel given the memories' states one step before; without them, of the first step."""
-    # Of each memory its possible next states, with their probabilities: (state, weight) pairs.
-    choices = []
-    for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
-        state = None if last is None else memory.state_from_number(number)
+    """Return the mean and covariance of (G, n) in z = G y + n, given the links' states one step before.
+
+    Args:
+        last_channel: the channel one step before; None at the first step, where states have their initial laws.
+        channel: the channel at this step.
+        numbers: for each memory (a chain of modes, or a gain that drifts) its state one step before, as a number.
+    """
+    # For each memory pairs (next state, probability). A gain that drifts has quadrature points as next states, enough
+    # for the degree in which z depends on it.
+    next_states = []
+    known_memories = memories(channel if last_channel is None else last_channel)
+    for (identity, memory), number in zip(known_memories.items(), numbers, strict=True):
+        state = None if last_channel is None else memory.state_from_number(number)
         states, weights = memory.next_state_quadrature(state, channel.degree_in(identity))
-        choices.append([(states[j], weights[j]) for j in range(len(weights))])
-    # The channel is the mixture over all combinations.
+        next_states.append([(states[j], weights[j]) for j in range(len(weights))])
+    # The channel is the mixture over all combinations of next states.
     maps, probabilities = [], []
-    for combination in product(*choices):
+    for combination in product(*next_states):
         maps.append(condition_on_memories(channel, [state for state, _ in combination]))
         probabilities.append(jnp.asarray(prod(weight for _, weight in combination)))
     return _find_nominal_moments(Mixture(maps, jnp.stack(probabilities)))
@@ -205,7 +222,8 @@ def _find_nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
     """Return the best linear filter with side information: current modes or drifting gains of links arrive with z.
 
-    Its measurements are those of `with_flag(link)`; a `Node` refuses flags of the step before.
+    Its measurements are those of `with_flag(link)`: z, then for each link with memory the number of its mode, or its
+    gain, at the same step. A `Node` refuses a link that reports those of the step before.
 
     Args:
         plant: a linear plant, n states.
@@ -226,7 +244,8 @@ def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> M
 def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
     """Return the best linear filter with late side information: the links' modes or drifting gains of the step before.
 
-    Its measurements are those of `with_flag(link, late=True)`; a `Node` refuses flags of the same step.
+    Its measurements are those of `with_flag(link, late=True)`: z, then for each link with memory the number of its
+    mode, or its gain, one step before. A `Node` refuses a link that reports those of the same step.
 
     Args:
         plant: a linear plant, n states.
@@ -238,7 +257,8 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Mo
     Raises:
         ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
 
-    Source: the Kalman filter given the modes, and one update with the law of the mode that follows the last.
+    Source: the Kalman filter given all modes up to the step before, then one update under the law of the present mode
+    given the last.
     """
     return _make_mode_observed_filter(plant, sensor, channel, late=True)
 

@@ -52,7 +52,10 @@ class ModalLaw(NamedTuple):
 
 
 class MovedPairs(NamedTuple):
-    """Gaussians of the mode before, moved by the mode after, (M, M, n) by pair, and the smoother gains back."""
+    """The Gaussian of each mode i moved by the plant of each mode j, [i, j] (M, M, n), and the smoother gain back.
+
+    The gain gives the law of x before the step given x after it.
+    """
 
     gaussian: Gaussian
     back: BackwardGain
@@ -95,6 +98,20 @@ def move_pairs(
     return pairs
 
 
+class PairSmootherTerms(NamedTuple):
+    """What a smoother by pairs (mode i before, mode j after) needs of a step of M modes.
+
+    What later data say of mode j is the ratio of its smoothed Gaussian to `reference`, the Gaussian of mode j without
+    them: predicted, or filtered if pairs take z before they are merged. This ratio corrects the Gaussians of the pairs
+    (i, j), `pairs` (M^2, n), of probabilities `weights` (M, M). `smoother_gains` take them back to mode i.
+    """
+
+    reference: Gaussian
+    pairs: Gaussian
+    weights: jax.Array
+    smoother_gains: BackwardGain
+
+
 class FutureObservation(NamedTuple):
     """What the future says of a mode's state: h x + noise = value, NaN where it says nothing.
 
@@ -117,35 +134,38 @@ def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
         later: N(s, S), what is known with later data.
         known: N(q, Q), what was known before these.
     """
-    # Whitening W of `known`, W Q W' = I, zero in components that are known exactly.
+    # W with W Q W' = I, and zeros for components that `known` has exactly.
     variances = jnp.sum(known.root**2 * known.variances, axis=1)
     varies = known.variances > SINGULAR * variances
     scale = jnp.where(varies, 1 / jnp.sqrt(jnp.where(varies, known.variances, 1.0)), 0.0)
     n, lower = len(known.mean), unit_lower(known.lower)
     whitening = scale[:, None] * decorrelate(lower, jnp.eye(n))
-    # W S W' = T diag(e) T', V' = T' W; what is known exactly has e = 1, so that it is told nothing.
+    # W S W' = T diag(e) T' and V' = T' W. What is known exactly gets e = 1: later data add no information.
     root = whitening @ later.root
-    e, turn = eigh((root * later.variances) @ root.T + jnp.diag(jnp.where(varies, 0.0, 1.0)))
-    gained = 1 - jnp.maximum(e, 0.0)
-    tells = gained > NOTHING
+    e, T = eigh((root * later.variances) @ root.T + jnp.diag(jnp.where(varies, 0.0, 1.0)))
+    information = 1 - jnp.maximum(e, 0.0)
+    is_informative = information > NOTHING
     # sqrt(1 - e) (V's - e V'q) / (1 - e) = sqrt(1 - e) V'q + V'(s - q) / sqrt(1 - e).
-    share = jnp.sqrt(jnp.where(tells, gained, 1.0))
-    axes = turn.T @ whitening
-    rows = share[:, None] * axes
-    value = rows @ known.mean + axes @ (later.mean - known.mean) / share
+    scaling = jnp.sqrt(jnp.where(is_informative, information, 1.0))  # sqrt(1 - e)
+    V_transposed = T.T @ whitening
+    rows = scaling[:, None] * V_transposed
+    value = rows @ known.mean + V_transposed @ (later.mean - known.mean) / scaling
     return FutureObservation(
         rows=rows,
-        value=jnp.where(tells, value, jnp.nan),  # NaN: no observation
-        noise=jnp.where(tells, jnp.maximum(e, 0.0), 1.0),
+        value=jnp.where(is_informative, value, jnp.nan),  # NaN: no observation
+        noise=jnp.where(is_informative, jnp.maximum(e, 0.0), 1.0),
     )
 
 
 class ModalSmootherStep(SmootherStep):
-    """Smoother step of a filter of modes: what the pass back needs of each pair of modes, and the moments of all.
+    """Smoother step of a filter of modes: the Gaussian of each pair of modes, and the whole mixture as one Gaussian.
 
-    law: after the step, mode by mode. known: what the ratio of a later law is to, (M, n). pairs: (M, M, n), of mode
-    before and after, with their weights (M, M), and the ways back to the former. The pass back keeps modes; a fixed
-    point and draws of paths are of the moments of the whole mixture, where all modes have one law of motion.
+    law: Gaussian and probability of each mode j after the step. known: the Gaussian of each mode j that a smoothed one
+    is divided by (M, n), to find what later data say. pairs: for mode i before and mode j after the step a Gaussian
+    [i, j], (M, M, n), with its probability in `weights` (M, M), and the smoother gain back to mode i in `ways`.
+
+    The pass back keeps a Gaussian for each mode. Smoothing of a fixed point, and draws of paths, use the whole mixture
+    as one Gaussian; they need one plant for all modes.
     """
 
     law: ModalLaw = eqx.field(kw_only=True)
@@ -179,17 +199,18 @@ class ModalSmootherStep(SmootherStep):
             after, innovation = condition_on_measurement(x, slopes, noise, observed.value, expected)
             return after, jnp.asarray(innovation.log_likelihood)
 
-        after, score = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, observations)
-        # P(i, j | all) = P(j | all) P(i | j, all): of each later mode j, the share of each mode i before.
+        corrected, log_likelihood = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, observations)
+        # P(i, j | all data) = P(j | all data) P(i | j, all data), where P(i | j, all data) is proportional to P(i, j)
+        # times the likelihood of the observation.
         possible = self.weights > 0
-        logs = jnp.where(possible, jnp.log(jnp.where(possible, self.weights, 1.0)) + score, -jnp.inf)
-        most = jnp.max(logs, axis=0)
-        shares = jnp.where(possible, jnp.exp(logs - jnp.where(jnp.isfinite(most), most, 0.0)), 0.0)
-        total = jnp.sum(shares, axis=0)
-        joint = later.law * shares / jnp.where(total > 0, total, 1.0)
-        # Each pair back to its mode before, then merged over the modes after.
-        before = jax.vmap(jax.vmap(rts_step))(self.ways, after)
-        merged = jax.vmap(merge_mixture)(before, normalise_columns(joint.T).T)
+        log_weight = jnp.where(possible, jnp.log(jnp.where(possible, self.weights, 1.0)) + log_likelihood, -jnp.inf)
+        largest = jnp.max(log_weight, axis=0)
+        weight = jnp.where(possible, jnp.exp(log_weight - jnp.where(jnp.isfinite(largest), largest, 0.0)), 0.0)
+        total = jnp.sum(weight, axis=0)
+        joint = later.law * weight / jnp.where(total > 0, total, 1.0)
+        # Rauch's step takes each pair (i, j) back to mode i. Then the pairs of mode i are merged.
+        smoothed = jax.vmap(jax.vmap(rts_step))(self.ways, corrected)
+        merged = jax.vmap(merge_mixture)(smoothed, normalise_columns(joint.T).T)
         law = jnp.sum(joint, axis=1)
         return ModalLaw(merged, law / jnp.sum(law))
 

@@ -22,13 +22,15 @@ from heliograph.random_affine.modes import JointModes, joint_modes
 def describe_joint_modes(
     plant: AbstractPlant, sensor: AbstractSensor, channel: Channel, nodes: int
 ) -> tuple[JointModes, ChannelByPattern | OverTime]:
-    """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step.
+    """Return the joint modes of plant, sensor and links as one chain, and the law of what arrives at each step.
 
-    A gain that drifts is replaced by a chain of `nodes` modes.
+    The law is given for each mode and each pattern of components that arrive. A gain that drifts is replaced by a chain
+    of `nodes` modes.
     """
     steps = [joint_modes(step, nodes, beside=(plant, sensor)) for step in unstack(channel)]
     modes = len(steps[0].initial)
-    by_pattern = describe_by_pattern(steps, np.ones((modes, 1)))  # no flag tells the mode
+    # Nothing that is received reports the mode: all modes have the same flag, with probability 1.
+    by_pattern = describe_by_pattern(steps, np.ones((modes, 1)))
     if modes > 1:
         for step in by_pattern:
             _check_density(step)
@@ -39,13 +41,16 @@ def describe_joint_modes(
 def _check_density(channel: ChannelByPattern) -> None:
     """Raise ValueError unless z has a density in every mode and pattern of arrivals, for an x that has one.
 
-    `channel.present` says which components arrive in a pattern. `channel.mean` and `channel.spread` are moments of
-    (G, n) with z = G y + n. Traced moments have no numbers, and are not checked: typical ones were checked before.
+    Otherwise z in this mode lies in a subspace, and such a value would have an infinite likelihood in it.
+    `channel.present` says which components arrive in a pattern. `channel.mean` and `channel.spread` are the mean and
+    covariance of (G, n) with z = G y + n. Traced moments have no numbers, and are not checked: their assumed values
+    were checked before.
     """
     if is_traced((channel.mean, channel.gain_spread, channel.noise)):
         return
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
-        # E[z z'] for E[y y'] = I, without n, is regular if every combination of the rows that arrive is random.
+        # With E[y y'] = I, E[z z'] = E[G] E[G]' + sum_a Cov(G_ia, G_la) + Cov n. It is regular if every combination of
+        # the components that arrive is random.
         arriving, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
         second_moment = gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a]))
         if np.linalg.matrix_rank(second_moment[np.ix_(arriving, arriving)]) < len(arriving):
@@ -68,17 +73,22 @@ def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...
 def fields_of_mode_filters(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
 ) -> dict[str, Any]:
-    """Return the fields that all filters of modes share; a gain that drifts has `nodes` modes."""
+    """Return the fields with which every filter of modes is constructed, from its checked models.
+
+    Joint modes are those of plant, sensor and links together; a gain that drifts is replaced by a chain of `nodes`
+    modes. The filter's covariance is nominal.
+    """
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     for model in list_mode_models(first(sensor)):
         check_link(model, first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
-    joint, described = describe_joint_modes(first(plant), first(sensor), channel, nodes)
+    joint, channel_by_pattern = describe_joint_modes(first(plant), first(sensor), channel, nodes)
+    plant_of_mode, sensor_of_mode = zip(*joint.beside, strict=True)
     return {
         "plant": drop_names(plant), "sensor": drop_names(sensor),
-        "channel": described, "initial": joint.initial, "observed_angles": angles,
+        "channel": channel_by_pattern, "initial": joint.initial, "observed_angles": angles,
         "transform": Cubature() if transform is None else transform,
-        "plant_modes": find_models("plant", plant, [one for one, _ in joint.beside]),
-        "sensor_modes": find_models("sensor", sensor, [one for _, one in joint.beside]),
+        "plant_modes": find_models("plant", plant, plant_of_mode),
+        "sensor_modes": find_models("sensor", sensor, sensor_of_mode),
         **make_sizes("nominal", start, first(channel).outputs),
     }  # fmt: skip

@@ -15,7 +15,6 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import (
-    BackwardGain,
     Gaussian,
     from_covariance,
     merge_mixture,
@@ -52,7 +51,7 @@ from heliograph.filters.modes.mixing import (
     mix_and_predict_by_mode,
     replicate,
 )
-from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherStep, move_pairs
+from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherStep, PairSmootherTerms, move_pairs
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
@@ -89,20 +88,21 @@ def correct_in_every_mode(
         angles: components of z that are angles.
     """
     # Channel moments by mode, given which components arrived.
-    kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
-    links = jax.tree.map(lambda part: jnp.asarray(part)[mode, kind], (channel.mean, channel.gain_spread, channel.noise))
+    pattern = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
+    moments = channel.mean, channel.gain_spread, channel.noise
+    links = jax.tree.map(lambda by_mode: jnp.asarray(by_mode)[mode, pattern], moments)
     # Prior weights given which components arrived.
-    chance = weight * jnp.asarray(channel.chance)[mode, kind]
-    total = jnp.sum(chance)
-    prior = jnp.where(total > 0, chance / jnp.where(total > 0, total, 1.0), weight)
+    joint = weight * jnp.asarray(channel.chance)[mode, pattern]
+    total = jnp.sum(joint)
+    prior = jnp.where(total > 0, joint / jnp.where(total > 0, total, 1.0), weight)
     correct = partial(_correct_in_mode, z=z, angles=angles)
-    posteriors, received = jax.vmap(correct)(signal, *links)
-    # Posterior weights; beliefs stay as they are where no mode, or not this one, can produce such a value.
-    weights, density, excluded = posterior_weights(prior, jnp.where(chance > 0, received.log_likelihood, -jnp.inf))
-    possible = (chance > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
-    after = jax.tree.map(lambda a, b: jnp.where(possible[:, None], a, b), posteriors, signal.prior)
-    value = wrap_near(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
-    return after, weights, mixed_innovation(prior, value, received.covariance, density)
+    posteriors, innovations = jax.vmap(correct)(signal, *links)
+    # Posterior weights. A Gaussian stays as it is if its mode, or every mode, cannot produce such a value.
+    weights, density, excluded = posterior_weights(prior, jnp.where(joint > 0, innovations.log_likelihood, -jnp.inf))
+    is_possible = (joint > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
+    corrected = jax.tree.map(lambda a, b: jnp.where(is_possible[:, None], a, b), posteriors, signal.prior)
+    value = wrap_near(jnp.asarray(innovations.value), innovations.value[jnp.argmax(prior)], angles)
+    return corrected, weights, mixed_innovation(prior, value, innovations.covariance, density)
 
 
 def _correct_in_mode(
@@ -143,20 +143,6 @@ class ModalBeliefs(NamedTuple):
 NODES = 3  # modes that stand for a gain that drifts
 
 
-class _PairSmootherTerms(NamedTuple):
-    """What a smoother by pairs (mode i before, mode j after) needs of a step of M modes.
-
-    `known`: the Gaussian of each mode j that the smoothed one is compared with, predicted, or filtered where pairs take
-    z before they are merged. `pairs` (M^2, n): those that observe what the future says; `weights` (M, M): their
-    probabilities; `ways`: smoother gains back.
-    """
-
-    known: Gaussian
-    pairs: Gaussian
-    weights: jax.Array
-    ways: BackwardGain
-
-
 class MultipleModelFilter(AbstractSizedFilter):
     """Filter of the state and of the mode of links with memory; built by `imm_filter`, `gpb1_filter` and `gpb2_filter`.
 
@@ -187,21 +173,25 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
-        """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
+        """Merge components to mixtures by the chain, then move each mixture by the plant of its mode.
+
+        At the first prediction the chain has its initial law.
+        """
         plants, u, modes = list_mode_models(at(self.plant, k)), jnp.asarray(u), len(self.initial)
+        # Weights of components in mixtures (K, mixtures), and P(component, mode) after the step (K, M).
         mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, u, k))
-        parts = mix_and_predict_by_mode(
+        predicted = mix_and_predict_by_mode(
             plants=plants,
-            plant_of=np.array(self.plant_modes),
+            plant_of=np.array(self.plant_modes),  # number of each mode's plant
             transform=self.transform,
-            parts=state.gaussian,
+            components=state.gaussian,
             weight=mixing,
-            moves=self.merging.list_moves(modes),
+            moves=self.merging.list_moves(modes),  # which mixture each new component was, and which mode moves it
             u=u,
             initial_power=second_moments_at_start(self.plant),
         )
-        parts = parts._replace(mean=align_angles(plants[0], parts.mean, jnp.sum(weight, axis=1)))
-        return ModalBeliefs(parts, weight, jnp.asarray(True))
+        predicted = predicted._replace(mean=align_angles(plants[0], predicted.mean, jnp.sum(weight, axis=1)))
+        return ModalBeliefs(predicted, weight, jnp.asarray(True))
 
     def transition_matrix(self, state: ModalBeliefs, u: jax.Array, k: Step) -> jax.Array:
         """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
@@ -210,45 +200,49 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
-        """Correct each component in each mode with z, and weight them by their likelihood.
-
-        There is an update for each pair (component, mode), and `updating_mode` holds the mode of each.
-        """
+        """Correct a Gaussian for each pair (component, mode) with z, and weight the pairs by their likelihood."""
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
-        _, updating_mode = self.merging.list_update_pairs(modes)
-        signal, weights = self.prior_signals(state, k)
+        _, mode_of_pair = self.merging.list_update_pairs(modes)
+        signal, prior_weight = self.prior_signals(state, k)
         plant = list_mode_models(at(self.plant, k))[0]  # all models have the same angles
-        after, weight, innovation = correct_in_every_mode(
-            signal, channel, jnp.asarray(updating_mode), weights, z, self.observed_angles
+        corrected, weight, innovation = correct_in_every_mode(
+            signal, channel, jnp.asarray(mode_of_pair), prior_weight, z, self.observed_angles
         )
-        gaussians = after._replace(mean=align_angles(plant, after.mean, weight))
+        gaussians = corrected._replace(mean=align_angles(plant, corrected.mean, weight))
         return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
-        """Return the signal of each pair (component, mode) that is corrected, and its weight before."""
-        i, j = self.merging.list_update_pairs(len(self.initial))
-        return self.signals_of_pairs(state.gaussian, (i, j), k), state.weight[i, j]
+        """Return for all pairs (component, mode) that z corrects: moments of the sensor's signal, and prior weights.
 
-    def signals_of_pairs(self, parts: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
-        """Return the signal of each pair (component, mode): of the mode's sensor under the component's prior."""
+        The signal is that of the mode's sensor if x has the component's Gaussian.
+        """
+        component, mode = self.merging.list_update_pairs(len(self.initial))
+        return self.signals_of_pairs(state.gaussian, (component, mode), k), state.weight[component, mode]
+
+    def signals_of_pairs(self, components: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
+        """Return for each pair (component, mode) the moments of the signal y of the mode's sensor, for x ~ component.
+
+        `pairs`: numbers of the components and of the modes. `components`: Gaussians of x with a leading axis.
+        """
         plant, sensors = list_mode_models(at(self.plant, k))[0], list_mode_models(at(self.sensor, k))
         (component, mode), start = pairs, second_moments_at_start(self.plant)
         sensor_of_pair, results = np.array(self.sensor_modes)[mode], list[Signal]()
-        # Sensor after sensor: of each component once, then one for each of the sensor's pairs.
         for number, sensor in enumerate(sensors):
-            of_pairs = component[sensor_of_pair == number]
-            once = np.unique(of_pairs)
-            priors = parts if len(once) == len(parts.mean) else jax.tree.map(lambda leaf, i=once: leaf[i], parts)
+            # Each different component of this sensor's pairs goes through the sensor once, and is then copied.
+            its_components = component[sensor_of_pair == number]
+            distinct = np.unique(its_components)
+            are_all = len(distinct) == len(components.mean)
+            priors = components if are_all else jax.tree.map(lambda leaf, i=distinct: leaf[i], components)
             measure = partial(find_signal_moments, plant, sensor, self.transform)
             signals = jax.vmap(lambda x, measure=measure: measure(x, start))(priors)
-            index = np.searchsorted(once, of_pairs)
+            index = np.searchsorted(distinct, its_components)
             results.append(jax.tree.map(lambda leaf, index=index: leaf[index], signals))
         if len(results) == 1:
             return results[0]
-        # The place of each pair among the results: the inverse of the permutation in which these are listed.
-        listed = np.concatenate([np.flatnonzero(sensor_of_pair == number) for number in range(len(sensors))])
-        place = np.argsort(listed)
-        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *results)
+        # The results are ordered by sensor: the inverse permutation orders them by pair again.
+        order_by_sensor = np.concatenate([np.flatnonzero(sensor_of_pair == number) for number in range(len(sensors))])
+        inverse_order = np.argsort(order_by_sensor)
+        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[inverse_order], *results)
         return joined
 
     @estimates
@@ -259,50 +253,56 @@ class MultipleModelFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim, state.law)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
+        """Return the step of smoothing by pairs (mode before, mode after), and the mixtures around it as Gaussians."""
         plants, modes = list_mode_models(at(self.plant, step.k)), len(self.initial)
         law = self._find_law_by_mode(step.after)
-        pairs_of_modes = self._describe_pairs(step, law)
+        terms = self._describe_pairs(step, law)
         merged = step.map_states(_merge_mixture)
         # With several plants no single function moves the whole mixture, so it has no smoother step of its own.
-        moments: Any = None
+        merged_before: Any = None
         if len(plants) == 1:
-            moments = smoother_step_by_transform(self, merged, first(self.plant)).before
+            merged_before = smoother_step_by_transform(self, merged, first(self.plant)).before
+        pairs = jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), terms.pairs)  # [i, j]
         return ModalSmootherStep(
-            merged.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law,
-            known=pairs_of_modes.known, ways=pairs_of_modes.ways, weights=pairs_of_modes.weights,
-            pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs_of_modes.pairs),
+            merged.after, merged_before, claim=self.claim, manifold=first(self.plant).manifold, law=law,
+            known=terms.reference, ways=terms.smoother_gains, weights=terms.weights, pairs=pairs,
         )  # fmt: skip
 
     def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
-        """Return the law of a state after a correction, mode by mode."""
+        """Return the Gaussian and the probability of each mode, from a filter's state after a correction."""
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
-    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> _PairSmootherTerms:
-        """Return what a smoother by pairs of modes needs of a step; `after`: the law by mode after its correction."""
+    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> PairSmootherTerms:
+        """Return what a smoother by pairs (mode i before the step, mode j after it) needs of a step.
+
+        It is the Gaussian and the probability of each pair, the smoother gain back to mode i, and the Gaussian of each
+        mode j without later data, to which a smoothed one is compared. `after`: the law by mode after the correction.
+        """
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = list_mode_models(at(self.plant, k)), second_moments_at_start(self.plant)
+        # The Gaussian of mode i moved by the plant of mode j, with P(i, j) = P(i) Pi_ij.
         moved = move_pairs(
             plants, np.array(self.plant_modes), self.transform, before.gaussian, jnp.asarray(step.u), start
         )
         pairs = jax.tree.map(lambda leaf: leaf.reshape(modes**2, *leaf.shape[2:]), moved.gaussian)
         weights = before.law[:, None] * self.transition_matrix(step.before, jnp.asarray(step.u), k)
-        known = after.gaussian if self.merging.corrects_pairs else step.prior.gaussian
-        pairs = pairs._replace(mean=plants[0].near(pairs.mean, jnp.tile(known.mean, (modes, 1))))
-        if not self.merging.corrects_pairs:
-            return _PairSmootherTerms(known=known, pairs=pairs, weights=weights, ways=moved.back)
-        j = np.tile(np.arange(modes), modes)
-        signal = self.signals_of_pairs(pairs, (np.arange(modes**2), j), k)
-        pairs, weight, _ = correct_in_every_mode(
-            signal, at(self.channel, k), jnp.asarray(j), weights.reshape(-1), jnp.asarray(step.z), self.observed_angles
-        )
-        return _PairSmootherTerms(known=known, pairs=pairs, weights=weight.reshape(modes, modes), ways=moved.back)
+        # Later data correct the pairs as the filter corrects: filtered pairs (GPB2), else predicted ones.
+        reference = after.gaussian if self.merging.corrects_pairs else step.prior.gaussian
+        pairs = pairs._replace(mean=plants[0].near(pairs.mean, jnp.tile(reference.mean, (modes, 1))))
+        if self.merging.corrects_pairs:
+            j = np.tile(np.arange(modes), modes)
+            signal, z = self.signals_of_pairs(pairs, (np.arange(modes**2), j), k), jnp.asarray(step.z)
+            pairs, weights, _ = correct_in_every_mode(
+                signal, at(self.channel, k), jnp.asarray(j), weights.reshape(-1), z, self.observed_angles
+            )
+            weights = weights.reshape(modes, modes)
+        return PairSmootherTerms(reference=reference, pairs=pairs, weights=weights, smoother_gains=moved.back)
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
     """Return one Gaussian with the mean and covariance of the mixture."""
-    weights, parts = state.components
-    return merge_mixture(parts, weights)
+    weights, components = state.components
+    return merge_mixture(components, weights)
 
 
 @accept_limits

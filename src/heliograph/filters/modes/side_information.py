@@ -11,14 +11,12 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import (
     WeightedColumns,
-    below_diagonal,
     join_columns,
     reciprocal_or_zero,
     rounding_of,
     side_by_side,
     square_root,
     triangularise,
-    unit_lower,
     unit_of,
 )
 from heliograph.factors.factored_gaussian import Innovations, from_covariance
@@ -27,14 +25,20 @@ from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_st
 from heliograph.filters.gaussian.signal_moments import bound_signal_power_at_start, factor_spread
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag, describe_by_pattern, pattern_of
 from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows
-from heliograph.filters.modes.jump_linear_filter import (
-    concatenate_modes,
+from heliograph.filters.modes.jump_linear_filter import concatenate_modes, make_mode_sum_matrix, subtract_mean_output
+from heliograph.filters.modes.linear_by_mode import (
+    centred_measurement,
+    centred_transition,
     kron,
-    make_mode_sum_matrix,
-    predict_by_mode,
-    subtract_mean_output,
+    multiply_by_transition,
+    noise_in_mode,
 )
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
+from heliograph.filters.modes.side_information_state import (
+    SideInformationBelief,
+    make_belief,
+    mode_probabilities,
+    split_columns,
+)
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
@@ -45,41 +49,9 @@ from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.linalg import outer
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes
-
-
-class SideInformationBelief(NamedTuple):
-    """s, the estimate of zeta, and factors of E[q q' 1{mode} | side information] of q = (e, x~), of each mode.
-
-    x~ = (x - c, 1) with c = E[x] before any data, zeta holds x~ 1{mode}, mode after mode, and e = zeta - s is the
-    error: in a mode, s follows from e and x~.
-
-    Shapes: with N = M (n + 1) and q = N + n + 1: mean (N,), lower (M, q (q - 1) / 2), variances (M, q), centre c (n,).
-    """
-
-    mean: Float[jax.Array, " N"]
-    lower: Float[jax.Array, "M entries"]
-    variances: Float[jax.Array, "M q"]
-    centre: Float[jax.Array, " n"]
-    moved: Bool[jax.Array, ""]
-
-    @property
-    def moments(self) -> WeightedColumns:
-        """E[q q' 1{mode}] of each mode as columns (M, q, q)."""
-        return WeightedColumns(unit_lower(self.lower), self.variances)
-
-    @property
-    def errors(self) -> WeightedColumns:
-        """E[e e' | side information] as columns (N, M q): e the error of the estimate, q columns of each of M modes."""
-        of_errors = WeightedColumns(self.moments.matrix[:, : len(self.mean)], self.moments.weights)
-        return side_by_side(of_errors, np.ones(len(self.lower)))
-
-    @property
-    def covariance(self) -> Float[jax.Array, "N N"]:
-        """Second moment E[e e' | side information] of the error."""
-        return self.errors.covariance
 
 
 class SideInformationFilter(AbstractSizedFilter):
@@ -105,65 +77,70 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> SideInformationBelief:
-        """Return the prior, in which state and mode are independent; x~ = (x - c, 1), and p is the law of the modes."""
+        """Return the prior, in which x~ = (x - c, 1) and the mode, of law p, are independent.
+
+        The state holds E[q q' 1{mode = j}] for each mode j, q = (e, x~), where e = zeta - E zeta is the error of the
+        products zeta = (x~ 1{mode = 1}, ...). In mode j zeta is u_j (x) x~ with the unit vector u_j (Kronecker's
+        product), and E zeta = p (x) (0, 1).
+        """
         start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
-        unit = np.eye(len(self.states) + 1)[:, -1:]
-        # Columns of q = (e, x~) in each mode j. e is the error of (x~ 1{mode 1}, ...): e = 1_j (x) x~ - p (x) (0, 1).
-        x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
-        constant = jnp.zeros_like(x).at[:, -1:].set(unit)
-        errors = [kron(indicator[:, None], x) - kron(law[:, None], constant) for indicator in jnp.eye(len(law))]
+        mean_x = np.eye(len(self.states) + 1)[:, -1:]  # E x~ = (0, 1)
+        # x~ and E x~ over common columns, those of Cov x and one for E x~, so that E[q q' 1{j}] is P(j) times a sum.
+        x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), mean_x], axis=1)
+        expected_x = jnp.zeros_like(x).at[:, -1:].set(mean_x)
         weights = outer(law, jnp.append(prior.variances, 1.0))
+        errors = [kron(u_j[:, None], x) - kron(law[:, None], expected_x) for u_j in jnp.eye(len(law))]
         moments = WeightedColumns(jnp.stack([jnp.concatenate([e, x]) for e in errors]), weights)
-        factors, mean = jax.vmap(triangularise)(moments), jnp.kron(law, unit[:, 0])
-        return _make_belief(mean, factors, centre=jnp.asarray(start.initial_mean), moved=jnp.asarray(False))
+        factors, mean = jax.vmap(triangularise)(moments), jnp.kron(law, mean_x[:, 0])
+        return make_belief(mean, factors, centre=jnp.asarray(start.initial_mean), moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
         """Predict s+ = F s, and the moments of q = (e, x~) in each mode.
 
-        s estimates zeta = x~ 1{mode}, mode after mode, e = zeta - s, x~ = (x - c, 1). Where the mode goes from i to j,
-        e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~: 1_j is the unit vector of mode j, p_i row i of the transition matrix,
-        A~ the plant about the centre c, w~ its noise; `x` between two of them is the Kronecker product.
+        s estimates zeta = (x~ 1{mode = 1}, ...), e = zeta - s, x~ = (x - c, 1), and F has the blocks F_ji = Pi_ij A~.
+        Where the mode goes from i to j, x~+ = A~ x~ + w~, zeta+ = u_j (x) x~+ and F zeta = Pi_i (x) A~ x~, so that
+
+            e+ = F e + (u_j - Pi_i) (x) A~ x~ + u_j (x) w~
+
+        with the unit vector u_j, row Pi_i of the transition matrix, and Kronecker's product (x).
         """
         plant, channel = at(self.plant, k), at(self.channel, k)
-        move, _, centre = centred_transition(plant, u, state.centre)
-        modes, (errors, x, weights) = len(self.initial), _split_columns(state)
-        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
-        law = _mode_probabilities(x, weights) @ rows
-        # F e and A~ x~ of each mode, then e+ and x~+ of each transition.
-        errors = jax.vmap(lambda e: predict_by_mode(e, move, rows))(errors)
-        x = jax.vmap(lambda x: move @ x)(x)
-
-        def move_columns(change: jax.Array, e: jax.Array, x: jax.Array) -> jax.Array:
-            """Return q+ = (e+, x~+) of one transition i -> j, without noise; `change`: 1_j - p_i."""
-            return jnp.concatenate([e + kron(change[:, None], x), x])
-
-        # From all modes to each: their columns side by side, and the process noise.
+        A, _, next_centre = centred_transition(plant, u, state.centre)  # A~
+        modes, (errors, x, weights) = len(self.initial), split_columns(state)
+        transition = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))  # Pi
+        law = mode_probabilities(x, weights) @ transition
+        # Columns of F e and A~ x~ in each mode before the step, and of w~.
+        moved_errors = jax.vmap(lambda e: multiply_by_transition(e, A, transition))(errors)
+        moved_x = jax.vmap(lambda x: A @ x)(x)
         noise = noise_in_mode(plant, u, second_moments_at_start(self.plant))
 
-        def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> WeightedColumns:
-            """Return E[q+ q+' 1{next mode j}], from the indicator 1_j, P(j | i) by mode i (`chances`), and P(j).
+        def move_columns(u_j_less_row: jax.Array, moved_error: jax.Array, moved_x: jax.Array) -> jax.Array:
+            """Return the columns of (e+, x~+) after one transition i -> j, without noise; the first is u_j - Pi_i."""
+            return jnp.concatenate([moved_error + kron(u_j_less_row[:, None], moved_x), moved_x])
 
-            `errors` and `x` hold columns of e and x~ in each mode i, with `weights`. `rows` is the modes' transition
-            matrix, and `noise` holds columns of the process noise. `move_columns` maps (e, x~) to (e+, x~+).
+        def collect_moments(u_j: jax.Array, column: jax.Array, probability: jax.Array) -> WeightedColumns:
+            """Return columns of E[q+ q+' 1{next mode = j}], the sum over i of Pi_ij E[q+ q+' 1{mode = i}].
+
+            `u_j`: unit vector of mode j; `column`: Pi_ij for all i; `probability`: P(next mode = j).
             """
-            moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
-            process = WeightedColumns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
-            return triangularise(join_columns(side_by_side(moved, chances), process))
+            moved = WeightedColumns(jax.vmap(move_columns)(u_j - transition, moved_errors, moved_x), weights)
+            process = WeightedColumns(kron(jnp.append(u_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
+            return triangularise(join_columns(side_by_side(moved, column), process))
 
-        moments = jax.vmap(collect_into)(jnp.eye(modes), rows.T, law)
-        mean = predict_by_mode(state.mean[:, None], move, rows)[:, 0]
-        return _make_belief(mean, moments, centre, jnp.asarray(True))
+        moments = jax.vmap(collect_moments)(jnp.eye(modes), transition.T, law)
+        mean = multiply_by_transition(state.mean[:, None], A, transition)[:, 0]
+        return make_belief(mean, moments, next_centre, jnp.asarray(True))
 
     @corrects
     def correct(
         self, state: SideInformationBelief, z: ArrayLike, k: Step = 0
     ) -> tuple[SideInformationBelief, Innovation]:
-        """Weight the modes by the flag and by the pattern of arrivals, then project zeta on (1, s, z).
+        """Weight the modes by the flag and by which components arrived, then project zeta on (1, s, z).
 
-        z: what the channel delivers (m,), NaN for what did not arrive, and then the number of the flag, where
-        `flagged`.
+        zeta holds the products of (x - c, 1) and the modes' indicators, and s is its estimate before. z: what the
+        channel delivers (m,), NaN for what did not arrive, and then the number of the flag, if `flagged`.
         """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
@@ -173,10 +150,10 @@ class SideInformationFilter(AbstractSizedFilter):
         flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
-        # Moments given the side information: those of each mode are multiplied by weight = P(mode | side information)
-        # / P(mode); `excess` is what is added to them by it.
-        _, x, weights = _split_columns(state)
-        weight = weight / (weight @ _mode_probabilities(x, weights))
+        # Moments given the side information: those of mode j times weight_j = P(j | side information) / P(j). `excess`,
+        # the weights times weight_j - 1, is what this adds.
+        _, x, weights = split_columns(state)
+        weight = weight / (weight @ mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
         excess = jnp.asarray(weight - 1)[:, None] * state.variances
         links = jax.tree.map(
@@ -184,28 +161,32 @@ class SideInformationFilter(AbstractSizedFilter):
         )
         size = bound_signal_power_at_start(sensor, second_moments_at_start(self.plant))
         received = _make_measurement_model(prior, sensor, size, *links)
-        # What z says of zeta, then the innovation as it is reported: NaN for what did not arrive.
-        after, innovations, innovation = _project_on_data(prior, excess, received, z)
+        # The projection, then the innovation as it is reported: NaN for what did not arrive.
+        corrected, innovations, innovation = _project_on_data(prior, excess, received, z)
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
         value = jnp.where(arrived, innovation.mean, jnp.nan)
         covariance = jnp.where(arrived[:, None] & arrived, innovation.covariance, jnp.nan)
         if self.flagged:
             flag_innovation, covariance = append_flag(covariance, flag)
             value = jnp.append(value, flag_innovation)
-        return after, Innovation(value, covariance, likelihood)
+        return corrected, Innovation(value, covariance, likelihood)
 
     @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
-        """Return the estimate c + sum_j zeta_j, zeta_j that of (x - c) 1{mode j}, and its error's covariance."""
+        """Return the estimate of x = c + sum_j (x - c) 1{mode = j}, and its error's covariance.
+
+        The filter estimates the products (x - c, 1) 1{mode = j}, for c = E[x] before any data.
+        """
         projection = make_mode_sum_matrix(len(self.states), len(self.initial))
         covariance = state.errors.through(projection).covariance
         return Estimate(state.centre + projection @ state.mean, covariance, self.claim)
 
 
 class StackedMeasurementModel(NamedTuple):
-    """Model of what arrives: z = common + output zeta + noise, its noise in each mode times the mode's probability.
+    """Model of what arrives: z = common + output zeta + noise, with columns of E[noise noise' 1{mode}] in each mode.
 
-    Shapes: output (m, N), common (m,), noise (M, m, m) columns.
+    zeta holds the products of (x - c, 1) and the modes' indicators. Shapes: output (m, N), common (m,), noise columns
+    (M, m, m).
     """
 
     output: jax.Array
@@ -214,31 +195,10 @@ class StackedMeasurementModel(NamedTuple):
 
 
 class PredictedInnovation(NamedTuple):
-    """Innovation z - E[z | 1, s] (m,) and its covariance (m, m)."""
+    """Innovation of z (m,), z less its projection on 1 and the estimate s, and its covariance (m, m)."""
 
     mean: jax.Array
     covariance: jax.Array
-
-
-def _split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Split into columns of e (M, N, q) and of x~ (M, n + 1, q) in each mode, and their weights (M, q)."""
-    root, count = jnp.asarray(state.moments.matrix), len(state.mean)
-    return root[:, :count], root[:, count:], jnp.asarray(state.variances)
-
-
-def _make_belief(
-    mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
-) -> SideInformationBelief:
-    """Return the filter's state, with the triangular factors of each mode's moments (M, q, q)."""
-    lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))  # what is below the unit diagonal
-    return SideInformationBelief(
-        mean=mean, lower=lower, variances=jnp.asarray(moments.weights), centre=centre, moved=moved
-    )
-
-
-def _mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:
-    """Return the probabilities of the modes (M,), E[1^2 1{mode}]."""
-    return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
 
 
 def _make_measurement_model(
@@ -263,8 +223,8 @@ def _make_measurement_model(
         link: columns of Cov n_j (M, m, m).
     """
     measure, noise = centred_measurement(sensor, state.centre)  # C~ and R~
-    _, x, weights = _split_columns(state)
-    law = _mode_probabilities(x, weights)
+    _, x, weights = split_columns(state)
+    law = mode_probabilities(x, weights)
 
     def describe_noise(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
@@ -290,35 +250,35 @@ def _make_measurement_model(
 def _project_on_data(
     state: SideInformationBelief, excess: jax.Array, received: StackedMeasurementModel, z: jax.Array
 ) -> tuple[SideInformationBelief, Innovations, PredictedInnovation]:
-    """Project zeta on (1, s, z): what these say of the error e = zeta - s goes from e to the estimate s.
+    """Project zeta on (1, s, z): subtract from the error e = zeta - s its projection, and add it to the estimate s.
 
-    All random numbers are rows over common columns, those of all modes side by side, with weights: the second moment of
-    two of them is the weighted product of their rows. Before the side information (1, s) said nothing of e; what they
-    say now comes of the growth of the weights.
+    A random number a is a row over the columns of all modes side by side, so that E[a b] = a W b' with the diagonal
+    matrix W of the columns' weights. Before the side information E[e (1, s)] was 0, as s is a projection. The side
+    information changes W by `excess`, so that now E[e (1, s)] = e diag(excess) (1, s)'.
 
     Args:
-        state: s, and moments of (e, x~) in each mode, given the side information.
-        excess: by what the weights of the columns grew by it (M, q).
+        state: s, and moments of e and x~ = (x - c, 1) in each mode, given the side information.
+        excess: change of the weights by the side information (M, q).
         received: z = common + output zeta + noise.
         z: measurement (m,), NaN for what did not arrive.
 
     Returns:
         The state after; the innovations of z, each given the components before it; z - E[z | 1, s] and its covariance.
     """
-    errors, x, weights = _split_columns(state)
+    errors, x, weights = split_columns(state)
     m, count, modes, arrived = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
-    # Columns of the state and of the noise of z, in each mode.
+    # For each mode the columns of e, x~ and the noise of z: first those of the state, then those of the noise.
     errors, x = (jnp.pad(part, ((0, 0), (0, 0), (0, m))) for part in (errors, x))
     noise = jnp.pad(jnp.asarray(received.noise.matrix), ((0, 0), (0, 0), (weights.shape[1], 0)))
     weights = jnp.concatenate([weights, received.noise.weights], axis=1).reshape(-1)
     excess = jnp.pad(excess, ((0, 0), (0, m))).reshape(-1)
-    # Basis 1 and s = zeta - e; rows z, less what s says, and e: of all modes side by side, and their values.
+    # Rows over the columns of all modes: the basis (1, s) with s = zeta - e, then z - common - output s and e.
     zeta = jax.vmap(lambda j, x: kron(j[:, None], x))(jnp.eye(modes), x)
     innovation_rows = jnp.where(arrived[:, None], jax.vmap(lambda e: received.output @ e)(errors) + noise, 0.0)
     basis, rows = _join_modes(x[:, -1:], zeta - errors), _join_modes(innovation_rows, errors)
     values = jnp.where(arrived, z - received.common - received.output @ state.mean, 0.0)
-    # First 1 and s: e and z less what these say of them. Directions of s whose variance is rounding say nothing: eps of
-    # the second moments of x~, and of s itself.
+    # First e and z less their projections on 1 and s, made orthogonal. A direction of s whose variance is rounding (eps
+    # of the second moments of x~, and of s itself) is not used.
     size = jnp.tile(jnp.square(_join_modes(x)) @ weights, modes) + jnp.square(basis[1:]) @ weights
     smallest = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
     basis, basis_values, variances = orthogonalise_first_rows(basis, jnp.append(1.0, state.mean), weights, 1 + count)
@@ -326,15 +286,15 @@ def _project_on_data(
     gains = (rows @ (excess * basis).T) * inverses
     rows, values = rows - gains @ basis, jnp.append(values, -state.mean) - gains @ basis_values
     expected = PredictedInnovation(values[:m], WeightedColumns(rows[:m], weights).covariance)
-    # Then what z says of e.
+    # Then e less its projection on z.
     rows, values, variances = orthogonalise_first_rows(rows, values, weights, m)
     innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
-    # Factors of each mode.
+    # Triangular factors of the moments of (e, x~) in each mode.
     remaining = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
     moments = jax.vmap(triangularise)(
         WeightedColumns(jnp.concatenate([remaining, x], axis=1), weights.reshape(modes, -1))
     )
-    return _make_belief(-values[m:], moments, state.centre, state.moved), innovations, expected
+    return make_belief(-values[m:], moments, state.centre, state.moved), innovations, expected
 
 
 def _join_modes(*parts: jax.Array) -> jax.Array:
@@ -392,9 +352,13 @@ def side_information_filter(
 
 @cache_by_object
 def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[ChannelByPattern], bool]:
-    """Return the modes' initial probabilities, the channel by mode at each step, and whether all laws are known."""
+    """Return the modes' initial probabilities, the channel at each step, and whether all probabilities are known.
+
+    The channel is given by mode and by pattern of components that arrive.
+    """
     steps = [joint_modes(step) for step in unstack(channel)]
-    # All probabilities are known if every map has only one extreme law (corner).
+    # A law with uncertain probabilities has several extreme ones, the vertices of the set of possible laws.
     is_known = all(affine.corner_count() == 1 for step in steps for affine in step.maps)
-    no_flag = np.ones((len(steps[0].initial), 1))
-    return steps[0].initial, describe_by_pattern(steps, no_flag), is_known and not uncertain_chain(channel)
+    same_flag_in_all_modes = np.ones((len(steps[0].initial), 1))
+    by_pattern = describe_by_pattern(steps, same_flag_in_all_modes)
+    return steps[0].initial, by_pattern, is_known and not uncertain_chain(channel)

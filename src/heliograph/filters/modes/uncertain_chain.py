@@ -1,8 +1,18 @@
 """Upper bound behind Markov chains with uncertain, time-varying transition probabilities.
 
-With Pi + Delta_k for Pi, |Delta| <= radius, rows that sum to 0: the error before z is F e + (Delta x A~) zeta + w, so
-Sigma- <= (1 + b) F Sigma F' + (1 + 1/b) D + W with D >= sum_i p_i Delta_i Delta_i' x A~ Xi A~' for every such chain.
-Terms that depend on the law p of the modes are bounded over the interval of possible p.
+The estimated vector is zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), with the nominal transition F = Pi' (x) A~
+(Kronecker's product). The true chain is Pi + Delta, where |Delta_ij| <= radius_ij and each row Delta_i sums to 0. So
+the error e = zeta - (its estimate), whose second moment Sigma bounds, becomes
+
+    e+ = F e + (Delta' (x) A~) zeta + w        w: the draw of the next mode, and the plant's noise
+
+By Young's inequality (a + c)(a + c)' <= (1 + b) a a' + (1 + 1/b) c c' with any b > 0, and with p the modes' law,
+
+    E[e+ e+'] <= (1 + b) F Sigma F' + (1 + 1/b) D + W
+    D >= sum_i p_i Delta_i' Delta_i (x) A~ E[x~ x~'] A~'
+    W >= sum_i p_i Cov(1{next mode} | mode = i) (x) A~ E[x~ x~'] A~' + diag(p+) (x) Q~
+
+D and W bound the right-hand sides for every such Delta, and for every p between the bounds of the modes' law.
 """
 
 from typing import NamedTuple
@@ -22,14 +32,17 @@ from heliograph.filters.modes.jump_linear_filter import (
     compute_initial_moments,
     concatenate_modes,
     condition_modes_on_received,
-    factor_with_last_mode,
     fields_of_joint_modes,
     mean_from_centre,
-    predict_by_mode,
     rounding_of_received,
     subtract_mean_output,
 )
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
+from heliograph.filters.modes.linear_by_mode import (
+    centred_measurement,
+    centred_transition,
+    factor_with_last_mode,
+    multiply_by_transition,
+)
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
@@ -65,10 +78,10 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
     @compile_on_call
     def init(self) -> UncertainBelief:
-        """Return the prior, independent of the mode, whose initial law is known.
+        """Return the prior of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), where x~ = (x - centre, 1).
 
-        `low` and `high`, the ends of the modes' law, are equal at the start. `second_moment` is E[x~ x~'] with
-        x~ = (x - centre, 1).
+        State and mode are independent at the start, and the initial law of the mode is known: its lower and upper
+        bounds `low` and `high` are equal. `second_moment` is E[x~ x~'].
         """
         start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior, second_moment = compute_initial_moments(start, self.initial)
@@ -79,23 +92,32 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
-        """Propagate the bound on Sigma-; at the first prediction the mode has its initial law.
+        """Predict zeta = (x~ 1{mode = 1}, ...) by the nominal chain, and a bound on its error's covariance Sigma.
 
-        Sigma-: covariance of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - centre, 1). `young`: scalar of
-        Young's inequality, by which the bound of the nominal part grows; `added_noise`: noise and the uncertain part.
+        x~ = (x - c, 1) with c = E[x] before any data. The nominal transition F has the blocks F_ji = Pi_ij A~. For
+        every chain within the radius of Pi, and with a scalar b > 0 of Young's inequality,
+        Sigma+ <= (1 + b) F Sigma F' + (1 + 1/b) D + W: D bounds what the error of Pi adds, W the noise's covariance.
         """
-        x = state.gaussian
-        transition, radius = self._chain_and_radius(state, k)
-        matrix, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
-        root, young, added_noise = self._transition_factors(state, u, k)
-        deviation, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ transition
-        mean = predict_by_mode(deviation[:, None], matrix, transition)[:, 0] + mean_from_centre(law, centre)
-        after = from_columns(mean, join_columns(WeightedColumns(root, (1 + young) * x.variances), added_noise))
-        # E[x~ x~'] and nominal law one step later.
-        second_moment = matrix @ state.second @ matrix.T + noise
+        zeta = state.gaussian
+        transition, radius = self._chain_and_radius(state, k)  # Pi; at the first prediction I, with radius 0
+        A, Q, next_centre = centred_transition(at(self.plant, k), u, state.centre)  # A~ and Q~
+        # The mean of zeta counts x from 0: P(j) (c, 0) for each mode j, plus `deviation`, which F moves.
+        next_law = state.law @ transition
+        deviation = zeta.mean - mean_from_centre(state.law, state.centre)
+        moved_deviation = multiply_by_transition(deviation[:, None], A, transition)[:, 0]
+        mean = moved_deviation + mean_from_centre(next_law, next_centre)
+        # Sigma = L diag(variances) L' becomes (1 + b) F L diag(variances) (F L)' + columns of (1 + 1/b) D + W.
+        slopes, b, added_noise = self._transition_factors(state, u, k)
+        predicted = from_columns(mean, join_columns(WeightedColumns(slopes, (1 + b) * zeta.variances), added_noise))
         low, high = _bound_next_law(transition, radius, state.low, state.high)
         return UncertainBelief(
-            gaussian=after, second=second_moment, centre=centre, law=law, low=low, high=high, moved=jnp.asarray(True)
+            gaussian=predicted,
+            second=A @ state.second @ A.T + Q,  # E[x~+ x~+']
+            centre=next_centre,
+            law=next_law,
+            low=low,
+            high=high,
+            moved=jnp.asarray(True),
         )
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
@@ -108,54 +130,66 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def _transition_factors(
         self, state: UncertainBelief, u: ArrayLike, k: Step
     ) -> tuple[jax.Array, jax.Array, WeightedColumns]:
-        """Return F L, b, and the columns of (1 + 1/b) D + W, of Sigma- = (1 + b) F Sigma F' + (1 + 1/b) D + W."""
-        move, _, _ = centred_transition(at(self.plant, k), u, state.centre)
-        rows, radius = self._chain_and_radius(state, k)
-        # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
-        carried = move @ state.second @ move.T
-        of_jumps, of_chain = (
-            _bound_mean(matrices, *_find_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
-        )
-        # Young's inequality, b = root(tr D / tr F Sigma F').
-        root, weights = predict_by_mode(state.gaussian.root, move, rows), state.gaussian.variances
-        young = jnp.sqrt(_divide_or_zero(jnp.trace(of_chain) * jnp.trace(carried), jnp.sum(root**2 @ weights)))
-        of_both = of_jumps + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * of_chain
-        # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
-        low, high = _bound_next_law(rows, radius, state.low, state.high)
-        by_modes = factor_with_last_mode(jnp.einsum("jl,ab->jalb", of_both[:-1, :-1], carried))
-        of_process = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
-        return root, young, join_columns(by_modes, of_process)
+        """Return F L, b, and columns of (1 + 1/b) D + W, for the bound Sigma+ <= (1 + b) F Sigma F' + (1 + 1/b) D + W.
+
+        Sigma = L diag(variances) L' bounds the covariance of zeta = (x~ 1{mode = 1}, ...), x~ = (x - c, 1), and F has
+        the blocks F_ji = Pi_ij A~. Row i of the chain is Pi_i + Delta_i, the modes have the law p, and p+ is the next
+        one. With X = A~ E[x~ x~'] A~' and Kronecker's product (x), for all possible Delta and p,
+
+            D = D_m (x) X,                 D_m >= sum_i p_i Delta_i' Delta_i
+            W = J_m (x) X + N_m (x) Q~,    J_m >= sum_i p_i Cov(1{next mode} | mode = i),    N_m >= diag(p+)
+        """
+        A, _, _ = centred_transition(at(self.plant, k), u, state.centre)  # A~
+        transition, radius = self._chain_and_radius(state, k)
+        X = A @ state.second @ A.T
+        # J_m and D_m: bounds for each mode i, then on their mean over all laws p of the modes.
+        middle, reach = _find_middle_law(state.low, state.high)
+        J_m, D_m = (_bound_mean(by_mode, middle, reach) for by_mode in _bound_moves(transition, radius))
+        # b = sqrt(tr D / tr(F Sigma F')) makes the trace of the bound least; tr D = tr D_m tr X.
+        slopes = multiply_by_transition(state.gaussian.root, A, transition)
+        nominal_trace = jnp.sum(slopes**2 @ state.gaussian.variances)
+        b = jnp.sqrt(_divide_or_zero(jnp.trace(D_m) * jnp.trace(X), nominal_trace))
+        # Columns of ((1 + 1/b) D_m + J_m) (x) X, whose blocks sum to 0 over the modes, and of N_m (x) Q~.
+        modes_bound = J_m + jnp.where(b > 0, 1 + 1 / jnp.where(b > 0, b, 1.0), 0.0) * D_m
+        chain_noise = factor_with_last_mode(jnp.einsum("jl,ab->jalb", modes_bound[:-1, :-1], X))
+        low, high = _bound_next_law(transition, radius, state.low, state.high)
+        process_noise = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
+        return slopes, b, join_columns(chain_noise, process_noise)
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
-        """Correct with z; the covariance of z given zeta is bounded over the laws of the modes.
+        """Correct with the components of z that arrived: z = common + H zeta + v, with a bound on Cov v.
 
-        zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1); `signal_moment`: E[y~ y~'] of the signal; `bounded_noise`:
-        bound of noise and spread of the gains.
+        zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1). The sensor sends y~ = (y, 1) = C~ x~ + noise. In mode j,
+        z = G y~ with a random G of mean Hbar_j, whose last column is the noise of the link. H = (Hbar_1 C~, Hbar_2 C~,
+        ...), and Cov v = sum_j p_j V_j with V_j = E[(G - Hbar_j) E[y~ y~'] (G - Hbar_j)' | j] + Hbar_j R~ Hbar_j'. The
+        law p of the modes is known up to its bounds, so this sum is bounded over all p between them.
         """
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        gains, (measure, noise) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)
-        signal_moment = measure @ state.second @ measure.T + noise
+        gains, (C, R) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)  # Hbar_j, C~ and R~
+        signal_moment = C @ state.second @ C.T + R  # E[y~ y~']
         gain_noise = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), signal_moment)
+        noise_by_mode = gain_noise + gains @ R @ gains.swapaxes(1, 2)  # V_j
         middle, reach = _find_middle_law(state.low, state.high)
-        bounded_noise = _bound_mean(gain_noise + gains @ noise @ gains.swapaxes(1, 2), middle, reach)
-        matrix, mean_output = subtract_mean_output(gains @ measure, state.law)
+        noise_bound = _bound_mean(noise_by_mode, middle, reach)
+        # A part of Hbar_j C~ x~ that is the same in all modes is a constant, as the modes' indicators sum to 1.
+        matrix, common = subtract_mean_output(gains @ C, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * signal_moment)
+        noise = join_columns(rounding, factor_spread(noise_bound))
+        # The mean of zeta counts x from 0, the model of z from the centre: `deviation` is the mean of products of x~.
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        output = MeasurementModel(
-            concatenate_modes(matrix), mean_output, join_columns(rounding, factor_spread(bounded_noise))
-        )
-        after, innovation = condition_modes_on_received(state.gaussian, deviation, output, z)
-        return state._replace(gaussian=after), innovation
+        model = MeasurementModel(concatenate_modes(matrix), common, noise)
+        corrected, innovation = condition_modes_on_received(state.gaussian, deviation, model, z)
+        return state._replace(gaussian=corrected), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing.
+        """Return the smoother step of zeta+ = F zeta + noise, zeta = (x~ 1{mode = 1}, ...) for x~ = (x - centre, 1).
 
-        zeta is the state times each mode's indicator. `young` is the scalar of the bound: F P F' grows by this share.
-        `added_noise` holds the process noise and the uncertain part.
+        The filter's bound is P+ = (1 + b) F P F' + N for a scalar b: here b F P F' + N is taken as the covariance of
+        the noise. The claim is nominal, since no bound is proved for smoothing.
         """
-        slopes, young, added_noise = self._transition_factors(step.before, step.u, step.k)
-        growth = WeightedColumns(slopes, young * step.before.gaussian.variances)
+        slopes, b, added_noise = self._transition_factors(step.before, step.u, step.k)  # F L, b, columns of N
+        growth = WeightedColumns(slopes, b * step.before.gaussian.variances)
         slopes_and_noise = slopes, triangularise(join_columns(growth, added_noise))
         return smoother_step_of(step, slopes_and_noise, "nominal", projection=self._projection_to_state())
 
@@ -166,25 +200,26 @@ def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
 
 
 def _bound_moves(transition: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return bounds on Cov(1{next} | i) and on Delta_i Delta_i' (M, M, M), for each mode i and every Delta_i.
+    """Return for each mode i bounds on Cov(1{next mode} | mode = i) and on Delta Delta' (M, M, M), for every Delta.
 
-    Row i of `transition` is pi, the nominal law of the next mode after i. Delta_i is its error, with |Delta_ij| <= r_ij
-    (`radius`). For each i, Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta', and replacing Delta_j by
-    r_j bounds it. Delta Delta' <= P diag(r_j sum r) P, with P the projection that removes the mean, since
-    Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
+    pi, row i of `transition`, is the nominal law of the next mode, and pi + Delta the true one, with |Delta_j| <= r_j
+    for row i of `radius`. Both are columns here.
     """
     modes = len(transition)
-    difference = jnp.eye(modes)[None] - transition[:, None, :]  # [i, j] = e_j - pi_i
-    jump_covariance = jnp.einsum("ij,ija,ijb->iab", transition + radius, difference, difference)
+    # Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta' is at most that with r_j for Delta_j, without
+    # the last term.
+    difference = jnp.eye(modes)[None] - transition[:, None, :]  # [i, j] = e_j - pi
+    indicator_covariance = jnp.einsum("ij,ija,ijb->iab", transition + radius, difference, difference)
+    # Delta Delta' <= P diag(r_j sum_l r_l) P: P removes the mean, so Delta = P Delta, and |Delta_j Delta_l| <= r_j r_l.
     projection = jnp.eye(modes) - 1 / modes
     delta_bound = radius * jnp.sum(radius, axis=1, keepdims=True)
-    return jump_covariance, jnp.einsum("aj,ij,jb->iab", projection, delta_bound, projection)
+    return indicator_covariance, jnp.einsum("aj,ij,jb->iab", projection, delta_bound, projection)
 
 
 def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return a law between the ends (its sum is 1), and the largest deviation of a possible law from it.
+    """Return a law in the middle of all possible ones (M,), and how far a possible probability may be from it (M,).
 
-    `low` and `high` (M,) are the least and the greatest probability of each mode.
+    `low` and `high` (M,) are the least and the greatest probability of each mode. The middle law sums to 1.
     """
     middle = (low + high) / 2
     middle = middle + (1 - jnp.sum(middle)) / len(low)
@@ -192,9 +227,11 @@ def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
-    """Return a bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|.
+    """Return a bound on sum_i p_i X_i for all laws p with |p_i - middle_i| <= reach_i, as a matrix.
 
-    The X_i are symmetric, and |X| has the absolute eigenvalues of X. `reach` (M,) is how far p_i may be from middle_i.
+    Since p - middle sums to 0, sum_i p_i X_i = sum_i middle_i X_i + sum_i (p_i - middle_i) (X_i - Xbar) with the mean
+    Xbar of all X_i, and X <= |X|, which has the absolute eigenvalues of X. So the bound is
+    sum_i middle_i X_i + sum_i reach_i |X_i - Xbar|. `matrices`: the symmetric X_i (M, s, s).
     """
     values, vectors = jax.vmap(eigh)(matrices - jnp.mean(matrices, axis=0))
     absolute = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
@@ -202,18 +239,24 @@ def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax
 
 
 def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return a bound on diag(p) over all laws p of the modes, tight in the direction of equal entries.
+    """Return a bound on diag(p) for all laws p of the modes with low <= p <= high, (M, M).
 
-    p = middle + delta with |delta_i| <= reach_i, and the delta_i sum to 0. With u = (1, ..., 1) / root M, P = I - u u'
-    and d = delta / root M, diag(delta) = P diag(delta) P + u d' + d u'. By Young's inequality
-    u d' + d u' <= e u u' + d d' / e. P diag(delta) P is 0 for two modes. `low` and `high` (M,) are the ends of p.
+    p = middle + delta with |delta_i| <= reach_i, and the delta_i sum to 0. With u = (1, ..., 1) / sqrt(M), P = I - u u'
+    and d = delta / sqrt(M),
+
+        diag(p) = diag(middle) + P diag(delta) P + u d' + d u'
+
+    Each term is bounded alone. The bound is tight in the direction u, in which all modes count alike.
     """
     modes = len(low)
     middle, reach = _find_middle_law(low, high)
     projection, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
-    e = total / modes / 2  # d d' <= diag(reach) sum reach / M, by Cauchy and Schwarz
+    # u d' + d u' <= e u u' + d d' / e by Young's inequality, with d d' <= P diag(reach) P sum(reach) / M by Cauchy and
+    # Schwarz, and d = P d.
+    e = total / modes / 2
     safe_e = jnp.where(e > 0, e, 1.0)
     cross_term = projection @ jnp.diag(reach * total) @ projection / (safe_e * modes)
+    # P diag(delta) P <= P diag(reach) P, and for two modes it is 0.
     projected = projection @ jnp.diag(reach) @ projection if modes > 2 else jnp.zeros((modes, modes))
     return jnp.diag(middle) + e / modes * jnp.ones((modes, modes)) + cross_term + projected
 

@@ -1,7 +1,8 @@
 """Whether a function written in JAX is affine in some of its arguments, given the others: read off its operations.
 
-Each number of the traced program has a degree: KNOWN, a constant; GIVEN, made of the other arguments alone; AFFINE, a
-sum of numbers that are given and of arguments times such; OTHER, whatever else, or what is not seen to be less.
+Each number of the traced program has a degree: KNOWN, a constant of the program; GIVEN, a function of the other
+arguments alone; AFFINE, a sum of given numbers and of arguments times given numbers; OTHER, anything else, or what is
+not recognised as less.
 """
 
 from collections.abc import Callable, Sequence
@@ -79,7 +80,7 @@ def _trace_known_array(value: Any) -> _EntryDegrees:
 def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of the results of one traced operation (a JAX equation), from the degrees of its operands x.
 
-    KNOWN: a constant, with its value; GIVEN: made of arguments that are given; AFFINE: in the others; OTHER: any.
+    KNOWN: a constant, with its value; GIVEN: no function of the variables; AFFINE: in the variables; OTHER: any other.
     """
     name, params = equation.primitive.name, equation.params
 
@@ -90,7 +91,7 @@ def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryD
 
     if (called := called_program(equation)) is not None:
         return _classify_dependence(called, x)
-    # Known operands give known results, given ones given results.
+    # Constants give constants, and given operands (no functions of the variables) given results.
     if all(operand.value is not None for operand in x):
         return [_trace_known_array(value) for value in compute([operand.value for operand in x])]
     shapes = [out.aval.shape for out in equation.outvars]
@@ -143,9 +144,10 @@ def _degree_of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _degree_of_contraction(a: _EntryDegrees, b: _EntryDegrees, dimensions: Any) -> np.ndarray:
     """Return the degrees of the sums of products that a contraction (dot_general) of a and b makes.
 
-    The degrees in their order are KNOWN, GIVEN, AFFINE (in the states asked about) and OTHER. A product with a known
-    zero does not count. A sum is OTHER if some product has an OTHER factor or two AFFINE ones. Else it is AFFINE if
-    some product has an AFFINE factor, and GIVEN if none has. `dimensions` are JAX's contracted and batch axes.
+    The degrees in their order are KNOWN (a constant), GIVEN (no function of the variables), AFFINE (in the variables)
+    and OTHER. A product with a known zero does not count. A sum is OTHER if some product has an OTHER factor or two
+    AFFINE ones. Else it is AFFINE if some product has an AFFINE factor, and GIVEN if none has. KNOWN is not needed, as
+    operations on constants alone are computed. `dimensions` are JAX's contracted and batch axes.
     """
 
     def count(of_a: np.ndarray, of_b: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ State = TypeVar("State", bound=tuple[Any, ...])
 
 
 class ResampledParticles(NamedTuple):
-    """Result of a resampling: numbers of the particles that go on (N,), and their log weights (N,)."""
+    """Result of a resampling: for each particle (N,) the index of the one it is a copy of, and log weights (N,)."""
 
     which: jax.Array
     log_weight: jax.Array
@@ -37,9 +37,9 @@ class WeighedParticles(NamedTuple):
     """Particles that were weighed by z.
 
     Args:
-        particles: what each is with z, (B, ...).
-        log_likelihood: log p(z | particle), less what the proposal adds (B,).
-        predicted: what each expected before z was known, arrays (B, ...).
+        particles: the particles (B, ...), drawn again with z if the filter does so. log_likelihood: log of the factor
+        on each weight, p(z | particle) times prior density over that of the draw (B,). predicted: what each expected of
+        z before z was known, arrays (B, ...).
     """
 
     particles: PyTree
@@ -70,40 +70,61 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         return FilterAngles(list_mode_models(first(self.plant))[0].angles, self.observed_angles)
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
-        """Filter rows with a lane for each particle where these are enough."""
+        """Filter rows of data in native code, a SIMD lane for each particle; None if there are too few particles."""
         return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
 
     @abstractmethod
     def allocate_particles(self, count: int) -> Any:
-        """Return arrays of so many particles, a tree of what each is, to be filled."""
+        """Return arrays for `count` particles, to be filled: a tree whose leaves have the particles as first axis."""
 
     @abstractmethod
     def get_particles(self, state: Any) -> Any:
-        """Return what the particles (N, ...) of a state are."""
+        """Return the particles (N, ...) of a filter's state: positions, or Gaussians in each mode."""
 
     @abstractmethod
     def sum_for_mean(self, weight: jax.Array, particles: Any) -> StateSums:
-        """Return the first sums of particles (B,) by weights of any sum."""
+        """Return sums over B particles, of weights and of weights times states, from which the mean follows.
+
+        The weights need not sum to 1. The sums of several groups of particles add up to that of all.
+        """
 
     @abstractmethod
     def sum_for_covariance(self, weight: jax.Array, particles: Any, sums: StateSums) -> jax.Array:
-        """Return the second sums (n, n) of particles (B,) about the mean that first sums of all have."""
+        """Return the sum over B particles of weight times second moment (n, n), about the mean of all particles.
+
+        `sums`: those of all particles by `sum_for_mean`, from which their mean follows.
+        """
 
     @abstractmethod
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
-        """Return the estimate that both sums over all particles say."""
+        """Return mean and covariance: of `sums`, and of the second sums (n, n) about this mean, over all particles."""
 
     @abstractmethod
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> Any:
-        """Return sums of what particles (B,) expect of z, counted from what one of reference expects."""
+        """Return weighted sums over B particles of innovations of z less a reference innovation.
+
+        They give the mean and covariance of z over all particles. The reference is subtracted so that no digits are
+        lost if z is far from 0.
+
+        Args:
+            reference: what one particle, the heaviest, expects of z: arrays as in `predicted`, without a first axis.
+            weight: weights of the particles before z is known, of any sum.
+            predicted: what each expects of z: arrays with the particles as first axis.
+            z: measurement (m,), NaN for what did not arrive.
+            k: step.
+        """
 
     @abstractmethod
     def innovation_from_sums(
         self, received: Any, reference: tuple[Any, ...], z: Any, k: Step, density: Any
     ) -> Innovation:
-        """Return the innovation that these sums over all particles say; `density`: log p(z)."""
+        """Return z - E z, Cov z and the log-likelihood, from sums over all particles.
+
+        `received`: sums by `sum_received`. `reference`: what the heaviest particle expects of z, whose innovation was
+        subtracted in them. `density`: log p(z).
+        """
 
     def compute_estimate(self, state: Any) -> Estimate:
         """Return the weighted mean of all particles, and the covariance about it, by sums over them."""
@@ -126,7 +147,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """True: a value of likelihood 0 under every particle is excluded by its model."""
+        """True: the law of z is a mixture over particles, so likelihood 0 says that its model excludes z."""
         return True
 
     def choose_particles(self, log_weight: jax.Array, key: jax.Array) -> ResampledParticles:
@@ -138,14 +159,14 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         weight = jax.nn.softmax(log_weight)
         resamples = effective_number(weight) < jnp.asarray(self.resample) * self.particles
         start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
-        chosen = jax.lax.cond(resamples, resample_systematically, lambda *_: all_particles, weight, start)
-        return ResampledParticles(chosen, jnp.where(resamples, 0.0, log_weight))
+        indices = jax.lax.cond(resamples, resample_systematically, lambda *_: all_particles, weight, start)
+        return ResampledParticles(indices, jnp.where(resamples, 0.0, log_weight))
 
 
 def update_if_used(used: jax.Array, updated: State, before: State) -> State:
     """Return the updated state where the row is used, else the state before."""
-    kept: State = jax.tree.map(lambda new, old: jnp.where(used, new, old), updated, before)
-    return kept
+    chosen: State = jax.tree.map(lambda new, old: jnp.where(used, new, old), updated, before)
+    return chosen
 
 
 def relative_to_largest(log_weight: jax.Array) -> jax.Array:

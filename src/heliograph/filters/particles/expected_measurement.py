@@ -15,9 +15,10 @@ from heliograph.numerics.types import Array
 
 
 class ExpectedMeasurement(NamedTuple):
-    """The atoms of z (m,) given h(x), and h(x) of a particle of reference (p,), which is no number if none is.
+    """The law of z (m,) given y = h(x), as a mixture of Gaussians (atoms), and y (p,) of a reference particle.
 
-    Innovations are summed as differences from that of the reference's first atom: of angles within half a turn of it.
+    Innovations are summed as differences from a base, that of the reference under the first atom: no digits are lost if
+    z is far from 0, and angles are within half a turn of it. The reference is NaN if y of every particle is.
     """
 
     atoms: ReceivedAtoms
@@ -27,14 +28,15 @@ class ExpectedMeasurement(NamedTuple):
 
     @property
     def base(self) -> jax.Array:
-        """Return the innovation (m,) of the reference's first atom."""
+        """Return the base of the sums, z - E[z | y of the reference particle, first Gaussian of the mixture] (m,)."""
         value = self.z - self.atoms.expected(jnp.nan_to_num(self.reference, nan=0.0, posinf=0.0, neginf=0.0))[0]
         return wrap_near(value, jnp.zeros(len(self.z)), self.angles)
 
     def find_innovations(self, weight: jax.Array, predicted: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return weights (B a,) of particles and atoms, and how far their innovations are from the base (B a, m).
+        """Return weights (B a,) of all pairs of particle and atom, and their innovations less the base (B a, m).
 
-        An atom is one of the channel's Gaussians; the base is the innovation of a reference particle's first atom.
+        An atom is one of the a Gaussians whose mixture is the law of z given h(x). The base is the innovation of the
+        reference particle under the first atom.
 
         Args:
             weight: weights (B,) of particles before z is known, of any sum.
@@ -50,8 +52,8 @@ class ExpectedMeasurement(NamedTuple):
     def compute_innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
         """Return mean and covariance of the innovation, and log p(z).
 
-        Atoms are the Gaussians whose mixture is the channel. The covariance is their noise plus the spread of their
-        means.
+        Cov z is the mean noise covariance of the Gaussians (atoms) that z is given h(x), plus the covariance of their
+        means over all particles and atoms.
 
         Args:
             first: first sums of the innovations less the base, a reference innovation.
@@ -61,9 +63,9 @@ class ExpectedMeasurement(NamedTuple):
         mean, present = first.mean(()), ~jnp.isnan(self.z)
         noise = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
         noise = jnp.where(present[:, None] & present, noise, jnp.nan)
-        spread = second / first.weight - jnp.outer(mean, mean)
+        covariance_of_means = second / first.weight - jnp.outer(mean, mean)
         nothing_arrived = ~jnp.any(present)  # then the density is exactly 1
-        return Innovation(self.base + mean, noise + spread, jnp.where(nothing_arrived, 0.0, density))
+        return Innovation(self.base + mean, noise + covariance_of_means, jnp.where(nothing_arrived, 0.0, density))
 
 
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:

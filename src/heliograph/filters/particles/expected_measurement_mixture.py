@@ -10,30 +10,38 @@ from heliograph.numerics.angles.angle import Angles, wrap_near
 
 
 class ExpectedMixture(NamedTuple):
-    """Mixture of Gaussians that each particle expects of z, with one part for each mode and atom of its noise.
+    """Mixture of Gaussians that a particle expects of z: one for each mode, and each Gaussian of the mode's noise.
 
-    Of particles with a leading axis: shapes share (a,) of each part, expected (a, m), total covariance (a, m, m), and
-    chance () of what arrived.
+    Shapes: share (a,), probability of each Gaussian; expected (a, m) and covariance (a, m, m) of z under it; chance (),
+    probability that those components arrive which did. Several particles have a leading axis.
     """
 
     share: jax.Array
     expected: jax.Array
-    total: jax.Array
+    covariance: jax.Array
     chance: jax.Array
 
 
 class ReceivedSums(NamedTuple):
-    """Sums of weights, of innovations less that of a reference (m,), of their second moments, of weights by chances."""
+    """Sums over the Gaussians that all particles expect of z, w the particle's weight times the Gaussian's probability.
+
+    With d the innovation of a Gaussian less a reference innovation: weight, sum of w; value (m,), sum of w d;
+    second_moment (m, m), sum of w (d d' + covariance); all_weights, sum of the particles' weights; chance, sum of the
+    particles' weights times their probability of what arrived.
+    """
 
     weight: jax.Array
     value: jax.Array
-    spread: jax.Array
-    of_all: jax.Array
+    second_moment: jax.Array
+    all_weights: jax.Array
     chance: jax.Array
 
 
 def find_reference_innovation(reference: ExpectedMixture, z: jax.Array, angles: Angles) -> jax.Array:
-    """Return the innovation (m,) of the largest part of what a particle expects, 0 for one that is no number."""
+    """Return z less the mean of the most probable Gaussian that a particle expects of z (m,); z itself if it is NaN.
+
+    It is subtracted from all innovations before they are summed, so that large numbers leave digits for differences.
+    """
     expected = jnp.asarray(reference.expected)[jnp.argmax(jnp.asarray(reference.share))]
     return wrap_near(z - jnp.where(jnp.isfinite(expected), expected, 0.0), jnp.zeros(len(z)), angles)
 
@@ -41,34 +49,46 @@ def find_reference_innovation(reference: ExpectedMixture, z: jax.Array, angles: 
 def sum_mixtures(
     base: jax.Array, weight: jax.Array, predicted: ExpectedMixture, z: jax.Array, angles: Angles
 ) -> ReceivedSums:
-    """Return sums over particles (B,) of weights before z; parts that are no number do not count."""
+    """Return weighted sums over particles and their Gaussians of the innovations of z, less a reference innovation.
+
+    Args:
+        base: the reference innovation (m,).
+        weight: weights of B particles before z is known, of any sum.
+        predicted: what each particle expects of z. A Gaussian whose mean is not finite is left out.
+        z: measurement (m,), NaN for what did not arrive.
+        angles: components of z that are angles.
+    """
     present, m = ~jnp.isnan(z), len(z)
-    value = wrap_near(z - predicted.expected - base, jnp.zeros(m), angles)
-    valid = jnp.all(jnp.isfinite(value) | ~present, axis=-1)
-    share = jnp.where(valid, weight[:, None] * predicted.share, 0.0).ravel()
-    value = jnp.where(valid[..., None], value, 0.0).reshape(-1, m)
-    total = jnp.where(valid[..., None, None], predicted.total, 0.0).reshape(-1, m, m)
-    spread = (value * share[:, None]).T @ value + jnp.einsum("a,aij->ij", share, total)
+    d = wrap_near(z - predicted.expected - base, jnp.zeros(m), angles)
+    is_valid = jnp.all(jnp.isfinite(d) | ~present, axis=-1)
+    w = jnp.where(is_valid, weight[:, None] * predicted.share, 0.0).ravel()
+    d = jnp.where(is_valid[..., None], d, 0.0).reshape(-1, m)
+    covariance = jnp.where(is_valid[..., None, None], predicted.covariance, 0.0).reshape(-1, m, m)
     return ReceivedSums(
-        weight=jnp.sum(share),
-        value=share @ value,
-        spread=spread,
-        of_all=jnp.sum(weight),
+        weight=jnp.sum(w),
+        value=w @ d,
+        second_moment=(d * w[:, None]).T @ d + jnp.einsum("a,aij->ij", w, covariance),
+        all_weights=jnp.sum(weight),
         chance=weight @ predicted.chance,
     )
 
 
 def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array, density: jax.Array) -> Innovation:
-    """Return the innovation's mean, covariance and log-likelihood, given which components arrived.
+    """Return z - E z, Cov z and the log-likelihood of z, given which components arrived.
 
-    `base` is a reference innovation, about which the sums are taken. `density` is log p(z, arrivals). p(z | arrivals)
-    is p(z, arrivals) over the mean chance of these arrivals.
+    Args:
+        sums: weighted sums, over particles and the Gaussians they expect of z, of innovations less `base` and of their
+            second moments; and of the probabilities of what arrived.
+        base: the reference innovation (m,).
+        z: measurement (m,), NaN for what did not arrive.
+        density: log p(z, arrivals).
     """
     present = ~jnp.isnan(z)
     weight = jnp.where(sums.weight > 0, sums.weight, 1.0)
     mean = jnp.asarray(sums.value) / weight
-    covariance = sums.spread / weight - jnp.outer(mean, mean)
+    covariance = sums.second_moment / weight - jnp.outer(mean, mean)
     covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
-    log_likelihood = density - jnp.log(jnp.asarray(sums.chance) / sums.of_all)
+    # p(z | arrivals) = p(z, arrivals) / P(arrivals), with P(arrivals) the mean over the particles.
+    log_likelihood = density - jnp.log(jnp.asarray(sums.chance) / sums.all_weights)
     nothing_arrived = ~jnp.any(present)  # then the density is exactly 1
     return Innovation(base + mean, covariance, jnp.where(nothing_arrived, 0.0, log_likelihood))

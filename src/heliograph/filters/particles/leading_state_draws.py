@@ -14,19 +14,19 @@ from heliograph.numerics.gaussian_density import LOG_TURN
 def slopes_given_drawn(
     function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Return f(mean), and the slopes (m, n) of f in xi, for x = mean + L xi.
+    """Return f(mean), and the slopes (m, n) of f in xi at the mean, for x = mean + L xi with a triangular factor L.
 
     The first `drawn` states are known and have no variance, so that the slopes in their xi are 0.
     """
 
-    def of_others(others: jax.Array) -> jax.Array:
+    def function_of_others(others: jax.Array) -> jax.Array:
         """Return f of the states that are not drawn, with the drawn ones at their means."""
         return function(jnp.concatenate([x.mean[:drawn], others]))
 
     others = x.mean[drawn:]
     # The rows of L for the others are zero in the drawn states' columns, which have no variance.
-    slopes = jax.jacfwd(of_others)(others) @ x.root[drawn:, drawn:]
-    return of_others(others), jnp.pad(slopes, ((0, 0), (drawn, 0)))
+    slopes = jax.jacfwd(function_of_others)(others) @ x.root[drawn:, drawn:]
+    return function_of_others(others), jnp.pad(slopes, ((0, 0), (drawn, 0)))
 
 
 def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
@@ -52,13 +52,13 @@ def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
 def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
     """Return x given its leading states d (drawn,), and the log of their density.
 
-    xi is the difference of each leading state from its mean given those before it. A `certain` state has no density,
-    and adds 0 to the log. LOG_TURN is log 2 pi.
+    With x = mean + L xi and a unit triangular L, xi_i is the difference of state i from its mean given the states
+    before it, of variance `variances`[i]. A `certain` state has no variance and no density, and adds 0 to the log.
     """
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
     variances = jnp.where(certain, 1.0, x.variances[:drawn])
-    log_density = -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2
+    log_density = -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2  # LOG_TURN = log 2 pi
     log_density = jnp.where(certain, 0.0, log_density)
     mean = (x.mean + x.root[:, :drawn] @ xi).at[:drawn].set(d)
     given = x._replace(mean=mean, variances=x.variances.at[:drawn].set(0.0))
@@ -66,5 +66,5 @@ def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -
 
 
 def draw_index(log_weight: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Draw an index by each row of log weights (N, M), with a uniform number each (N,)."""
+    """Draw an index with probabilities exp(log_weight) / sum for each row (N, M), by one uniform number each (N,)."""
     return jnp.sum(jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)[:, :-1] <= uniform[:, None], axis=1)

@@ -47,9 +47,9 @@ def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
     return FirstSums(jnp.sum(weight), sum_of_squares, weight @ x, sine, cosine)
 
 
-def second_sums(weight: jax.Array, apart: jax.Array) -> jax.Array:
-    """Return the sum of w d d' (n, n) of differences d (N, n) from one place, by weights (N,)."""
-    return (apart * weight[:, None]).T @ apart
+def second_sums(weight: jax.Array, differences: jax.Array) -> jax.Array:
+    """Return the sum of w d d' (n, n) of differences d (N, n) from one point, by weights w (N,)."""
+    return (differences * weight[:, None]).T @ differences
 
 
 def pack_sums(sums: PyTree) -> jax.Array:

@@ -1,8 +1,8 @@
 """Particle filters row by row in native code: compiled for one particle, called on all in the lanes of vectors.
 
-A run of many particles is no program of native code, which takes small arrays. But what is done with a particle is one,
-and keys and numbers of particles say what each draws. Three calls a row: particles move and are weighed, a lane each;
-first sums of them, a lane for GROUP; second sums about the means. Between them the particles that go on are chosen.
+Native code takes small arrays, so it holds the program of one particle, not of all. Random keys and the particles'
+indices say what each draws. A row makes three calls: particles move and are weighed, one in each SIMD lane; first sums
+over them, GROUP particles in each lane; second sums about the means. Before these particles may be resampled.
 """
 
 import math
@@ -17,16 +17,19 @@ from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected_measurement import find_reference_particle
 from heliograph.filters.particles.moments import pack_sums, unpack_sums
-from heliograph.filters.particles.resampling import resample_concrete_weights
-from heliograph.numerics.float64 import quickly_compiled
+from heliograph.filters.particles.resampling import (
+    draw_keys_of_rows,
+    draw_keys_of_rows_by_xla,
+    resample_concrete_weights,
+)
 from heliograph.numerics.types import Array, PyTree
 
 Call = Callable[..., Any]
-GROUP = 16  # particles that a lane adds up
+GROUP = 16  # particles that a SIMD lane adds up
 
 
 class DataRow(NamedTuple):
-    """A row of data, or rows along a leading axis: number k, z, u and random keys; `moved`: it is not the first."""
+    """A row of data, or rows along a first axis: step k, z, u and random keys; `moved`: False for the first step."""
 
     k: Array
     z: Array
@@ -37,7 +40,7 @@ class DataRow(NamedTuple):
 
 
 class ParticleGroup(NamedTuple):
-    """Particles of a row with a leading axis: weights before and with z, what each is, and what it expects of z."""
+    """Particles along a first axis: weights before and after z, the particles, and what each expected of z."""
 
     prior: Array
     weight: Array
@@ -46,9 +49,10 @@ class ParticleGroup(NamedTuple):
 
 
 class ParticleSums(NamedTuple):
-    """Sums over the particles of a row: of states and of what is received as `pack_sums` makes them, `second` (n, n).
+    """Sums over the particles of a row: first sums of states, and of innovations, as vectors; second sums (n, n).
 
-    `reference` is what the particle expects from which innovations are counted, `density` log p(z | earlier rows).
+    The innovation of `reference`, what one particle expected of z, is subtracted from all. `density` is
+    log p(z | earlier rows).
     """
 
     states: np.ndarray
@@ -61,7 +65,7 @@ class ParticleSums(NamedTuple):
 def filter_particles(
     filter: Any, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
 ) -> ScanResult | None:
-    """Filter rows with particles as the lanes of native code; None if there are no rows, or no native code.
+    """Filter rows in native code, a SIMD lane for each particle; None if there are no rows, or no native code.
 
     Args:
         filter: the filter.
@@ -80,11 +84,11 @@ def filter_particles(
 
 
 class _RowArrays(NamedTuple):
-    """Arrays that the programs of a row read in place: the row, particles, and sums over them.
+    """Arrays that the programs of a row read in place: the row, particles before it, and sums over them.
 
-    `particles` are those before the row, a tree, and `log_weight` their log weights, the largest 0; `prior` are the
-    weights that these are the logarithms of, and `weight` those with z, the largest 1. Behind the last particle others
-    of weight 0 fill the last group, at the place of the first.
+    `log_weight`: of the particles, the largest 0; `prior`: the weights themselves; `weight`: those after z, the largest
+    1; `used`: whether z is used; `reference`: what one particle expected of z; `states`: first sums. Copies of the
+    first particle with weight 0 fill the last group.
     """
 
     row: DataRow
@@ -99,13 +103,14 @@ class _RowArrays(NamedTuple):
 
 
 class _ParticlePrograms(NamedTuple):
-    """Code of what is done with particles, with the filter's own arrays: calls in memory of their own.
+    """Compiled programs of a row, and their arrays.
 
-    `now` are the particles behind the last row, and `log_weight` their log weights; `predicted` what each expected.
+    `memory`: what they read. `particles`, `log_weight`, `predicted`: what `advance` writes, the particles after the
+    row, their log weights, and what each expected of z. `first`, `second`: programs of first and second sums.
     """
 
     memory: _RowArrays
-    now: PyTree
+    particles: PyTree
     log_weight: np.ndarray
     predicted: tuple[np.ndarray, ...]
     advance: Any
@@ -141,13 +146,13 @@ def _compile_programs(
     if advance is None:
         return None
     leaves, structure = jax.tree.flatten(particles)
-    now = jax.tree.unflatten(structure, advance.outputs[: len(leaves)])
-    log_weight_now, predicted = advance.outputs[len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
-    # Second and third: sums over the particles of a group in each lane. `reference`: from what innovations are counted.
+    advanced = jax.tree.unflatten(structure, advance.outputs[: len(leaves)])
+    log_weight_after, predicted = advance.outputs[len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
+    # Second and third: sums over the particles of a group in each lane.
     reference = tuple(np.zeros(part.shape[1:]) for part in predicted)
     group: ParticleGroup = jax.tree.map(
         lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]),
-        ParticleGroup(prior, weight, now, predicted),
+        ParticleGroup(prior, weight, advanced, predicted),
     )
     first = _compile_in_place(_sum_for_mean, filter, (row, reference, group), (False, False, True), len(group.weight))
     if first is None:
@@ -158,7 +163,7 @@ def _compile_programs(
     if second is None:
         return None
     memory = _RowArrays(*before, prior=prior, weight=weight, reference=reference, states=states)
-    return _ParticlePrograms(memory, now, log_weight_now, predicted, advance=advance, first=first, second=second)
+    return _ParticlePrograms(memory, advanced, log_weight_after, predicted, advance=advance, first=first, second=second)
 
 
 def _compile_in_place(
@@ -197,18 +202,19 @@ def _take_first(tree: PyTree) -> PyTree:
 def _advance_particle(
     filter: Any, row: DataRow, is_used: Array, particle: PyTree, log_weight: Array, number: Array
 ) -> tuple[PyTree, jax.Array, tuple[jax.Array, ...]]:
-    """Move a particle and weigh it by z if the row `is_used`; return it, its log weight, and what it expected of z.
+    """Move a particle and weigh it by z; return it, its log weight, and what it expected of z.
 
-    The particle's random numbers depend on its `number`. The filter's methods take arrays of particles, so the particle
-    gets a leading axis of length 1 here.
+    If z is not used (`is_used` False: it is empty, or no particle explains it), the particle is moved but not weighed,
+    and not drawn again with z. Its random numbers depend on its `number`. The filter's methods take arrays of
+    particles, so it gets a first axis of length 1 here.
     """
     numbers = jnp.asarray(number)[None]
     one_particle = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
     moved_particle, law = filter.move_particles(one_particle, numbers, row.noise_key, row.u, row.k, row.moved)
     weighed = filter.weigh_particles(moved_particle, law, numbers, row.proposal_key, row.z, row.k)
-    likelihood = jnp.where(is_used, weighed.log_likelihood[0], 0.0)
+    log_likelihood = jnp.where(is_used, weighed.log_likelihood[0], 0.0)
     after = jax.tree.map(lambda new, old: jnp.where(is_used, new, old), weighed.particles, moved_particle)
-    return _take_first(after), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
+    return _take_first(after), jnp.asarray(log_weight) + log_likelihood, _take_first(weighed.predicted)
 
 
 def _sum_for_mean(
@@ -230,15 +236,18 @@ def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: Py
 
 
 def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
-    """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles."""
+    """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles.
+
+    The sums are vectors. Their fields have the shapes of the same sums over a single particle.
+    """
     one_particle, weight = jax.tree.map(jnp.asarray, filter.allocate_particles(1)), jnp.ones(1)
     states = unpack_sums(sums.states, filter.sum_for_mean, weight, one_particle)
     predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
     received = unpack_sums(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
     estimate = filter.estimate_from_sums(states, sums.second)
     innovation = filter.innovation_from_sums(received, sums.reference, row.z, row.k, sums.density)
-    count = states.first.weight**2 / states.first.square
-    return estimate.mean, estimate.covariance, innovation, estimate.modes, count
+    effective_number = states.first.weight**2 / states.first.square  # (sum of w)^2 / sum of w^2
+    return estimate.mean, estimate.covariance, innovation, estimate.modes, effective_number
 
 
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
@@ -250,7 +259,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     # Random keys of all rows at once: they depend on the data, and on no particle.
     key = None if state is None else np.asarray(state.key)
     start_key, choice_starts, last_key, noise_keys, proposal_keys = compute_once(
-        _draw_keys, _draw_keys_by_xla, (filter, z, key)
+        draw_keys_of_rows, draw_keys_of_rows_by_xla, (filter, z, key)
     )
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
@@ -280,63 +289,38 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     return ScanResult(loop.last_state(last_key), outputs.results())
 
 
-def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
-    """Return the random keys and numbers of rows, which do not depend on the particles.
-
-    Args:
-        filter: the filter.
-        z: measurements (rows, received), on which keys depend.
-        key: key of the state before the rows; None for the start before any data.
-
-    Returns:
-        Key of x_0; uniform numbers by which particles are chosen (rows,); the key after the last row; keys of noises,
-        and of proposals (rows, ...).
-    """
-
-    def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Return the key after a row, a uniform number by which to choose particles, and keys of noise and proposal."""
-        key, choice_key, noise_key = filter.keys_of_prediction(key)
-        key, proposal_key = filter.keys_of_correction(key, row)
-        return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
-
-    first_key, start_key = filter.start_keys()
-    last_key, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
-        draw, first_key if key is None else jnp.asarray(key), jnp.asarray(z)
-    )
-    return start_key, choice_starts, last_key, noise_keys, proposal_keys
-
-
-_draw_keys_by_xla = quickly_compiled(_draw_keys)
-
-
 class _ParticleLoop:
-    """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
+    """Particles that are moved and weighed row by row, and sums of their weights that the next row needs."""
 
     def __init__(self, filter: Any, programs: _ParticlePrograms):
-        """Keep the filter, its compiled programs and their memory; `pairs`: arrays of present and of next particles."""
+        """Keep the filter, and the compiled programs with the arrays that they read and write in place.
+
+        A program writes particles to other arrays than it reads: `array_pairs` holds (written, read) of each leaf.
+        """
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
-        self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
-        self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
-        self.held = jax.tree.leaves(self.now)
-        self.pairs = list(zip(self.held, jax.tree.leaves(self.memory.particles), strict=True))
+        self.resample = float(filter.resample)
+        self.sum_of_weights, self.sum_of_squares = 0.0, 0.0
+        self.particles, self.log_weight, self.predicted = programs.particles, programs.log_weight, programs.predicted
+        self.particle_arrays = jax.tree.leaves(self.particles)
+        self.array_pairs = list(zip(self.particle_arrays, jax.tree.leaves(self.memory.particles), strict=True))
 
     def set_particles(self, particles: PyTree, log_weight: np.ndarray) -> None:
         """Set the particles (N, ...) before the next row, and their log weights, of which the largest must be 0."""
         memory, count = self.memory, self.count
-        for array, values in zip(self.held, jax.tree.leaves(particles), strict=True):
-            array[:count], array[count:] = values, values[0]  # copies of one particle fill the last lanes
+        for array, values in zip(self.particle_arrays, jax.tree.leaves(particles), strict=True):
+            array[:count], array[count:] = values, values[0]  # copies of the first particle fill the last lanes
         memory.log_weight[:count], memory.log_weight[count:] = log_weight, -np.inf
         np.exp(memory.log_weight, out=memory.weight)
-        self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
+        self.sum_of_weights, self.sum_of_squares = float(memory.weight.sum()), float(memory.weight @ memory.weight)
 
     def filter_row(self, row: DataRow, choice_start: float) -> ParticleSums:
-        """Choose the particles that go on, move and weigh them, in place; return the sums over them.
+        """Resample the particles if needed, move and weigh them, in place; return the sums over them.
 
-        `choice_start`: a uniform number, with which the choice begins.
+        `choice_start`: a uniform number, which is where systematic resampling starts.
         """
         memory, programs = self.memory, self.programs
-        for held, new in zip(memory.row, row, strict=True):
-            held[...] = new
+        for array, value in zip(memory.row, row, strict=True):
+            array[...] = value
         self._choose_particles(choice_start)
         # Move and weigh; a row that no particle explains is not used: they are only moved.
         used = self.filter.uses_empty_rows or not np.isnan(row.z).all()
@@ -354,37 +338,47 @@ class _ParticleLoop:
         received = np.einsum("ij->j", programs.first.outputs[1])
         programs.second()
         second = np.einsum("ijk->jk", programs.second.outputs[0])
-        # The sums of states begin with those of weights and of their squares. log p(z) is log of the sum of weights
-        # with z less that of weights before.
-        sum_before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
-        density = -np.inf if excluded else math.log(self.sum) + largest - math.log(sum_before)
+        # The first sums begin with the sums of weights and of their squares. p(z) is the sum of weights after z over
+        # that before z.
+        sum_before_z = self.sum_of_weights
+        self.sum_of_weights, self.sum_of_squares = float(states[0]), float(states[1])
+        density = -np.inf if excluded else math.log(self.sum_of_weights) + largest - math.log(sum_before_z)
         reference = tuple(part.copy() for part in memory.reference)
         return ParticleSums(states.copy(), received, second, reference=reference, density=np.asarray(density))
 
     def _choose_particles(self, start: float) -> None:
-        """Copy the particles to those of the next row, resampled if the effective number is too small."""
+        """Copy the particles after the last row to those before the next, resampled if too few have weight.
+
+        `start`: a uniform number, which is where systematic resampling starts. Resampled particles have weight 1.
+        """
         memory, count = self.memory, self.count
-        effective_number = self.sum**2 / self.square
+        effective_number = self.sum_of_weights**2 / self.sum_of_squares
         if not effective_number < self.resample * count:
-            for array, next_array in self.pairs:
-                next_array[...] = array
+            for written, read in self.array_pairs:
+                read[...] = written
             memory.prior[...] = memory.weight  # weights before z
             return
-        chosen = resample_concrete_weights(memory.weight[:count], start)
-        for array, next_array in self.pairs:
-            np.take(array, chosen, axis=0, out=next_array[:count], mode="clip")
-        memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)
+        indices = resample_concrete_weights(memory.weight[:count], start)
+        for written, read in self.array_pairs:
+            np.take(written, indices, axis=0, out=read[:count], mode="clip")
+        memory.log_weight[:count], memory.prior[:count], self.sum_of_weights = 0.0, 1.0, float(count)
 
     def _advance(self, is_used: bool) -> float:
-        """Move all particles, and weigh them by z if the row is used; return the largest log weight."""
+        """Move all particles, and weigh them by z if it is used; return the largest log weight.
+
+        The program computes as many particles as fill whole SIMD lanes; those beyond the last are set to the first.
+        """
         self.memory.used[...] = is_used
         self.programs.advance()
-        for array in (*self.held, *self.predicted):
-            array[self.count :] = array[0]  # copies of one particle fill the last lanes
+        for array in (*self.particle_arrays, *self.predicted):
+            array[self.count :] = array[0]
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:
-        """Keep what the heaviest particle before z expects of z, about which sums of innovations are taken."""
+        """Write what the heaviest particle before z expected of z: its innovation is subtracted before all are summed.
+
+        It is the heaviest particle with finite expectations, if any has them.
+        """
         prior: Any = self.memory.prior
         heaviest: Any = np.argmax(prior)
         if not all(np.isfinite(array_of_expectations[heaviest]).all() for array_of_expectations in self.predicted):
@@ -395,5 +389,5 @@ class _ParticleLoop:
 
     def last_state(self, key: np.ndarray) -> Any:
         """Return the state of the filter after the last row, given the key of what follows."""
-        particles = jax.tree.map(lambda leaf: np.array(leaf[: self.count]), self.now)
+        particles = jax.tree.map(lambda leaf: np.array(leaf[: self.count]), self.particles)
         return self.filter.make_state(particles, np.array(self.memory.log_weight[: self.count]), key)

@@ -4,6 +4,7 @@ Notation: x+ = m + G e, e ~ N(0, I), and z = M (h(m) + H G e) + c + r, r ~ N(0, 
 the `root` of the process noise, H the sensor's slopes, M the link's mean gain. G may be singular, R is regular.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -49,11 +50,12 @@ def propose_particles(
     numbers: jax.Array | None,
     particles: int,
 ) -> ProposedParticles:
-    """Draw x = center + G e of each particle, e near what z says of it, and weigh it for not being drawn from N(0, I).
+    """Draw x = m + G e of each particle, e from its law q given z, and weigh it for not being drawn from N(0, I).
 
-    e is of q = N(C' S^-1 r, I - C' S^-1 C), its law given z, with C = M H G, S = C C' + R and r = z - E z. The
-    covariance of q is (I + C' R^-1 C)^-1 too. Where the sensor is not linear or the noise has several atoms, a share
-    PRIOR_SHARE of q is N(0, I).
+    To first order z = M (h(m) + H G e) + c + N(0, R), with the mean gain M and slopes H of h. So
+    q = N(C' S^-1 r, I - C' S^-1 C), with C = M H G, S = C C' + R and r = z - E z; its covariance is also
+    (I + C' R^-1 C)^-1. If the sensor is not linear, or the noise is a mixture of several Gaussians (atoms), e is drawn
+    from N(0, I) with probability PRIOR_SHARE, which bounds the weights.
 
     Args:
         moved: center m (N, n) and root G (n, n) of each particle's law before z, and standard normal draws (N, n).
@@ -99,6 +101,18 @@ def propose_particles(
         return center + moved.root @ e, jnp.where(jnp.isfinite(log_q), log_prior - log_q, 0.0)
 
     return ProposedParticles(*jax.vmap(propose_one)(moved.center, moved.draws, from_prior))
+
+
+def share_drawn_from_prior(sensors: Sequence[AbstractSensor], atoms: int, optimal: bool) -> float:
+    """Return the share of particles drawn without z: all if not `optimal`, none if the law that uses z is exact.
+
+    It is exact for linear sensors and a noise that is one Gaussian (`atoms` = 1). Else a few draws from the prior bound
+    the weights, where the law that uses z has little mass but the posterior has some.
+    """
+    if not optimal:
+        return 1.0
+    is_exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and atoms == 1
+    return 0.0 if is_exact else PRIOR_SHARE
 
 
 def factor_noise_covariance(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:

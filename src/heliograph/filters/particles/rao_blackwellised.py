@@ -6,7 +6,7 @@ Gaussian of each mode that may follow; with z one mode is drawn, then d, and l k
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.covariance_factors import WeightedColumns, factor_covariances, join_columns
-from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns
+from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,
@@ -45,30 +45,16 @@ from heliograph.filters.particles.leading_state_draws import (
     slopes_given_drawn,
 )
 from heliograph.filters.particles.moments import StateSums
-from heliograph.filters.particles.proposal import PRIOR_SHARE, factor_noise_covariance
-from heliograph.filters.particles.received_density import ReceivedAtoms
+from heliograph.filters.particles.proposal import factor_noise_covariance, share_drawn_from_prior
+from heliograph.filters.particles.received_density import ReceivedByMode, condition_on_received, find_received_by_mode
 from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, LinearPlant
-from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.types import Array, Float
-
-
-class ReceivedByMode(NamedTuple):
-    """What arrived: z (m,), and for each mode the atoms of its density given h(x), and these as one Gaussian.
-
-    Shapes: weight (M, a), gain (M, a, m, p), offset (M, a, m), noise factors (M, a, m, m); `overall` without a.
-    """
-
-    z: jax.Array
-    weight: jax.Array
-    gain: jax.Array
-    offset: jax.Array
-    noise: WeightedColumns
-    overall: tuple[jax.Array, jax.Array, WeightedColumns]
 
 
 class PartlyDrawnFilter(AbstractStateParticleFilter):
@@ -78,7 +64,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     transition: Float[Array, "M M"]
     plant_modes: tuple[int, ...] = eqx.field(static=True)
     sensor_modes: tuple[int, ...] = eqx.field(static=True)
-    order: tuple[int, ...] = eqx.field(static=True)  # places of the states, drawn ones first
+    order: tuple[int, ...] = eqx.field(static=True)  # indices of the plant's states, drawn ones first
     drawn: int = eqx.field(static=True)  # how many are drawn
 
     @property
@@ -88,7 +74,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @compile_on_call
     def init(self) -> PartlyDrawn:
-        """Return the law of x_0 in every particle, with drawn states unless all plants are linear."""
+        """Return particles with the law of x_0; some states are drawn now, unless all plants are linear."""
         key, start_key = self.start_keys()
         particles = self.draw_start(start_key, jnp.arange(self.particles))
         return self.make_state(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
@@ -110,11 +96,14 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def start_keys(self) -> tuple[jax.Array, jax.Array]:
         """Return the key of the first step, and that of the draws of x_0."""
-        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
-        return key, own
+        key, start_key = jax.random.split(jax.random.PRNGKey(self.seed))
+        return key, start_key
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
-        """Return the law of x_0 in every mode for the particles with these numbers (B,); drawn states come first."""
+        """Return the particles with these indices (B,): the Gaussian of x_0 in each mode, and the modes' log law.
+
+        The states that are drawn come first. They are drawn here unless all plants are linear.
+        """
         plants, count, order = list_mode_models(at(self.plant, k=0)), len(numbers), np.array(self.order)
         prior = from_covariance(plants[0].initial_mean[order], plants[0].initial_covariance[order][:, order])
         x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), prior)
@@ -125,37 +114,45 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @predicts
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
-        """Resample if the effective number is too small, and then move each particle's Gaussian by each mode's law."""
-        key, choice_key, noise_key = self.keys_of_prediction(state.key)
+        """Resample if the effective number is too small, then draw modes and states, and move them by the plants."""
+        key, choice_key, draw_keys = self.keys_of_prediction(state.key)
         chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
         particles = jax.tree.map(lambda leaf: leaf[chosen], self.get_particles(state))
-        all_numbers, u = None, jnp.asarray(u)
-        moved_particles, _ = self.move_particles(particles, all_numbers, noise_key, u, k, state.moved)
-        return self.make_state(moved_particles, log_weight, key)
+        predicted, _ = self.move_particles(particles, None, draw_keys, jnp.asarray(u), k, state.moved)
+        return self.make_state(predicted, log_weight, key)
 
     def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return keys of what follows, of the choice of particles, and of their states and modes (2, 2)."""
+        """Return the key of the correction, that of the resampling, and those of drawn states and of modes (2, 2)."""
         keys = jax.random.split(jax.random.fold_in(key, 0), 4)
         return keys[0], keys[1], keys[2:]
 
     def move_particles(
         self, particles: Cloud, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
     ) -> tuple[Cloud, None]:
-        """Move the Gaussians of particles (B,) by the law of every mode that may follow."""
+        """Draw the mode and some states of B particles before a step; return the Gaussian in each mode after it.
+
+        Args:
+            particles: Gaussian of x in each mode, and log probabilities of the modes. After a correction, where z drew
+                both, they have one mode, and drawn states without variance: the draws here then change nothing.
+            numbers: indices of the particles (B,), which have draws of their own; None for all.
+            key: two keys, of the states and of the modes.
+            u: input.
+            k: step.
+            moved: False at the first step: modes keep their initial law, and x_0 stays Gaussian if plants are linear.
+        """
         plants, (gaussian, log_mode) = list_mode_models(at(self.plant, k)), particles
-        # What no measurement has drawn is drawn now; at the first step of a linear plant the start stays a Gaussian.
         mode = draw_index(log_mode, draw_uniforms(key[1], numbers, 1, self.particles)[:, 0])
         in_mode: Gaussian = jax.tree.map(lambda leaf: leaf[jnp.arange(len(mode)), mode], gaussian)
         x = self._draw_states(in_mode, key[0], numbers)
         if self._is_linear(plants):
-            x = jax.tree.map(lambda new, old: jnp.where(moved, new, old), x, in_mode)
-        # The law after the step in each mode that may follow.
-        by_model = [
-            jax.vmap(lambda particle, plant=plant: self._move_particle(plant, particle, u))(x) for plant in plants
-        ]
-        after: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
-        chance = jnp.where(moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
-        return Cloud(after, jnp.log(chance)), None
+            x = jax.tree.map(lambda drawn, undrawn: jnp.where(moved, drawn, undrawn), x, in_mode)
+        # Each particle moved by each plant (B, plants), then by the plant of each mode that may follow (B, M).
+        by_plant = [jax.vmap(lambda x, plant=plant: self._move_particle(plant, x, u))(x) for plant in plants]
+        predicted: Gaussian = jax.tree.map(
+            lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_plant
+        )
+        next_law = jnp.where(moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
+        return Cloud(predicted, jnp.log(next_law)), None
 
     def _is_linear(self, plants: Sequence[AbstractPlant]) -> bool:
         """Return whether the plant is linear in the drawn states too, so that they need not be drawn to be moved."""
@@ -166,7 +163,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return jax.vmap(condition_on_draw)(x, draw_normals(key, numbers, self.drawn, self.particles))
 
     def _move_particle(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
-        """Return the law of f(x) + w of one particle; f is affine in the states that have a variance."""
+        """Return the Gaussian of f(x) + w for a particle x; f is affine in the states that have a variance."""
         order = np.array(self.order)
         # A linear plant may have drawn states that still have a variance. With other plants they are known.
         noise, known_count = factor_noise_covariance(plant, u), 0 if self._is_linear([plant]) else self.drawn
@@ -186,31 +183,43 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @corrects
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
-        """Draw mode and drawn states from a law q that uses z, weigh by p(z) p / q, and condition the rest on z."""
+        """Draw each particle's mode j and some of its states d with z, and condition its other states on z.
+
+        They are drawn from a law q(j, d) near their posterior, so that the weight is multiplied by p(j, d, z) / q(j,
+        d).
+        """
         z = jnp.asarray(z)
-        key, proposal_key = self.keys_of_correction(state.key, z)
-        weighed = self.weigh_particles(self.get_particles(state), law=None, numbers=None, key=proposal_key, z=z, k=k)
+        key, proposal_keys = self.keys_of_correction(state.key, z)
+        weighed = self.weigh_particles(self.get_particles(state), law=None, numbers=None, key=proposal_keys, z=z, k=k)
+        # p(z) = sum_i weight_i p(z | i)
         log_likelihood = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
-        # If all weights become zero, the row is not used.
+        # A row without any number says something only of the modes. One that no particle explains is not used.
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
         is_used = (self.uses_empty_rows | ~jnp.all(jnp.isnan(z))) & (log_likelihood > -jnp.inf)
-        after = update_if_used(is_used, updated, state._replace(key=key))
-        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, log_likelihood)
+        corrected = update_if_used(is_used, updated, state._replace(key=key))
+        return corrected, self.compute_innovation(state.weight, weighed.predicted, z, k, log_likelihood)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return keys of what follows, and of the drawn states and of the choices (2, 2)."""
+        """Return the key of the next prediction, and those of drawn states and of uniform numbers (2, 2).
+
+        They depend on z, so that other data get other draws.
+        """
         key = fold_in_bits(key, z)
-        return key, jax.random.split(jax.random.fold_in(key, 2))
+        return key, jax.random.split(jax.random.fold_in(key, 2))  # the prediction folds in 0
 
     def weigh_particles(
         self, particles: Cloud, law: None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> WeighedParticles:
-        """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
+        """Draw mode j and states d of B particles from a law q that uses z, and weigh them by p(j, d, z) / q(j, d).
+
+        `particles`: Gaussian in each mode and log probabilities of the modes. `law`: None, used by filters that draw
+        all states. `numbers`: indices of the particles, None for all. `key`: of the states and of the uniform numbers.
+        """
         sensors, (gaussian, log_mode) = list_mode_models(at(self.sensor, k)), particles
         atoms, chance = at(self.density, k).given_arrivals(z)
-        received = self._find_atoms_by_mode(z, atoms)
-        # That nothing or only a part arrived says something of the mode.
+        received = find_received_by_mode(z, atoms)
+        # Which components arrived says something of the mode: P(j, arrivals) = P(j) P(arrivals | j).
         log_mode = log_mode + jnp.log(chance)
         draws = draw_normals(key[0], numbers, self.drawn, self.particles)
         uniform = draw_uniforms(key[1], numbers, 3, self.particles)
@@ -222,20 +231,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         predicted = jax.vmap(partial(self._expect_received, sensors, received))(gaussian, log_mode)
         return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
-    def _find_atoms_by_mode(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
-        """Return z with each mode's atoms, the Gaussians of its mixture, and with one Gaussian that replaces them."""
-        gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
-        return ReceivedByMode(
-            z=z,
-            weight=jnp.asarray(atoms.weight),
-            gain=jnp.asarray(atoms.gain),
-            offset=jnp.asarray(atoms.offset),
-            noise=jax.vmap(factor_covariances)(jnp.asarray(atoms.noise)),
-            overall=(gain, offset, factor_covariances(noise)),
-        )
-
     def _angles_in_order(self, plant: AbstractPlant | None = None) -> Angles:
-        """Return the places of the angles, drawn states first: of this plant, or of the first mode's."""
+        """Return the indices of the angles in x, drawn states first: of this plant, or of the first mode's."""
         angles = (plant or list_mode_models(first(self.plant))[0]).angles
         return tuple(i for i, place in enumerate(self.order) if place in angles)
 
@@ -256,22 +253,22 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         draw: jax.Array,
         uniform: jax.Array,
     ) -> tuple[Gaussian, jax.Array, jax.Array]:
-        """Draw mode j and d of one particle from q, and condition it on z: its Gaussian, j, and log (p / q).
+        """Draw a particle's mode j and states d from q; return its Gaussian given j, d, z, then j, log p(j, d, z) / q.
 
-        p(j, d, z) is P(j) N(d) sum_a w_a N(z given d, atom a). q(j, d) is P(j) N(d) times N(z) of the linearised sensor
-        and one Gaussian noise, in coordinates of the noise; where that is not p, a share of q is P(j) N(d) itself.
+        p(j, d, z) = P(j) N(d) sum_a w_a N_a(z | d), over the Gaussians a (atoms) of the mixture of noises. q(j, d) is
+        the posterior by the linearised sensor and one Gaussian noise, mixed with the prior.
 
         Args:
-            sensors: one of each mode of the sensor.
+            sensors: the different sensors.
             received: what arrived, with gains and noises by mode and atom.
             x: Gaussian of the state in each mode, drawn states first.
-            log_mode: log P(j) of each mode.
+            log_mode: log P(j, what arrived) of each mode.
             draw: standard normal numbers for d.
             uniform: three numbers, for prior or posterior, for the mode and for the atom of the noise.
         """
-        # Posterior of each mode by the linearised sensor, and alpha_j = log P(j) N_j(z); where no mode can produce z
-        # there is no posterior, and the prior is drawn from.
-        share = self._prior_share(sensors, received)
+        # Posterior of each mode by the linearised sensor, and alpha_j = log P(j) N_j(z). If no mode can produce z there
+        # is no posterior, and the draw is from the prior.
+        share = share_drawn_from_prior(sensors, received.weight.shape[1], self.optimal)
         modes = jnp.arange(len(self.initial))
         posterior, alpha = jax.vmap(lambda j, x_j: self._linearised_posterior(sensors, received, j, x_j))(modes, x)
         alpha = jnp.where(jnp.isnan(alpha), -jnp.inf, alpha) + log_mode
@@ -283,44 +280,31 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         prior, linearised = (jax.tree.map(lambda leaf: leaf[mode], law) for law in (x, posterior))
         source: Gaussian = jax.tree.map(lambda a, b: jnp.where(from_prior, a, b), prior, linearised)
         d = condition_on_draw(source, draw).mean[: self.drawn]
-        # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d). States
-        # that are known already have no density: they are `certain`, and left out of both.
+        # q = (1 - share) (linearised posterior of j and d) + share P(j | arrivals) N(d). States d that are known have
+        # no density, and are left out of p and q.
         certain = find_states_without_variance(prior, d)
-        rest, log_prior = condition_on_leading_states(prior, d, certain)
-        log_linearised = log_posterior_mode[mode] + condition_on_leading_states(linearised, d, certain)[1]
-        log_p = log_mode[mode] + log_prior
-        log_total = log_p - jax.nn.logsumexp(log_mode)  # of the prior's share, which is a law
-        log_q = jnp.logaddexp(jnp.log1p(-share) + log_linearised, jnp.log(share) + log_total)
-        log_q = jnp.where(possible, log_q, log_total)
-        after, log_density = self._condition_on_atoms(sensors, received, mode, rest, uniform[2])
-        return after, mode, log_density + log_p - log_q
-
-    def _prior_share(self, sensors: Sequence[AbstractSensor], received: ReceivedByMode) -> float:
-        """Return the share of particles drawn without z: all if not `optimal`, none if drawing with z is exact."""
-        if not self.optimal:
-            return 1.0
-        is_exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and received.weight.shape[1] == 1
-        return 0.0 if is_exact else PRIOR_SHARE
+        x_given_d, log_prior_d = condition_on_leading_states(prior, d, certain)
+        _, log_linearised_d = condition_on_leading_states(linearised, d, certain)
+        log_linearised = log_posterior_mode[mode] + log_linearised_d
+        log_p = log_mode[mode] + log_prior_d
+        log_prior = log_p - jax.nn.logsumexp(log_mode)
+        log_q = jnp.logaddexp(jnp.log1p(-share) + log_linearised, jnp.log(share) + log_prior)
+        log_q = jnp.where(possible, log_q, log_prior)
+        # log p(j, d, z) / q(j, d)
+        corrected, log_density = self._condition_on_atoms(sensors, received, mode, x_given_d, uniform[2])
+        return corrected, mode, log_density + log_p - log_q
 
     def _linearised_posterior(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, mode: jax.Array, x: Gaussian
     ) -> tuple[Gaussian, jax.Array]:
         """Return x given z = gain h(x) + n in this mode, and the log density of z.
 
-        h is linearised at the mean of x in all states. n is one Gaussian that replaces the atoms.
+        h is linearised at the mean of x. `overall` holds gain and noise of the one Gaussian that has the moments of the
+        mode's mixture. So this law is near the posterior, and weights correct for the difference.
         """
         gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
         y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
-        return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
-
-    def _condition_on_received(
-        self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: WeightedColumns, z: jax.Array
-    ) -> tuple[Gaussian, jax.Array]:
-        """Return x = m + L xi given z = expected + slopes xi + v, and the log density of z."""
-        value = wrap_near(z - expected, jnp.zeros(len(z)), self.observed_angles)
-        present = ~jnp.isnan(z)
-        after, innovations = condition_on_observation(x, slopes, value, noise, present)
-        return after, innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+        return condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z, self.observed_angles)
 
     def _condition_on_atoms(
         self,
@@ -330,57 +314,73 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         x: Gaussian,
         uniform: jax.Array,
     ) -> tuple[Gaussian, jax.Array]:
-        """Return x, whose drawn states are known, given z and an atom drawn by its probability; and log p(z) of all."""
+        """Return x given z and one Gaussian of the noise's mixture, which is drawn, and the log density of z.
+
+        `x`: Gaussian of a particle whose drawn states d are known, so that h is affine in the others. Given d, the law
+        of z in this mode is sum_a weight_a N_a(z). Gaussian a is drawn with P(a | z), by a `uniform` number.
+        """
         y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, self.drawn)
 
         def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> tuple[Gaussian, jax.Array]:
             """Return x given z = gain h(x) + offset + noise, and log p(z); h(x) = y + slopes xi, x = m + L xi."""
-            return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
+            return condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z, self.observed_angles)
 
         atoms = jax.tree.map(lambda leaf: leaf[mode], (received.gain, received.offset, received.noise))
-        after, densities = jax.vmap(condition_on_atom)(*atoms)
-        densities = jnp.where(jnp.isnan(densities), -jnp.inf, densities) + jnp.log(received.weight[mode])
-        atom = draw_index(densities[None], uniform[None])[0]
-        return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(densities)
+        posteriors, log_density = jax.vmap(condition_on_atom)(*atoms)
+        log_joint = jnp.where(jnp.isnan(log_density), -jnp.inf, log_density) + jnp.log(received.weight[mode])
+        a = draw_index(log_joint[None], uniform[None])[0]
+        return jax.tree.map(lambda leaf: leaf[a], posteriors), jax.nn.logsumexp(log_joint)
 
     def _expect_received(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, x: Gaussian, log_mode: jax.Array
     ) -> ExpectedMixture:
-        """Return what a particle expects of z in each mode and atom, to first order in h."""
+        """Return the Gaussians that a particle expects of z, one for each mode and atom, to first order in h.
+
+        `x`: Gaussian of the state in each mode; `log_mode`: log P(mode, what arrived). An atom is one Gaussian of the
+        mixture that z is given h(x).
+        """
 
         def expect_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
-            """Return for each atom of the mode's mixture the mean (atoms, m) of z, and its covariance."""
+            """Return for each atom the mean gain y + offset of z (atoms, m), and Cov z = gain Cov(y) gain' + noise."""
             y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
-            of_state = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
+            signal_covariance = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
             noise_columns = jax.tree.map(lambda leaf: leaf[mode], received.noise)
-            of_noise = jax.vmap(lambda columns: columns.covariance)(noise_columns)
-            return gain @ y + received.offset[mode], of_state + of_noise
+            noise_covariance = jax.vmap(lambda columns: columns.covariance)(noise_columns)
+            return gain @ y + received.offset[mode], signal_covariance + noise_covariance
 
-        expected, total = jax.vmap(expect_in_mode)(jnp.arange(len(self.initial)), x)
-        share = jax.nn.softmax(log_mode)[:, None] * received.weight
-        m = len(received.z)
-        chance = jnp.sum(jnp.exp(log_mode))
+        expected, covariance = jax.vmap(expect_in_mode)(jnp.arange(len(self.initial)), x)
+        m, share = len(received.z), jax.nn.softmax(log_mode)[:, None] * received.weight  # P(mode, atom | arrivals)
         return ExpectedMixture(
-            share=share.ravel(), expected=expected.reshape(-1, m), total=total.reshape(-1, m, m), chance=chance
+            share=share.ravel(),
+            expected=expected.reshape(-1, m),
+            covariance=covariance.reshape(-1, m, m),
+            chance=jnp.sum(jnp.exp(log_mode)),  # P(arrivals)
         )
 
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> ReceivedSums:
-        """Return sums over particles (B,), modes and atoms of the innovations less the reference innovation."""
+        """Return weighted sums, over B particles and the Gaussians that each expects of z, of the innovations of z.
+
+        `reference` and `predicted` are the fields of an `ExpectedMixture`: of one particle, and of all. The innovation
+        of the reference is subtracted from all, so that a z far from 0 costs no digits, and added back to the mean.
+        """
         base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
         return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
 
     def innovation_from_sums(
         self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z less its mean over particles, modes and the channel's atoms, its covariance, and log p(z)."""
+        """Return z - E z and Cov z over the mixtures that all particles expect of z, and the log-likelihood of z.
+
+        `received`: sums of innovations less that of the `reference` particle. `density`: log p(z, what arrived).
+        """
         base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
         return compute_mixture_innovation(received, base, z, density)
 
     def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
-        """Return the first sums of particles (B,), drawn states first."""
+        """Return sums over particles (B,) of weights and of weights times states, drawn states first."""
         return sum_clouds_for_mean(weight, particles, self._angles_in_order())
 
     def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:

@@ -1,11 +1,14 @@
 """Density of what is received given the sensor's h(x): a mixture of Gaussians, for each set of what arrives."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.covariance_factors import WeightedColumns, factor_covariances
+from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation
 from heliograph.filters.modes.arrival_patterns import pattern_of
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angles.angle import Angles, wrap_near
@@ -97,13 +100,57 @@ class ReceivedDensity(Module):
     atoms: ReceivedAtoms
 
     def given_arrivals(self, z: jax.Array) -> tuple[ReceivedAtoms, jax.Array]:
-        """Return the atoms in each mode, and the chance (M,), of the smallest set that holds all that arrived.
+        """Return for each mode the Gaussians (atoms) of z given h(x), and P(set of arrivals | mode) (M,).
 
-        Atoms are the Gaussians whose mixture is what arrives. There are some for each mode and each set of arrivals.
+        The set is the smallest possible one in which all components of z arrive that are no NaN; a larger one is
+        possible too, if numbers that arrived were replaced by NaN.
         """
         pattern = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
         atoms: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, pattern], self.atoms)
         return atoms, jnp.asarray(self.chance)[:, pattern]
+
+
+class ReceivedByMode(NamedTuple):
+    """What arrived: z (m,), and in each mode the mixture of Gaussians that is its law given y = h(x).
+
+    z = gain y + offset + N(0, noise) with probability `weight`, for each Gaussian a (atom) of the mixture. `overall`
+    holds gain, offset and noise of one Gaussian with the moments of the mixture.
+
+    Shapes: weight (M, a), gain (M, a, m, p), offset (M, a, m), noise columns (M, a, m, m); `overall` without a.
+    """
+
+    z: jax.Array
+    weight: jax.Array
+    gain: jax.Array
+    offset: jax.Array
+    noise: WeightedColumns
+    overall: tuple[jax.Array, jax.Array, WeightedColumns]
+
+
+def find_received_by_mode(z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
+    """Return z with the Gaussians (atoms) of each mode's mixture, and with the one Gaussian that has their moments."""
+    gain, offset, noise = jax.vmap(lambda atoms_of_mode: atoms_of_mode.moments())(atoms)
+    return ReceivedByMode(
+        z=z,
+        weight=jnp.asarray(atoms.weight),
+        gain=jnp.asarray(atoms.gain),
+        offset=jnp.asarray(atoms.offset),
+        noise=jax.vmap(factor_covariances)(jnp.asarray(atoms.noise)),
+        overall=(gain, offset, factor_covariances(noise)),
+    )
+
+
+def condition_on_received(
+    x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: WeightedColumns, z: jax.Array, angles: Angles
+) -> tuple[Gaussian, jax.Array]:
+    """Return x = m + L xi given z = expected + slopes xi + noise, and the log density of z.
+
+    Only the components of z that arrived are used; `angles` are those that are angles.
+    """
+    innovation = wrap_near(z - expected, jnp.zeros(len(z)), angles)
+    present = ~jnp.isnan(z)
+    corrected, innovations = condition_on_observation(x, slopes, innovation, noise, present)
+    return corrected, innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
 
 
 def find_received_density(

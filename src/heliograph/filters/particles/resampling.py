@@ -1,10 +1,14 @@
 """Random numbers of particles: resampling of weighted ones, their normal numbers, and keys that depend on the data."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.types import Array
 
 STEP = 2.0**-22  # between the uniform numbers of which normal ones of many particles are made
 MANY = 10_000  # normal numbers, more than a program of native code draws at once
@@ -87,3 +91,32 @@ def fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
     for word in bits.ravel():
         key = jax.random.fold_in(key, word)
     return key
+
+
+def draw_keys_of_rows(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
+    """Return the random keys of rows of data, and uniform numbers, which depend on the data but on no particle.
+
+    Args:
+        filter: the filter.
+        z: measurements (rows, received), on which keys depend.
+        key: key of the state before the rows; None for the start before any data.
+
+    Returns:
+        Key of x_0; uniform numbers by which particles are chosen (rows,); the key after the last row; keys of noises,
+        and of proposals (rows, ...).
+    """
+
+    def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        """Return the key after a row, a uniform number by which to choose particles, and keys of noise and proposal."""
+        key, choice_key, noise_key = filter.keys_of_prediction(key)
+        key, proposal_key = filter.keys_of_correction(key, row)
+        return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
+
+    first_key, start_key = filter.start_keys()
+    last_key, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
+        draw, first_key if key is None else jnp.asarray(key), jnp.asarray(z)
+    )
+    return start_key, choice_starts, last_key, noise_keys, proposal_keys
+
+
+draw_keys_of_rows_by_xla = quickly_compiled(draw_keys_of_rows)

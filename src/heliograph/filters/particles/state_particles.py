@@ -67,7 +67,8 @@ class StateParticles(NamedTuple):
 class StateParticleFilter(AbstractStateParticleFilter):
     """Weighted particles of the whole state, which are drawn from the prior or with z. Built by `particle_filter`.
 
-    What is done with particles takes any of them side by side, by their numbers: all at once (None), or a lane each.
+    Methods on particles take some of them (B, n), with their indices `numbers`, on which their draws depend. None
+    stands for all particles; native code calls them for one particle in each SIMD lane.
     """
 
     uses_empty_rows = False
@@ -101,8 +102,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     def start_keys(self) -> tuple[jax.Array, jax.Array]:
         """Return the key of the first step, and that of the draws of x_0."""
-        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
-        return key, own
+        key, start_key = jax.random.split(jax.random.PRNGKey(self.seed))
+        return key, start_key
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> jax.Array:
         """Draw x_0 (B, n) of the particles of these numbers.
@@ -123,7 +124,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
         """Resample if the effective number is too small, and then move each particle with a noise of its own.
 
-        `law` is the law of that move, from which an optimal proposal draws again. It is None for the prior proposal.
+        `law` is p(x+ | x) of each particle. The optimal proposal draws x+ again from it once z is known; for a filter
+        that draws from the prior it is None.
         """
         key, choice_key, noise_key = self.keys_of_prediction(state.key)
         chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
@@ -134,15 +136,24 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
 
     def keys_of_prediction(self, key: jax.Array) -> jax.Array:
-        """Return keys of what follows, of the choice of particles, and of their noise (3, 2)."""
+        """Return three keys (3, 2): of the correction, of the resampling, and of the process noise."""
         return jax.random.split(jax.random.fold_in(key, 0), 3)
 
     def move_particles(
         self, x: jax.Array, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
     ) -> tuple[jax.Array, MoveLaw | None]:
-        """Move particles x (B, n) with noises of their own; return with them the law of the move, if z is to use it.
+        """Return f(x, u) + w for B particles x, and the law of this move if the optimal proposal is to draw from it.
 
-        `numbers`: of the particles, None for all; the law has centers, root of the noise's covariance and draws.
+        Args:
+            x: particles (B, n).
+            numbers: their indices (B,), on which their noise depends; None for all particles.
+            key: of the noise.
+            u: input.
+            k: step.
+            moved: False at the first step, where x is x_0.
+
+        Returns:
+            Positions, and the law m + G e with e ~ N(0, I): centers m, the root G of the noise's covariance, and e.
         """
         plant = at(self.plant, k)
         center = jax.vmap(lambda one: plant.transition(one, u))(x)
@@ -158,11 +169,11 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u)
 
     def _find_law_of_move(self, plant: AbstractPlant, moved: jax.Array, law: MoveLaw, u: jax.Array) -> MoveLaw:
-        """Return the law of x+ of each particle, from which the optimal proposal draws again with z.
+        """Return the law of x+ of each particle, from which the optimal proposal draws once z is known.
 
-        `law` is that of the particle's move: center, root of the noise's covariance, and draws. At the first step
-        (`moved` is False) of a linear plant it is replaced by the law of A x_0 + w, with x_0 random too. Else a
-        measurement that is far more precise than x_0 would leave only few of the particles.
+        `law` is p(x+ | x): a center for each particle, the root of the noise's covariance, and draws. At the first step
+        (`moved` is False) of a linear plant it is replaced by the law of A x_0 + w with a random x_0. Otherwise a
+        measurement that is far more precise than x_0 would leave only few particles with weight.
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return law
@@ -178,7 +189,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
         """Weight each particle by the density of z; under the optimal proposal each is first drawn again with z.
 
-        `state.law` is the law of the last move, from which is drawn. A row that no particle explains is not used.
+        `state.law` is the law p(x | x before) of the last move, from which it is drawn. A measurement that has no
+        density under any particle is not used.
         """
         z = jnp.asarray(z)
         key, proposal_key = self.keys_of_correction(state.key, z)
@@ -187,21 +199,24 @@ class StateParticleFilter(AbstractStateParticleFilter):
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         is_used = ~jnp.all(jnp.isnan(z)) & (log_likelihood > -jnp.inf)
         updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
-        after = update_if_used(is_used, updated, state._replace(key=key))
-        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, log_likelihood)
+        corrected = update_if_used(is_used, updated, state._replace(key=key))
+        return corrected, self.compute_innovation(state.weight, weighed.predicted, z, k, log_likelihood)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return keys of what follows, and of the choice of those drawn from the prior."""
+        """Return the key of the next prediction, and that by which the proposal chooses particles to keep unchanged.
+
+        They depend on z, so that runs with other data draw other numbers.
+        """
         key = fold_in_bits(key, z)
-        return key, jax.random.fold_in(key, 2)
+        return key, jax.random.fold_in(key, 2)  # the prediction folds in 0
 
     def weigh_particles(
         self, position: jax.Array, law: MoveLaw | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> WeighedParticles:
-        """Weigh particles (B, n) by z, after they are drawn again with z if the `law` of their move is given.
+        """Weigh particles (B, n) by p(z | x), after they are drawn again with z if the `law` of their move is given.
 
-        `predicted` (B, p) is h(x) before z was known. `correction` is the log of the move's density over that of the
-        draw. `numbers` are those of the particles, None for all.
+        A draw from q(x) instead of p(x) multiplies the weight by p(x) / q(x), whose log is `correction`. `numbers` are
+        the indices of the particles, None for all. `predicted` (B, p) is h(x) before z was known.
         """
         sensor, atoms = at(self.sensor, k), self.find_received_atoms(z, k)
         predicted = signal = jax.vmap(sensor.measure)(position)
@@ -214,16 +229,22 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return WeighedParticles(position, likelihood, (predicted,))
 
     def find_received_atoms(self, z: jax.Array, k: Step) -> ReceivedAtoms:
-        """Return the atoms of what is received given h(x)."""
-        atoms: ReceivedAtoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
+        """Return the Gaussians (atoms) whose mixture is the law of z given h(x), for the components that arrived.
+
+        There is one mode, since the channel has no memory.
+        """
+        atoms_by_mode, _ = at(self.density, k).given_arrivals(z)
+        atoms: ReceivedAtoms = jax.tree.map(lambda leaf: leaf[0], atoms_by_mode)
         return atoms
 
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
-        """Return first and second sums of the innovations of particles (B,) and atoms, less a reference innovation.
+        """Return first and second sums of the innovations of B particles and atoms, less a reference innovation.
 
-        Atoms are the Gaussians whose mixture is the channel. `predicted` holds what particles expect of z.
+        Atoms are the Gaussians whose mixture is the law of z given y = h(x). `predicted` holds y of the particles, and
+        `reference` y of the heaviest one, whose innovation under the first atom is subtracted, so that no digits are
+        lost if z is far from 0.
         """
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         joint_weight, difference = expected.find_innovations(weight, *predicted)
@@ -239,8 +260,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
     ) -> Innovation:
         """Return z - E z over particles and atoms, the covariance of z, and the log-likelihood.
 
-        `received` holds first and second sums of innovations about that of the `reference` particle. `density` is
-        log p(z).
+        Atoms are the Gaussians whose mixture is the law of z given h(x). `received` holds first and second sums of
+        innovations less that of the `reference`, h(x) of the heaviest particle. `density` is log p(z).
         """
         first_sums_of_innovations, second_sums_of_innovations = received
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)

@@ -1,0 +1,77 @@
+"""State of a filter with side information on the modes: an estimate, and moments of its error and of x in each mode."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import WeightedColumns, below_diagonal, side_by_side, unit_lower
+from heliograph.numerics.types import Bool, Float
+
+
+class SideInformationBelief(NamedTuple):
+    """s, the estimate of zeta, and factors of E[q q' 1{mode} | side information] of q = (e, x~), of each mode.
+
+    x~ = (x - c, 1) with c = E[x] before any data, zeta holds x~ 1{mode}, mode after mode, and e = zeta - s is the
+    error: in a mode, s follows from e and x~.
+
+    Shapes: with N = M (n + 1) and q = N + n + 1: mean (N,), lower (M, q (q - 1) / 2), variances (M, q), centre c (n,).
+    """
+
+    mean: Float[jax.Array, " N"]
+    lower: Float[jax.Array, "M entries"]
+    variances: Float[jax.Array, "M q"]
+    centre: Float[jax.Array, " n"]
+    moved: Bool[jax.Array, ""]
+
+    @property
+    def moments(self) -> WeightedColumns:
+        """E[q q' 1{mode}] of each mode as columns (M, q, q)."""
+        return WeightedColumns(unit_lower(self.lower), self.variances)
+
+    @property
+    def errors(self) -> WeightedColumns:
+        """E[e e' | side information] = sum_j E[e e' 1{mode = j} | ...] of the estimate's error e, as columns (N, M q).
+
+        Each of the M modes has q columns.
+        """
+        modes, errors_by_mode = len(self.lower), self.moments.matrix[:, : len(self.mean)]
+        return side_by_side(WeightedColumns(errors_by_mode, self.moments.weights), np.ones(modes))
+
+    @property
+    def covariance(self) -> Float[jax.Array, "N N"]:
+        """Second moment E[e e' | side information] of the error."""
+        return self.errors.covariance
+
+
+def split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the columns of e (M, N, q) and of x~ (M, n + 1, q) in each of M modes, and the columns' weights (M, q).
+
+    x~ = (x - c, 1), and e is the error of the estimate of its products with the modes' indicators. A second moment in a
+    mode is the weighted sum over the q columns: E[e x~' 1{mode = j}] = sum_q weights_jq e_jq x~_jq'.
+    """
+    columns, length_of_e = jnp.asarray(state.moments.matrix), len(state.mean)
+    return columns[:, :length_of_e], columns[:, length_of_e:], jnp.asarray(state.variances)
+
+
+def make_belief(
+    mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
+) -> SideInformationBelief:
+    """Return the filter's state.
+
+    Args:
+        mean: estimate of the products of (x - c, 1) and the modes' indicators.
+        moments: lower triangular factors of E[q q' 1{mode}] (M, q, q), q the estimate's error and (x - c, 1).
+        centre: c = E[x] before any data.
+        moved: True once a step was predicted.
+    """
+    lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))  # what is below the unit diagonal
+    return SideInformationBelief(
+        mean=mean, lower=lower, variances=jnp.asarray(moments.weights), centre=centre, moved=moved
+    )
+
+
+def mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:
+    """Return the probabilities of the modes (M,): E[1^2 1{mode}], since the last entry of x~, `x`, is 1."""
+    return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
