@@ -107,9 +107,10 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: jax.Array) -> jax.Array:
     """Return 1 / sqrt(pivot); it is 0 for a pivot that is zero up to rounding, and NaN for a negative one.
 
-    `whole`: the diagonal entry of the matrix of which the pivot is left. `growth`: the largest ratio so far of a
-    diagonal entry to its pivot. Dividing by such a pivot multiplies rounding errors by this ratio, so a pivot may be so
-    far below zero by rounding. For a zero pivot the root is taken of infinity, which makes its derivative 0.
+    `whole` is the matrix's diagonal entry from which the pivot was computed, by subtracting squares. `growth` is the
+    largest ratio so far of a diagonal entry to its pivot: dividing by such a pivot multiplies rounding errors by this
+    ratio, so that rounding may make a later pivot negative by as much. For a zero pivot the root is taken of infinity,
+    which makes its derivative 0.
     """
     is_zero_or_more = pivot >= -negative_tolerance(pivot, growth) * whole
     if_not_positive = jnp.where(is_zero_or_more, jnp.inf, jnp.nan)
@@ -118,7 +119,7 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
-    """Return the share of its diagonal entry by which a pivot below zero is rounding of a singular matrix."""
+    """Return the share of its diagonal entry that a negative pivot may have by rounding, in a singular matrix."""
     eps = float(np.finfo(like.dtype).eps)
     return jnp.maximum(rounding(NEGATIVE_TOLERANCE, like, 1000), 10 * eps * growth)
 
@@ -138,7 +139,7 @@ def cholesky(a: Float[Array, "n n"]) -> Float[jax.Array, "n n"]:
 def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[jax.Array, "n k"]:
     """Solve A X = B for a positive semidefinite A and B in its range.
 
-    Of a component that those before it determine, X is zero: B' X is B' A^+ B whatever is chosen there. An indefinite A
+    A row of A that depends on those above it has the row 0 in X: B' X = B' A^+ B whatever that row is. An indefinite A
     gives NaN.
 
     Shapes: (n, n), (n, k) -> (n, k).
@@ -163,14 +164,14 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
 
 @jax.jit
 def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the numerators B_i - sum_{j < i} L_ij Y_j of L Y = B (n, k): each row of Y is taken off those below it.
+    """Return the numerators B_i - sum_{j < i} L_ij Y_j of the solution Y of L Y = B (n, k), by forward substitution.
 
     Y_i is numerator i times `scales`, the reciprocals of L's diagonal (n,). Above WRITTEN rows it is a loop.
     """
     n, remainder, numerators = len(b), b, list[jax.Array]()
 
     def take_off(j: jax.Array, rows: jax.Array) -> jax.Array:
-        """Take row j of Y, which is `rows[j] * scales[j]`, times its entries of L, off the rows below it."""
+        """Subtract L_ij Y_j from each row i below row j, with Y_j = `rows[j] * scales[j]`."""
         is_below = (np.arange(n) > j)[:, None]
         return jnp.where(is_below, rows - outer(lower[:, j], rows[j] * scales[j]), rows)
 
@@ -185,9 +186,10 @@ def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
     """Return x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
-    A component that those before it determine, or that is known to its rounding, counts 1, what is expected of it in
-    the limit, where x says what they say, and is infinite where it does not; `size` (n,) is what x is a difference of,
-    for its rounding.
+    Each component of x adds its squared difference from what the components before it predict, over the variance of
+    that. If the components before it determine it, or it is known up to rounding, this is 0 / 0: it adds 1, the mean of
+    any other component's square, if it agrees with the prediction, and infinity if not. `size` (n,) is the size of the
+    numbers whose difference x is, which decides the rounding.
     """
     return jnp.sum(squared_distance_terms(a, x, size, KNOWN)[0])
 
@@ -202,7 +204,8 @@ def squared_distance_terms(
     numbers whose difference x is.
     """
     variance = diagonal(a)
-    agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)  # see squared_distance
+    # Up to this a determined component agrees: shares of its deviation and of the size of the subtracted numbers.
+    agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)
     lower, scales = factor(a)
     unexplained = _substitute(lower, scales, x[:, None])[:, 0]  # of each component, by those before it
     determined = scales == 0  # `factor` gives 0 for a pivot that is zero

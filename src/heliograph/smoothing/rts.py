@@ -29,7 +29,7 @@ class Smoothed:
 
     Args:
         means: (steps, n).
-        covariances: what is claimed of their errors (steps, n, n).
+        covariances: claimed covariances of their errors (steps, n, n).
         claim: what the covariances are: "exact", "upper", "nominal" or "none".
         modes: probabilities of the modes given all rows (steps, M); None of a filter that weighs none.
     """
@@ -142,5 +142,5 @@ def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
 
 @compile_on_call
 def _smoothed_covariances(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    """Return the smoothed estimates for z = 0, of which the covariances are those of all data."""
+    """Return the smoothed estimates for measurements of zero; their covariances hold for any data."""
     return smoothing.sweep(data_free_smoother_steps(filter, u))
