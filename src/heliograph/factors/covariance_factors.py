@@ -25,7 +25,7 @@ from straightline import operation
 
 ROUNDING_UNITS = 4  # how many eps of a number are noise of it
 LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their squares none in single precision
-RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
+RANK = 1e-12  # a pivot of a known covariance below this share of its variance counts as 0
 
 
 class WeightedColumns(NamedTuple):
@@ -76,7 +76,7 @@ def zero_covariance(n: int) -> WeightedColumns:
 
 def unit_lower(entries: Array) -> Any:
     """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
-    # With a 0 and a 1 behind them, each number of L is one of the entries, `index` (n, n) says which.
+    # A 0 and a 1 are appended to the entries: then each number of L is one of them, of the number `index` (n, n).
     xp, index = library(entries), _place_unit_lower(entries.shape[-1])
     zero_and_one = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
     numbers = xp.concatenate([entries, zero_and_one], axis=-1)
@@ -174,7 +174,7 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     """
     n, dtype = len(factors.matrix), jnp.asarray(columns.matrix).dtype
     rows, places = np.tril_indices(n, -1)
-    # Place of entry (i, j) of L in the flat array of what is below its diagonal.
+    # Index of entry (i, j) of L in the flat array of the entries below its diagonal.
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:

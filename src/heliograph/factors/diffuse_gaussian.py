@@ -135,7 +135,8 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
         unknown: which components are unknown (n,), as flags or as 0 and 1.
     """
     n = len(mean)
-    # Unit columns with an infinite weight where unknown, then those of what is known, with finite weights.
+    # Unit columns, with an infinite weight where unknown, then the columns of the known covariance, with finite
+    # weights.
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
     finite = jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)])
     infinite = jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])])
@@ -170,7 +171,7 @@ def _append_noise_columns(
 
 
 class MeasurementLikelihood(NamedTuple):
-    """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
+    """Log-likelihood () of a measurement, and which of its components depend on an unknown direction (m,)."""
 
     log_likelihood: jax.Array
     unknown: jax.Array
@@ -179,10 +180,11 @@ class MeasurementLikelihood(NamedTuple):
 def observe_diffuse(
     x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
 ) -> tuple[Diffuse, MeasurementLikelihood]:
-    """Condition x on z = H x + v; return it and what z says of the model.
+    """Condition x on z = H x + v; return its law given z, and the likelihood of z.
 
-    A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
-    is the log of the integral of p(z | delta) over the unknown delta.
+    A component that shows an unknown direction, and so has an infinite variance kappa s_inf, adds -1/2 log s_inf to the
+    log-likelihood, and any other log N(e; 0, s). Their sum is the log of the integral of p(z | delta) over the unknown
+    delta.
 
     Args:
         x: the state's law.
@@ -237,7 +239,8 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
         leading_s = jnp.where(s_inf > 0, s_inf, s)
         # L_j - (f_j / s_{j+1}) cross_{j+1}; the slope f of an unknown direction that z does not show is rounding.
         taken = jnp.where(is_unknown & ~is_shown, 0.0, f * reciprocal_or_zero(leading_s) * cross)
-        # What is left of an unknown direction in a component that z told is 0, not rounding of infinite weight.
+        # A component that z determines has no part in an unknown direction: its entry is 0, not rounding times an
+        # infinite weight.
         rounding = DEAF * (jnp.abs(column) + jnp.abs(taken))
         is_left = ~is_unknown | is_first_unknown | (jnp.abs(column - taken) > rounding)
         columns[j] = jnp.where(is_left, column - taken, 0.0)

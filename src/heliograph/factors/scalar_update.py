@@ -222,7 +222,7 @@ def _update_by_rows_in_loop(
         root, d, means, rounding_variance = carry
         rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, rounding_variance[0])
         innovation = -means[n]
-        # The first row has no rounding from rows before it, only that of its own products.
+        # The first row has no rounding from earlier rows, only that of its own products.
         rounding = jnp.where(rounding_variance[0] < 0, rounding_of_products(n, variance_of_row), rounding_variance[0])
         rounding_variance = propagate_slope_rounding(rounding_variance, gain[n:], rounding)
         means = means + gain * innovation

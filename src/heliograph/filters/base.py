@@ -48,7 +48,7 @@ INSTEAD = {  # what other packages call what a filter does here
 
 @readable
 class AbstractFilter(Module):
-    """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
+    """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` returns the estimate.
 
     Deterministic: the same state and data give the same result. It receives no random key; a filter that draws holds
     one in its state, into which it folds the data (`docs/extend.md` has one). A component of z that is NaN did not
@@ -93,7 +93,7 @@ class AbstractFilter(Module):
         """Return mean (n,) and covariance (n, n): the prediction after `predict`, the posterior after `correct`.
 
         Raises:
-            ValueError: what is no state of such a filter.
+            ValueError: a state of another form than the filter's.
         """
         raise unwritten(self, "estimate")
 

@@ -58,13 +58,13 @@ class ChunkLengths(NamedTuple):
     ahead: int
 
 
-# Results of 2,048 rows in eight lanes are 4 MB, as fast as a fourth of them; in 512 rows positions and speeds of which
-# positions are measured every tenth of a second, or levels with a hundredth of their noise, are forgotten.
+# Results of 2,048 rows in eight lanes take 4 MB, and are as fast as a fourth of them. 512 rows suffice to forget the
+# position and speed of a target measured ten times a second, or a level that moves by a hundredth of its noise.
 LADDER = ChunkLengths(2048, 512), ChunkLengths(8192, 2048)
 
 
 class ScanResult(NamedTuple):
-    """The state after the last row, and what is kept of each row (rows, ...)."""
+    """The state after the last row, and the output of each row (rows, ...)."""
 
     last: PyTree
     outputs: PyTree
@@ -100,7 +100,7 @@ def filter_in_chunks(
         filter: the filter.
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
-        output: what is kept of a row, a function of the filter, its state, the innovation and the row's number.
+        output: returns a row's output from the filter, its state after the row, the innovation and the row's number.
         state: the filter's state before the first row; by default that before any data.
         begin: number of the first row.
     """
@@ -356,7 +356,7 @@ def scan_means_where_settled(
     A chunk is settled if its covariances and gains do not change from its first row on, so that only means change.
 
     Args:
-        begun: how the chunks begin: `begun.states` (chunks, ...), and in `begun.covered` whether each chunk is settled.
+        begun: states with which the chunks begin (chunks, ...), and in `begun.covered` whether each chunk is settled.
         scan_in_full: returns the results of some chunks from the states with which they begin.
         scan_means: returns the results of all chunks as if all were settled; None without native code.
     """

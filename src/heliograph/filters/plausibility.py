@@ -245,7 +245,7 @@ def judge_step(
         innovation: of the measurement.
         z: the measurement (m,), NaN for what did not arrive.
         of_atoms: whether the filter is a mixture (particles, modes) in which each component may exclude z.
-        angles: which components of z the filter takes for angles; None where it does not say.
+        angles: which components of z the filter takes for angles; None if it is not known.
         spoilt: whether the inputs of the prediction were not finite.
     """
     (state_before, state_prior, state_after), (before, prior, after) = states, estimates

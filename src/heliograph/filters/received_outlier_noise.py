@@ -169,7 +169,7 @@ def _find_noisy_outputs(squares: Array, covariance: Array) -> np.ndarray:
 
     `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
     TOLERANCE: 1e-12, the share of a gain that is zero but for rounding. Free numbers (traced) cannot be compared:
-    then each component carries the output of its own number.
+    then component i carries the noise of output i.
 
     Raises:
         ValueError: one that carries the noise of several.

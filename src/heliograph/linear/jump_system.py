@@ -153,7 +153,8 @@ class JumpSystem(NamedTuple):
 def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the e entries of their upper triangles.
 
-    Column k holds what the map makes of the k-th unit matrix: an entry and its mirror image at 1, all else at 0.
+    Column k is the map's result for the k-th unit matrix, which has an entry and its mirror image at 1, all others at
+    0.
     """
     _, where, basis = _place_in_upper_triangles(shape)
     matrix: Array = linear(basis)[:, *where].T

@@ -157,7 +157,7 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
         jumps = system.close_loop(next_gains)
         values, vectors = np.linalg.eig(jumps.operator())
         next_radius = float(np.max(np.abs(values)))
-        # Worse gains are dropped, and the last ones kept; so are gains that changed by rounding alone.
+        # If the new gains are worse, or differ only by rounding, the last ones are returned.
         if next_radius >= max(radius, BELOW_ONE) or _relative_change(gains, next_gains) < CONVERGED:
             break
         gains, radius = next_gains, next_radius

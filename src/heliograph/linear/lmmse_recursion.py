@@ -24,7 +24,7 @@ Pair = tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]  # a covariance
 
 
 class NoiseRoots(NamedTuple):
-    """Roots of both noises of one step, with the rounding of what they are added to: Cov(w) = W W', Cov(v) = V V'."""
+    """Roots of both noises of one step, Cov(w) = W W' and Cov(v) = V V', with the rounding of state and measurement."""
 
     process: Float[np.ndarray, "N _"]
     received: Float[np.ndarray, "m _"]
@@ -79,7 +79,7 @@ def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoo
 def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
     """Return a root W of a noise covariance plus that of rounding, W W' = Cov + rounding: their columns side by side.
 
-    `seconds` are the second moments (n,) of the numbers to which the noise is added. The sums are what is rounded.
+    `seconds` are the second moments (n,) of the numbers to which the noise is added, since the sums are rounded.
     """
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)

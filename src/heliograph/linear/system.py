@@ -65,7 +65,7 @@ class LinearSystem(Module):
     start_rounding: Float[np.ndarray, "N"]
     kept: StaticPremise = eqx.field(
         static=True, default=NOTHING, init=False, repr=False, compare=False
-    )  # what it was made of
+    )  # models that it was made of
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class LinearSystem(Module):
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
-        # Shapes of one step: A, a, Cov w of the state and C, c, Cov v of what is received, as `Steps` has them.
+        # Shapes of one step in the order of `Steps`: A, a, Cov w of the state, and C, c, Cov v of the measurement.
         shapes: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
         named = zip(Steps._fields, steps, shapes, strict=True)
         self.steps = Steps(*(array(f"system {name}", value, (time, *shape)) for name, value, shape in named))
@@ -212,7 +212,7 @@ class Schedule(Module):
     claim: Claim = eqx.field(static=True)
     kept: StaticPremise = eqx.field(
         static=True, default=NOTHING, init=False, repr=False, compare=False
-    )  # what it was made for
+    )  # models that it was made for
 
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
         """Check and hold the gains of each step, the filter's state before the first, and the claim.

@@ -17,13 +17,13 @@ PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, gi
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
 # How far a component that others determine may be from what they say: OFF_SUPPORT deviations and OFF_VALUE of its size.
 OFF_SUPPORT, OFF_VALUE = 1e-6, 1e-9
-KNOWN = 16  # roundings of its size: a deviation of no more says that a component is known
+KNOWN = 16  # a component whose deviation is at most so many roundings of its size is known
 
 
 def symmetric(a: jax.Array) -> jax.Array:
-    """Return a symmetric matrix from what is symmetric but for rounding: its upper triangle, mirrored.
+    """Return a matrix that is symmetric up to rounding as an exactly symmetric one, by mirroring its upper triangle.
 
-    Native code does not compute the lower one.
+    Native code then does not compute the lower triangle.
     """
     return lax.select(np.triu(np.ones(a.shape, bool)), a, lax.transpose(a, (1, 0)))
 
@@ -40,12 +40,12 @@ def symmetrize(a: Float[jax.Array, "... n n"]) -> Float[jax.Array, "... n n"]:
 
 
 def outer(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a b' as a matrix product, in which a known zero stays one."""
+    """Return a b' as a matrix product, in which an entry known to be zero stays known to be zero."""
     return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
 def scale(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a_i b_i as matrix products of one number each, in which a known zero stays one."""
+    """Return a_i b_i as matrix products of one number each, in which an entry known to be zero stays known."""
     return lax.dot_general(a, b, (((), ()), ((0,), (0,))))
 
 
@@ -63,9 +63,9 @@ def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) ->
 def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return lower L (n, n) with A = L L' of a positive semidefinite A, and the reciprocals (n,) of its diagonal.
 
-    A column of L is the first column of what is left of A, times the reciprocal root of its pivot, or 0 for a zero
-    column. A pivot is judged relative to the component's own diagonal entry, so that units do not decide what is
-    singular. More than WRITTEN columns are computed in a loop, so that the program stays short.
+    Column j of L is the first column of the Schur complement A - sum_{k < j} L_k L_k', times the reciprocal root of its
+    pivot, or 0 for a zero column. A pivot is judged relative to the component's own diagonal entry, so that units do
+    not decide what is singular. More than WRITTEN columns are computed in a loop, so that the program stays short.
     """
     n, remainder, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
     if not 0 < n <= WRITTEN:
@@ -76,7 +76,7 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
         column = remainder[:, 0] * scales[j]
         columns.append(jnp.concatenate([jnp.zeros(j, a.dtype), column]))
-        # What is left is the Schur complement of the pivot.
+        # The Schur complement of the pivot.
         remainder = remainder[1:, 1:] - outer(column[1:], column[1:])
     return jnp.stack(columns, axis=1), jnp.stack(scales)
 
@@ -86,10 +86,10 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     n, whole = len(a), diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Subtract column j of the factor from what is left of the matrix, and put it and its scale in their places.
+        """Compute column j of the factor and its scale, and subtract L_j L_j' from the remaining matrix.
 
-        `whole`: the matrix's diagonal, by which a pivot is judged. A scale is the reciprocal root of a pivot. `growth`:
-        the largest ratio so far of an entry of `whole` to its pivot.
+        `whole` is the matrix's diagonal, by which a pivot is judged. A scale is the reciprocal root of a pivot.
+        `growth` is the largest ratio so far of an entry of `whole` to its pivot.
         """
         remainder, lower, scales, growth = carry
         scale = compute_pivot_reciprocal_root(remainder[j, j], whole[j], growth)

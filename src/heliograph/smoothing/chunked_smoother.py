@@ -75,7 +75,7 @@ def smooth_chunk(
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
         state: the filter's state at the chunk's beginning.
-        rows: measurements and inputs of its own rows and of those behind them.
+        rows: measurements and inputs of its own rows and of those after them.
         first: number of its first row.
         end: number of the row before which the backward pass begins; rows from it on are not used.
         later: the smoothed law with which the backward pass begins, if `is_given`; else the filtered law is taken.

@@ -40,7 +40,7 @@ def smoother_steps(
         first_step: number of the first row's step; 0 by default.
 
     Raises:
-        ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
+        ValueError: arrays of other sizes than the filter's, a wrong step number, a filter that cannot be smoothed.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = check_data(filter, measurements, inputs)

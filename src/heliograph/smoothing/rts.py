@@ -47,8 +47,8 @@ def rts_smoother(
 ) -> Smoothed:
     """Rauch-Tung-Striebel smoother: estimates of every state given all rows, by a pass back over those of a filter.
 
-    The estimates of `filter.run(z, u)` given the later rows too, of many rows in chunks side by side as there. It warns
-    where the innovations say that the filter is not consistent. Of a whole network:
+    The estimates are those of `filter.run(z, u)`, given the later rows too; many rows are smoothed in chunks side by
+    side. It warns if the innovations show that the filter is not consistent. A whole network is smoothed by
     `hg.run(..., smooth=hg.smoothing.FixedInterval())`.
 
     Args:

@@ -58,12 +58,14 @@ class AdaptiveBelief(NamedTuple):
 class AdaptiveFilter(AbstractWrapper):
     """Gaussian or robust filter whose noise variances are learned. Built by `adaptive_filter`.
 
-    Of each component that arrived, with a_0, b_0 of the filter's own variance r = b_0 / a_0:
+    The variance R of each component's noise has an inverse gamma law of shape a and scale b, used as R = b / a. Its
+    prior a_0, b_0 has the variance of the filter's model, b_0 / a_0. For a component that arrived,
 
         a' = rho a + (1 - rho) a_0,  b' = rho b + (1 - rho) b_0,  a = a' + 1/2,
         R = b / a and b = b' + w E / 2,  E = (z - t+)^2 + V+, five times, from the same prior,
 
-    w its weight (1 in a plain filter). A component that did not arrive leaves its law as it is.
+    with the noiseless measurement t, its mean t+ and variance V+ after an update with R, and the component's weight w
+    (1 in a filter that weighs nothing). A component that did not arrive leaves its law unchanged.
 
     Args:
         base: the filter whose noise variances are learned.
@@ -101,7 +103,7 @@ class AdaptiveFilter(AbstractWrapper):
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
         """Correct the state and the law of the noise variances with what arrived of z (m,), NaN for what did not."""
-        # Moments of what arrives without its noise.
+        # Moments of the measurement without its noise.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))
@@ -131,7 +133,7 @@ class AdaptiveFilter(AbstractWrapper):
         return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
-        """Return the noise variances of what arrives, b / a, of one state or of several stacked."""
+        """Return the noise variances of the received components, b / a, of one state or of several stacked ones."""
         variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
         return variances
 
@@ -280,16 +282,16 @@ def _scale_branches(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
     """Return the filter with the noise variances of its sensor learned on line.
 
-    At each step a share 1 - `memory` of what was learned is forgotten, and replaced by the filter's own variance. A
-    component that does not arrive forgets nothing. The process noise is taken as true: a Q that is too small makes the
-    learned R too large, so learn Q first, with `fit`.
+    At each step a share 1 - `memory` of the learned law is forgotten, and replaced by the variance of the filter's
+    model. A component that does not arrive forgets nothing. The process noise is taken as true: a Q that is too small
+    makes the learned R too large, so learn Q first, with `fit`.
 
     Claim: "nominal".
 
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
-        memory: share of what was learned that a step leaves, over 0 and at most 1 (never forget); a variance is known
-            from some 1 / (1 - memory) values (default 0.98).
+        memory: share of the learned law that a step keeps, above 0 and at most 1 (never forget); so some
+            1 / (1 - memory) values decide a variance (default 0.98).
 
     Raises:
         ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].

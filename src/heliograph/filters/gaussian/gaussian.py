@@ -76,7 +76,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z.
 
-        Angles in z are turned by whole turns to near what is expected of them.
+        Full turns are added to angles in z, so that they are within half a turn of their expected values.
 
         Args:
             z: measurements of a run, or of several.

@@ -134,14 +134,14 @@ class GivingInFilter(AbstractSizedFilter):
         The gate gives in, which makes the rival's estimate its own, if a number has been refused for long and the
         numbers that were not refused do not contradict the rival.
         """
-        # The gate's own update, and which numbers it refused: how often in a row.
+        # The gate's own update, and how often in a row it has refused each number.
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
         after, innovation = self.base.correct(state.believed, z, k)
         left_out = arrived & (_get_weights_of_received(innovation) < 0.5)  # a gate's weights are 0 and 1
         refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
         suspect = refused > 0
-        # The rival, its prior widened where it would refuse what the gate does. It begins as the gate's state.
+        # The rival: it begins as the gate's estimate. Its prior is widened if it would refuse what the gate refuses.
         prior = _select_tree(jnp.any(state.refused > 0), state.rival, state.believed)
         opened = self._widen_prior(prior, z, left_out, k)
         rival, rival_innovation = self.base.correct(opened, z, k)

@@ -60,9 +60,10 @@ class Huber(AbstractWeightingRule):
 
 
 class InverseMultiquadric(AbstractWeightingRule):
-    """Weight w = 1 / (1 + d^2 / c^2), d the innovation in its deviations: what is far loses all weight.
+    """Weight w = 1 / (1 + d^2 / c^2), d the innovation in its deviations: a value far away loses all weight.
 
-    Its covariance is that of the innovation, so that good values count after an outage, when the state is uncertain.
+    The deviation is that of the whole innovation, so that good values count after an outage, when the state is
+    uncertain.
     """
 
     c: Number
@@ -187,7 +188,7 @@ class RobustFilter(AbstractGaussianStateFilter):
         channel: moments of the channel without the noise that may hold outliers.
         noise: that noise as it arrives.
         rule: weights, or None for the score update.
-        received_angles: circular components of what arrives.
+        received_angles: indices of received components that are angles.
     """
 
     sensor: AnySensor

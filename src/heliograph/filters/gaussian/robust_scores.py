@@ -45,7 +45,7 @@ class PredictedMeasurement(NamedTuple):
 
 
 class ScoreUpdate(NamedTuple):
-    """State after the update, weight of each component (0: left out, 1: in full), log density of what arrived."""
+    """State after the update, weight of each component (0: not used, 1: used in full), log density of z."""
 
     state: Gaussian
     weight: jax.Array

@@ -111,7 +111,7 @@ def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: Arrive
 
     Args:
         signal: moments of the state and of y, jointly.
-        channel: what is received of y.
+        channel: moments of G and n.
         z: innovation, and which components arrived.
         scalar: beta (1,), NaN for the one of least trace.
     """

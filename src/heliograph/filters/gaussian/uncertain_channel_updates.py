@@ -89,7 +89,7 @@ class AbstractUpdate(Module):
         Args:
             signal: moments of the sensor's signal.
             channel: what `describe` returned.
-            z: z - E z, and what of it arrived.
+            z: innovation z - E z, and which components of z arrived.
             nominal: the prior conditioned by the nominal law, the best update if that law is known to be true.
         """
         prior = signal.prior

@@ -117,14 +117,14 @@ def unscented_filter(
 ) -> "GaussianFilter":
     """Return the unscented Kalman filter (UKF) on its channel's second moments; points are redrawn after predictions.
 
-    By default the points are those of `cubature_filter`, sqrt(n) deviations from the mean, and so are the means; the
-    covariance has Merwe's beta = 2 besides, by which that of a quadratic function of one Gaussian number is exact, so
-    that a step is never surer of itself than cubature's. Julier's points are alpha = 1, beta = 0.
+    By default the points, sqrt(n) deviations from the mean, are those of `cubature_filter`, and give the same means.
+    Merwe's beta = 2 adds a term to the covariance, which makes it exact for a quadratic function of one Gaussian
+    number, and never smaller than cubature's. Julier's points are alpha = 1, beta = 0.
 
-    Other packages take alpha = 0.001. For quadratic functions of one number alpha changes nothing, as the variance is
-    4 m^2 P + (alpha^2 kappa + beta) P^2. For all others such points make a second derivative at the mean, which says
-    nothing of what lies a deviation away, and divide the difference of values so near each other by alpha^2: of the
-    digits of f, six are lost.
+    Other packages take alpha = 0.001. For a quadratic function of one number alpha changes nothing if kappa = 0: the
+    variance of x^2 is 4 m^2 P + (alpha^2 kappa + beta) P^2. For all other functions such points only find the second
+    derivative at the mean, not the function a deviation away. They divide the difference of nearly equal values by
+    alpha^2, which costs six digits of f.
 
     Args:
         plant: the plant, n states.

@@ -78,7 +78,7 @@ class PolynomialFilter(AbstractSizedFilter):
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
         self.centre, self.kept = centre, inner.kept
         self.states, self.inputs = inner.states, inner.inputs
-        # How many numbers m are received, by the number of their monomials (the constant is left out).
+        # The number m of received numbers, found by the number of their monomials without the constant.
         fitting = [m for m in range(1, inner.received + 1) if count_monomials(m + 1, degree) == inner.received + 1]
         if not fitting:
             raise fail(

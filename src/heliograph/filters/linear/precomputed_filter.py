@@ -164,7 +164,7 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
     """Return the filter with its gains and covariances of every step, recorded while it runs over data of zeros.
 
     Args:
-        filter: one of which only the mean depends on data.
+        filter: a filter in which only the mean depends on data.
         inputs: of each step (steps, inputs).
         projection: (n, N), maps the filter's mean and covariance to those of the plant's state; None where they are
             these already.
@@ -207,9 +207,9 @@ def record_step_matrices(
     """Return the matrices of step k, the state after its prediction, and that after its correction.
 
     Args:
-        filter: one of which only the mean depends on data, and affinely.
-        state: before the step; the matrices are the same whatever its mean, and the states returned are from mean 0.
-        z: measurement (m,), which says by NaN what did not arrive.
+        filter: a filter in which only the mean depends on data, by an affine function.
+        state: before the step. Its mean does not matter for the matrices; the returned states have started from mean 0.
+        z: measurement (m,), NaN where a component did not arrive.
         u: input.
         k: number of the step.
     """

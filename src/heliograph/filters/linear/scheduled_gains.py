@@ -86,8 +86,8 @@ class ScheduledFilter(AbstractSizedFilter):
     def init(self) -> ScheduleState:
         """Return the schedule's initial state.
 
-        Estimate and expected measurement are NaN before the first step. `complete` says that no number was missing so
-        far. `stage` counts the predictions and corrections made.
+        Estimate and expected measurement are NaN before the first step. No number was missing so far (`complete`), and
+        the covariance has the index (`stage`) 0.
         """
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
         return ScheduleState(
@@ -243,7 +243,7 @@ class SystemNoises(NamedTuple):
 
 @in_float64
 def _factor_noises(system: LinearSystem) -> SystemNoises:
-    """Return the factors of both noises at each step, with the rounding of the state and of what is received.
+    """Return the factors of both noises at each step, with the rounding of the state and of the measurement.
 
     Measurements may repeat each other, and their difference is then only rounding. Without the rounding as a noise,
     this difference would seem to measure the state without noise.
@@ -277,7 +277,7 @@ def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, roundin
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds of second moments at each step, of the next state (time, N) and of what is received (time, m).
+    """Return bounds of second moments at each step, of the next state (time, N) and of the measurement (time, m).
 
     The rounding of a sum A x + a is proportional to the size of its terms. So the bound for x+ = A x + a + w is (|A|
     root + |a|)^2, with root_i = sqrt(E[x_i^2]) before any data, and alike for z = C x+ + c + v. An unstable system's

@@ -145,7 +145,7 @@ def _predict_joint_moments(
 def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: ChannelByMode, step: LinearStep) -> np.ndarray:
     """Return E[r r' 1{mode}] (M, size, size) after a correction, for r = (x, 1, s) and each of M modes of the channel.
 
-    The filter's state s becomes s + K (z - C s - c). The world sends y = C_x x + v, of which z = G y + n arrives, with
+    The filter's state s becomes s + K (z - C s - c). The true sensor sends y = C_x x + v, and z = G y + n arrives, with
     a random G and n whose law depends on the mode. With (y, 1) = D (x, 1) + (v, 0), D = [C_x, E v; 0, 1],
 
         s+ = (I - K C) s - K c + K E[(G, n)] D (x, 1)                  mean given x, s and the mode

@@ -35,7 +35,7 @@ from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 Observe = Callable[[jax.Array], jax.Array]
-SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of zero gives no information on time
+SIGNIFICANT = 9.0  # squared deviations: a speed within three deviations of zero gives no information on time
 SHARE = 1e-3  # an offset is unobservable if other states explain all but this share of the outputs' derivatives by it
 RANK = 1e-12  # share of the largest eigenvalue: directions of smaller eigenvalues are unobservable
 

@@ -312,8 +312,8 @@ class KnownDelayFilter(AbstractWrapper):
     It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint
     noise R 11' + N I. Given all delays it is the best linear estimate.
 
-    base: a filter of (x, y_k, ..., y_{k-D}) whose `channel` may be replaced. channels: its channel at each delay, with
-    a leading axis of the delays 0, ..., D.
+    base: a filter of (x, y_k, ..., y_{k-D}) whose field `channel` can be replaced. channels: the moments of its channel
+    for each delay, with a leading axis of the delays 0, ..., D.
     """
 
     base: AbstractFilter

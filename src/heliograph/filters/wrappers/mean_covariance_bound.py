@@ -49,16 +49,17 @@ class ToldNumbersByMode(NamedTuple):
 def mean_error_bound(
     filter: AbstractFilter, steps: int, inputs: "Float[ArrayLike, 'steps inputs'] | None" = None
 ) -> Float[np.ndarray, "steps n n"]:
-    """Bound the mean of a filter's covariance over all numbers that messages may tell, at each step, before any data.
+    """Bound the mean of a filter's covariance over all numbers that messages may report, at each step, before any data.
 
-    A message with the numbers a leaves f(P, a) of a covariance P, which is concave and increasing in P. If the numbers
-    are drawn anew each step, V+ = E f(V, a) is at least E P+, and at most what a filter claims that knows only their
-    law. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, with b_ij = P(i before | j now).
-    Means over gains with a density are sums over Gauss's nodes. A message is assumed to arrive at each step.
+    After a message that reports the numbers a, a covariance P becomes f(P, a), which is concave and increasing in P. If
+    the numbers are drawn anew each step, V+ = E f(V, a) is at least E P+, and at most the covariance that a filter
+    claims which knows only their law. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, with
+    b_ij = P(i before | j now). Means over gains with a density are sums over Gauss's nodes. A message is assumed to
+    arrive at each step.
 
     Args:
-        filter: a `linear_filter` behind a link that tells gains, readings of gains, or numbers of finitely many values
-            or of one gain's law.
+        filter: a `linear_filter` behind a link that reports gains, readings of gains, or numbers that have finitely
+            many values or the law of one gain.
         steps: number of steps.
         inputs: rows (steps, inputs); by default there are none, as for a filter without inputs.
 

@@ -40,9 +40,10 @@ class StateUnderInputs(NamedTuple):
 
 
 class FilterOfInputs(AbstractWrapper):
-    """A filter whose sensor is at each step the one that the inputs give.
+    """A filter whose sensor depends on the inputs of each step.
 
-    Given the inputs the sensor varies in a known way, as one over time does: the claim is that of the filter within.
+    Given the inputs the sensor varies in a known way, like one that varies over time, so that the covariance is what
+    the base filter claims.
 
     Args:
         base: the filter of the sensor under inputs of 1, which predicts; with another sensor in its place it corrects.
@@ -55,7 +56,7 @@ class FilterOfInputs(AbstractWrapper):
     sensor: AnySensor
 
     def within(self, state: StateUnderInputs) -> PyTree:
-        """Return the state of the filter within."""
+        """Return the state of the base filter."""
         return state.base
 
     @in_float64

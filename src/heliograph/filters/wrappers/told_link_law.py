@@ -233,7 +233,7 @@ class ToldFilter(AbstractWrapper):
 def _spoil_state(state: PyTree, is_refused: jax.Array) -> PyTree:
     """Return the state, with NaN for all its real numbers if it `is_refused`.
 
-    A state of NaN says that the message gave no law of the link.
+    So the caller sees that the message's numbers give no law of the link.
     """
 
     def spoil(leaf: jax.Array) -> jax.Array:
@@ -264,7 +264,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     claim = base.claim
     if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):
         claim = weakest([claim, "nominal"])
-    # Rows of z in which the link's values and the told numbers stand.
+    # Indices of the measured values and of the reported numbers in a message z.
     _, values, numbers = separate_told_numbers(first(channel))
     filter = ToldFilter(
         base=base,

@@ -32,7 +32,7 @@ class Manifold(NamedTuple):
     rotations: Rotations = ()
 
     def plus(self, x: Array, d: Array) -> Any:
-        """Return x changed by d, (..., n) both: angles between -pi and pi, attitudes turned in their own axes."""
+        """Return x changed by d (..., n): angles are wrapped to between -pi and pi, attitudes rotated in body axes."""
         total: Any = x + d
         return self._replace_rotations(wrap_angles(total, self.angles), turn, x, d)
 
