@@ -25,7 +25,7 @@ from straightline import operation
 
 ROUNDING_UNITS = 4  # how many eps of a number are noise of it
 LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their squares none in single precision
-RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
+RANK = 1e-12  # a pivot of a known covariance below this share of its variance counts as 0
 
 
 class WeightedColumns(NamedTuple):
@@ -76,7 +76,7 @@ def zero_covariance(n: int) -> WeightedColumns:
 
 def unit_lower(entries: Array) -> Any:
     """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
-    # With a 0 and a 1 behind them, each number of L is one of the entries, `index` (n, n) says which.
+    # A 0 and a 1 are appended to the entries: then each number of L is one of them, of the number `index` (n, n).
     xp, index = library(entries), _place_unit_lower(entries.shape[-1])
     zero_and_one = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
     numbers = xp.concatenate([entries, zero_and_one], axis=-1)
@@ -114,7 +114,7 @@ def is_positive(x: jax.Array) -> jax.Array:
 
 @jax.jit
 def reciprocal_or_one(x: jax.Array) -> jax.Array:
-    """Return 1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
+    """Return 1 / x of a positive number, and 1 of 0: for a numerator that is 0 where x is, so that 0 / 0 is 0."""
     one = lax.full_like(x, 1.0)
     return lax.div(one, lax.select(is_positive(x), x, one))
 
@@ -155,7 +155,7 @@ def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
         row = lax.index_in_dim(rows, j, keepdims=False)
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
-        # Column j of L: how much of row j is in each row below it, which is taken off there.
+        # Column j of L: L_ij = (row i, row j) / d_j. Then row i loses L_ij row j.
         reciprocal = lax.reshape(reciprocal_or_one(variances[j]), (1,))
         column = column_below_diagonal(j, outer(lax.dot(rows, weighted), reciprocal))
         rows = rows - outer(column, row)
@@ -175,11 +175,11 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     """
     n, dtype = len(factors.matrix), jnp.asarray(columns.matrix).dtype
     rows, places = np.tril_indices(n, -1)
-    # Place of entry (i, j) of L in the flat array of what is below its diagonal.
+    # Index of entry (i, j) of L in the flat array of the entries below its diagonal.
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        """Return the factors of L diag(d) L' + w c c': row j takes its part of c, and c_i - c_j L_ij is left below."""
+        """Return the factors of L diag(d) L' + w c c', (c, w) = `column`. Row j takes c_j L_ij off each c_i below."""
         (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
@@ -235,7 +235,7 @@ def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
 def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
     """Return a root W (n, rank) of a known covariance P = W W', by Cholesky's method with pivots.
 
-    Components are in units of their deviations. The largest variance left comes next, until none is above RANK.
+    Components are in units of their deviations. The next pivot is the largest variance of P less the w_j w_j' so far.
 
     Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
     """
@@ -256,7 +256,7 @@ def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
 def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return L's entries below the diagonal and d of a known P = L diag(d) L', by orthogonal rows of its root.
 
-    Row j loses its parts along the rows above it. d_j is the squared length of what is left.
+    Row j loses its projections on the rows above it, and d_j is then its squared length: Gram-Schmidt.
     """
     rows = find_covariance_root(covariance)
     n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
@@ -297,8 +297,8 @@ def factor_covariances(covariances: Array) -> WeightedColumns:
 def rounding_of(second_moments: Array) -> WeightedColumns:
     """Return the covariance (n, n) of the rounding of numbers s_i: diagonal, (ROUNDING_UNITS eps)^2 E[s_i^2].
 
-    Models take the rounding of the state beside Q, and that of a measurement beside R. It is kept in columns of its
-    own, since it is so small that a sum with a variance would lose it.
+    A filter adds the rounding of the state to Q, and that of a measurement to R. It stays in columns of its own, since
+    it is so small that the sum with a variance would lose it.
 
     Args:
         second_moments: E[s_i^2] (n,). No variance is above LARGEST, so that all stay finite.
@@ -313,17 +313,15 @@ def rounding_of_pivots(covariance: Array) -> float:
 
 
 def rounding_of_variances(variances: Array, products: int) -> Array:
-    """Return by how much variances that are sums of so many products may be off: ROUNDING_UNITS products eps of each.
-
-    For what is left of a variance from which a known part was subtracted: it is known to no less than this.
-    """
+    """Return the rounding of variances that are sums of `products` products: ROUNDING_UNITS products eps of each."""
     return ROUNDING_UNITS * products * unit_of(variances) * variances
 
 
 def noise_beside_repeated(sizes: Array) -> Array:
-    """Return variances eps s^2 of a noise beside which a number of size s that others determine says nothing.
+    """Return the noise variance eps s^2 for measured numbers of size s, so that one that repeats others has no gain.
 
-    Of what others determine slopes of an eps s are left. Squared they are eps times this noise, and so is the gain.
+    If earlier numbers determine s, its slopes after them are 0, but rounding leaves about eps s. Without a noise they
+    would count as information. With this one, their square (eps s)^2 is eps times the noise, and so small is the gain.
     """
     return unit_of(sizes) * sizes**2
 
@@ -382,7 +380,7 @@ def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColum
     n = len(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take column j off what is left of P, and put it into L and its pivot into d, which is at least `least[j]`."""
+        """Subtract d_j L_j L_j' from the remainder of P; put column L_j into L, and d_j >= `least[j]` into d."""
         remainder, lower, variances = carry
         d = _bound_below(remainder[j, j], least[j])
         multiples = jnp.where(np.arange(n) > j, remainder[:, j] * reciprocal_or_zero(d), 0.0)

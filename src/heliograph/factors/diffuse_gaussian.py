@@ -1,7 +1,8 @@
 """Gaussians of which some directions are unknown: the limit of P + kappa P_inf, by factors of two levels.
 
-One unit lower L, whose columns are infinite (d_inf) or finite (d). What else an infinite column has vanishes in the
-limit, so that this is exact. An operation is the one of `factored_gaussian.py` where no column is infinite.
+One unit lower L, each of whose columns has an infinite weight (d_inf) or a finite one (d). Beside an infinite weight a
+finite one vanishes in the limit, so that this is exact. An operation is the one of `factored_gaussian.py` where no
+column is infinite.
 """
 
 from typing import NamedTuple
@@ -22,8 +23,8 @@ from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.types import Float
 
-FALLEN = 1e-12  # of what a row had in infinite columns: less is rounding
-DEAF = 1e-9  # of |L_j|'|h|: a measurement that hears less of a direction hears nothing of it
+FALLEN = 1e-12  # a row's square in the infinite columns below this share of its first value is rounding
+DEAF = 1e-9  # if |h'L_j| is below this share of |h|'|L_j|, the measurement h'x does not depend on direction j
 
 
 class Diffuse(NamedTuple):
@@ -49,13 +50,13 @@ class Diffuse(NamedTuple):
 
     @property
     def covariance(self) -> jax.Array:
-        """Covariance (n, n): of what is unknown infinite on the diagonal and 0 beside it."""
+        """Covariance (n, n); an unknown component has infinity on the diagonal and 0 in the rest of its row."""
         root = self.root
         return mark_unknown((root * self.variances) @ root.T, self.unknown)
 
 
 def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
-    """Return the covariance (m, m), of unknown components infinite on the diagonal and 0 beside it."""
+    """Return the covariance (m, m) with infinity on the diagonal and 0 elsewhere in rows of `unknown` components."""
     infinite = jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
     return jnp.where(unknown[:, None] | unknown, infinite, covariance)
 
@@ -72,9 +73,13 @@ def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def _find_slopes(matrix: jax.Array, x: Diffuse) -> jax.Array:
-    """Return the slopes H L of H x, (m, n): 0 along an unknown direction of which rounding alone is left."""
-    slopes, reach = matrix @ x.root, jnp.abs(matrix) @ jnp.abs(x.root)
-    return jnp.where((x.infinite > 0) & (jnp.abs(slopes) <= DEAF * reach), 0.0, slopes)
+    """Return the slopes H L (m, n) of H x, for x = m + L xi.
+
+    A slope in an unknown direction j that is only rounding is set to 0: else H x would have an infinite variance. It
+    counts as rounding if |(H L)_ij| <= DEAF (|H| |L|)_ij, a small share of the terms of its sum.
+    """
+    slopes, size_of_terms = matrix @ x.root, jnp.abs(matrix) @ jnp.abs(x.root)
+    return jnp.where((x.infinite > 0) & (jnp.abs(slopes) <= DEAF * size_of_terms), 0.0, slopes)
 
 
 class FiniteAndInfiniteWeights(NamedTuple):
@@ -89,18 +94,19 @@ def triangularise_both_levels(
 ) -> tuple[jax.Array, FiniteAndInfiniteWeights, jax.Array]:
     """Make the first `count` rows (c columns) orthogonal in the weights w, from the first down.
 
-    Row j, a, has s = sum of w a^2 over infinite columns. Where more than rounding is left of s, L_ij follows from these
-    columns alone, and d_inf,j = s; else their part of the row is put to 0, and the finite columns count. Each row i
-    below loses L_ij row j.
+    Let a be row j and s = sum of w a^2 over the infinite columns. If s is more than rounding, d_inf,j = s and
+    L_ij = (row i, a) / s over these columns alone. Else their entries of a are set to 0, and d_j and L_ij are the same
+    sums over the finite columns. Then each row i below becomes row i - L_ij a.
 
     Args:
         rows: (rows, c).
         weights: of the columns (c,).
         count: how many rows are made orthogonal.
-        whole: what the rows had in infinite columns, of which the rest may be rounding (rows,); all by default.
+        whole: squares (rows,) of the rows in the infinite columns before anything was subtracted, which rounding is a
+            share of; by default those of `rows`.
 
     Returns:
-        L (rows, count), the weights (count,) of its columns, and what is left of the rows.
+        L (rows, count), the weights (count,) of its columns, and the rows less their projections.
     """
     whole = rows**2 @ weights.infinite if whole is None else whole
     columns, finite, infinite, numbers = [], [], [], np.arange(len(rows))
@@ -109,7 +115,7 @@ def triangularise_both_levels(
         is_infinite = infinite_s > FALLEN * whole[j]
         row = jnp.where((weights.infinite > 0) & ~is_infinite, 0.0, rows[j])
         finite_s = row**2 @ weights.finite
-        # Column j of L: what of each row below is along this one.
+        # Column j of L: L_ij = (row i, row j) / s.
         weighted = jnp.where(is_infinite, weights.infinite, weights.finite) * row
         along = rows @ weighted * reciprocal_or_zero(jnp.where(is_infinite, infinite_s, finite_s))
         column = jnp.where(numbers == j, 1.0, jnp.where(numbers > j, along, 0.0))
@@ -129,7 +135,8 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
         unknown: which components are unknown (n,), as flags or as 0 and 1.
     """
     n = len(mean)
-    # Unit columns with an infinite weight where unknown, then those of what is known, with finite weights.
+    # Unit columns, with an infinite weight where unknown, then the columns of the known covariance, with finite
+    # weights.
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
     finite = jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)])
     infinite = jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])])
@@ -164,7 +171,7 @@ def _append_noise_columns(
 
 
 class MeasurementLikelihood(NamedTuple):
-    """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
+    """Log-likelihood () of a measurement, and which of its components depend on an unknown direction (m,)."""
 
     log_likelihood: jax.Array
     unknown: jax.Array
@@ -173,10 +180,11 @@ class MeasurementLikelihood(NamedTuple):
 def observe_diffuse(
     x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
 ) -> tuple[Diffuse, MeasurementLikelihood]:
-    """Condition x on z = H x + v; return it and what z says of the model.
+    """Condition x on z = H x + v; return its law given z, and the likelihood of z.
 
-    A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
-    is the log of the integral of p(z | delta) over the unknown delta.
+    A component that shows an unknown direction, and so has an infinite variance kappa s_inf, adds -1/2 log s_inf to the
+    log-likelihood, and any other log N(e; 0, s). Their sum is the log of the integral of p(z | delta) over the unknown
+    delta.
 
     Args:
         x: the state's law.
@@ -185,8 +193,8 @@ def observe_diffuse(
         noise: Cov v.
     """
     present = ~jnp.isnan(innovation)
-    # Components with uncorrelated noises: (H, innovation) times the inverse of the noise's unit lower factor. What did
-    # not arrive is a row of zeros with the noise 1, which says nothing.
+    # Components with uncorrelated noises: (H, innovation) times the inverse of the noise's unit lower factor. A
+    # component that did not arrive becomes a row of zeros with the noise variance 1, which carries no information.
     factors = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = decorrelate(factors.matrix, jnp.where(present[:, None], rows, 0.0))
@@ -231,7 +239,8 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
         leading_s = jnp.where(s_inf > 0, s_inf, s)
         # L_j - (f_j / s_{j+1}) cross_{j+1}; the slope f of an unknown direction that z does not show is rounding.
         taken = jnp.where(is_unknown & ~is_shown, 0.0, f * reciprocal_or_zero(leading_s) * cross)
-        # What is left of an unknown direction in a component that z told is 0, not rounding of infinite weight.
+        # A component that z determines has no part in an unknown direction: its entry is 0, not rounding times an
+        # infinite weight.
         rounding = DEAF * (jnp.abs(column) + jnp.abs(taken))
         is_left = ~is_unknown | is_first_unknown | (jnp.abs(column - taken) > rounding)
         columns[j] = jnp.where(is_left, column - taken, 0.0)
@@ -265,15 +274,19 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
+    # In the same uncorrelated (xi, omega): x+ = ahead + [F L_x | N] (xi, omega), and x = m + [L_x | 0] (xi, omega).
     n = len(x.mean)
     next_rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
     rows = jnp.concatenate([x.root, jnp.zeros((n, next_rows.shape[1] - n))], axis=1)
+    # x+ - ahead = L e with uncorrelated e: L is lower[:n]. The regression x = m + K e + rest has K = lower[n:], and the
+    # rows of the rest are remainder[n:], orthogonal to those of x+.
     lower, _, remainder = triangularise_both_levels(jnp.concatenate([next_rows, rows]), weights, n)
-    conditional, levels, _ = triangularise_both_levels(remainder[n:], weights, n, rows**2 @ weights.infinite)
+    # Factors of the covariance of the rest, Cov(x given x+).
+    conditional, levels, _ = triangularise_both_levels(remainder[n:], weights, n, whole=rows**2 @ weights.infinite)
     law = Gaussian(x.mean, below_diagonal(conditional), jnp.where(levels.infinite > 0, jnp.nan, levels.finite))
     return BackwardGain(law, lower[n:], ahead, below_diagonal(lower[:n]))
 
 
 def as_gaussian(x: Diffuse) -> Gaussian:
-    """Return what is known of it as a Gaussian; the variance of an unknown direction is no number."""
+    """Return x as a Gaussian in which an unknown direction has the variance NaN instead of infinity."""
     return Gaussian(x.mean, x.lower, jnp.where(x.infinite > 0, jnp.nan, x.variances))

@@ -27,11 +27,7 @@ from heliograph.factors.covariance_factors import (
     unit_lower,
     zero_covariance,
 )
-from heliograph.factors.repeated_measurements import (
-    rounding_of_products,
-    rounding_of_slopes,
-    triangularise_noise,
-)
+from heliograph.factors.repeated_measurements import rounding_of_products, rounding_of_slopes, triangularise_noise
 from heliograph.factors.scalar_update import (
     update_by_parts,
     update_by_row,
@@ -93,7 +89,7 @@ def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian
 
 
 def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
-    """Return the Gaussian of a covariance matrix that was summed of squares, by elimination."""
+    """Return the Gaussian of a covariance computed as a sum of squares, by elimination, with pivots >= n eps P_jj."""
     factors = eliminate(covariance, rounding_of_pivots(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
@@ -120,12 +116,12 @@ def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumn
 
 
 class Image(NamedTuple):
-    """f(x) of x = m + L xi, to second moments: mean + slopes xi + what is uncorrelated with xi.
+    """f(x) of x = m + L xi by its second moments: f(x) = mean + S xi + c, where c is uncorrelated with xi.
 
-    `explained` is slopes diag(d) slopes'. Column j of its matrix is slopes_j times `unit`_j, what f moves by while xi_j
-    moves by that: points give that difference itself.
+    `explained` is the covariance S diag(d) S'. Column j of its matrix is S_j unit_j, the change of f while xi_j changes
+    by `unit`_j: a transform by points finds these differences directly. `curvature` is Cov c.
 
-    Shapes: mean (p,), explained (p, n), unit (n,), curvature (p, columns), the last a sum of squares.
+    Shapes: mean (p,), explained (p, n), unit (n,), curvature (p, columns).
     """
 
     mean: Float[jax.Array, " p"]
@@ -135,7 +131,7 @@ class Image(NamedTuple):
 
     @property
     def slopes(self) -> jax.Array:
-        """Slopes in xi, 0 in what is known, (p, n)."""
+        """Slopes S = df/dxi (p, n): columns of `explained` over `unit`; 0 where unit_j is 0, as xi_j is known then."""
         return jnp.asarray(self.explained.matrix * reciprocal_or_zero(jnp.asarray(self.unit)))
 
     @property
@@ -145,16 +141,16 @@ class Image(NamedTuple):
 
 
 def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: WeightedColumns | None = None) -> Image:
-    """Return the image of an f of which the slopes in xi are computed, affine where it has no curvature."""
-    rest = zero_covariance(len(mean)) if curvature is None else curvature
-    return Image(mean, WeightedColumns(slopes, x.variances), np.ones(len(x.mean)), rest)
+    """Return f(x) = mean + slopes xi + c, x = m + L xi, with Cov c = `curvature`: none if f is affine."""
+    curvature = zero_covariance(len(mean)) if curvature is None else curvature
+    return Image(mean, WeightedColumns(slopes, x.variances), np.ones(len(x.mean)), curvature)
 
 
 def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: WeightedColumns) -> Gaussian:
     """Return the law of (x, t) with t = mean + slopes xi + v: its factors are [[L, 0], [slopes, N]] and (d, r).
 
-    x = m + L xi, with uncorrelated xi of variances d.
-    `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean (m,), slopes (m, n), noise (m, m).
+    x = m + L xi, with uncorrelated xi of variances d. `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean
+    (m,), slopes (m, n), noise (m, m).
     """
     top = jnp.pad(x.root, ((0, 0), (0, len(mean))))
     root = jnp.concatenate([top, jnp.concatenate([slopes, noise.matrix], axis=1)])
@@ -168,7 +164,7 @@ def take_leading(x: Gaussian, n: int) -> Gaussian:
 
 
 def sum_unexplained(image: Image, noise: WeightedColumns) -> WeightedColumns:
-    """Return n columns of Cov (f(x) + w) beside its slopes: curvature + Cov w, `noise` as of `triangularise`."""
+    """Return n columns of curvature + Cov w, the part of Cov(f(x) + w) uncorrelated with xi; `noise` factors Cov w."""
     return from_summed_covariance(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
 
 
@@ -227,28 +223,31 @@ def condition_on_observation(
     """
     n = len(x.mean)
     present = ~jnp.isnan(innovation) if present is None else present
-    # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
-    fresh = triangularise_noise(WeightedColumns(where(present[:, None], noise.matrix, 0.0), noise.weights))
+    # Cov v = N diag(r) N'. A component that did not arrive is a row of zeros with the noise variance 1.
+    factors = triangularise_noise(WeightedColumns(where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([slopes, where(present, innovation, 0.0)[:, None]], axis=1)
     rows = where(present[:, None], rows, 0.0)
-    whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
-    rows, variance = decorrelate(fresh.matrix, rows), where(present, fresh.weights, 1.0)
-    least = rounding_of_slopes(n, fresh.matrix, whole)
-    # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
-    root, news = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
-    root, d, news, values, totals = update_by_rows(root, x.variances, news, variance, least)
-    return Gaussian(news[:n], below_diagonal(root[:n]), d), Innovations(values, totals, whole)
+    whole = rows[:, :n] ** 2 @ x.variances + factors.matrix**2 @ factors.weights
+    rows, variance = decorrelate(factors.matrix, rows), where(present, factors.weights, 1.0)
+    rounding_variance = rounding_of_slopes(n, factors.matrix, whole)
+    # One measurement changes the rows of L and the slopes of the components after it by the same formula, and also the
+    # mean of x and the mean of (component - its measured value), the innovation times -1. So each pair is one array.
+    root, means = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
+    root, d, means, values, variances = update_by_rows(root, x.variances, means, variance, rounding_variance)
+    return Gaussian(means[:n], below_diagonal(root[:n]), d), Innovations(values, variances, whole)
 
 
 def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array:
-    """Return Kalman's gain (n, m) of z = E z + slopes xi + v, of the factors N diag(r) N' of Cov v, N unit lower.
+    """Return Kalman's gain K (n, m) of a measurement z = E z + slopes xi + v of x = m + L xi.
 
-    With V the unit triangle by which a component's innovation, given those before it, enters those to come, these
-    innovations are V^-1 N^-1 (z - E z), and the gain is that of them times V^-1 N^-1.
+    `noise` has the factors N diag(r) N' of Cov v, N unit lower triangular. The components of N^-1 z have uncorrelated
+    noises, and are measured one after another. Their innovations e, each given those before it, satisfy
+    N^-1 (z - E z) = V e with a unit lower triangular V. If component j moves the mean by k_j e_j, then
+    K (z - E z) = [k_1 ... k_m] e, so K = [k_1 ... k_m] V^-1 N^-1.
     """
     n, rows = len(x.mean), decorrelate(noise.matrix, slopes)
     weights = jnp.asarray(noise.weights)
-    least = rounding_of_slopes(n, noise.matrix, slopes**2 @ x.variances + noise.matrix**2 @ weights)
+    rounding_variance = rounding_of_slopes(n, noise.matrix, slopes**2 @ x.variances + noise.matrix**2 @ weights)
 
     def measure_part(
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
@@ -260,9 +259,10 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array
         root, d, gain, _ = update_by_row(root, d, root[n + i], weights[i], rounding)
         return root, d, gain
 
-    *_, gains = update_by_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
-    entering = unit_lower(below_diagonal(gains[n:]))
-    return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
+    *_, gains = update_by_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, rounding_variance)
+    # Rows above n of the gains are k_j. Below, column j says how e_j enters the components after it: column j of V.
+    innovation_factor = unit_lower(below_diagonal(gains[n:]))
+    return gains[:n] @ decorrelate(innovation_factor, decorrelate(noise.matrix, jnp.eye(len(rows))))
 
 
 def correct_by_gain(
@@ -321,11 +321,11 @@ def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gauss
 class BackwardGain(NamedTuple):
     """Regression of x on the next state x+ = m+ + L e: x = m + K e + a noise uncorrelated with e.
 
-    J = K L^-1 of Rauch's form is never formed: a part of e that is nearly nothing has a large column of K, which would
-    be spread over all of J, to cancel again.
+    Rauch's smoother gain J = K L^-1 is never formed: an e_j of nearly no variance has a large column of K, which would
+    enter every entry of J and cancel again in J (x+ - m+).
 
-    Shapes: left the Gaussian of mean m and the covariance of the noise, gain K (n, n), ahead m+ = E x+ (n,), lower
-    (n (n - 1) / 2,) of L.
+    `left` has the mean m and the noise's covariance Cov(x given x+). Shapes: gain K (n, n), ahead m+ = E x+ (n,), lower
+    (n (n - 1) / 2,) the entries of L below its diagonal.
     """
 
     left: Gaussian
@@ -334,7 +334,7 @@ class BackwardGain(NamedTuple):
     lower: Float[jax.Array, "*time entries"]
 
     def mean_given(self, later: jax.Array) -> jax.Array:
-        """Return E x, from that of x+."""
+        """Return E(x given x+ = `later`) = m + K L^-1 (x+ - m+), (n,)."""
         return self.left.mean + self.gain @ self.apply_inverse_factor((later - self.ahead)[:, None])[:, 0]
 
     def apply_inverse_factor(self, rows: jax.Array) -> jax.Array:
@@ -356,7 +356,7 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         noise: N (n, n), unit lower triangular, as `triangularise` makes it, and r (n,).
 
     Returns:
-        What is left of x given x+, K, the mean of x+, and L.
+        The law of x given x+ (its mean m), K, the mean of x+, and L.
     """
     n, root = len(x.mean), jnp.concatenate([x.root, slopes])
     variances_of_next = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights

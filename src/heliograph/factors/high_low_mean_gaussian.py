@@ -1,4 +1,4 @@
-"""A Gaussian whose mean is a high part and a low one, for precisions in which its place takes its digits."""
+"""A Gaussian whose mean is a rounded number plus its rounding error, so that single precision keeps its digits."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,9 @@ from heliograph.numerics.types import Array, Float
 
 
 class SplitMeanGaussian(NamedTuple):
-    """Mean high + low, where high is the mean as it is rounded, and covariance L diag(d) L'.
+    """Mean high + low, where high is the mean rounded to the precision in use, and covariance L diag(d) L'.
+
+    `low` is the rounding error of `high`. Far from the origin, the mean of a precise estimate needs both.
 
     Shapes: high and low (n,), lower (n (n - 1) / 2,) of L, variances d (n,).
     """
@@ -24,12 +26,12 @@ class SplitMeanGaussian(NamedTuple):
 
     @property
     def about_center(self) -> Gaussian:
-        """Return the law of x - high."""
+        """Law of x - high: its mean is `low`, its covariance that of x."""
         return Gaussian(self.low, self.lower, self.variances)
 
 
 def center_gaussian(center: jax.Array, x: Gaussian) -> SplitMeanGaussian:
-    """Return the law of center + x."""
+    """Return the law of center + x, with the mean center + E x split into its rounded value and the rounding error."""
     mean = split_sum(center, x.mean)
     return SplitMeanGaussian(mean.high, jnp.asarray(mean.low), x.lower, x.variances)
 
@@ -45,6 +47,6 @@ def center_known(x: Gaussian) -> SplitMeanGaussian:
 
 
 def centred_from_covariance(mean: Array, covariance: Array) -> SplitMeanGaussian:
-    """Return the law of a mean that the precision has, and of a covariance matrix."""
+    """Return the law of this mean (n,) and covariance (n, n); the precision in use holds the mean, so low is 0."""
     x = from_covariance(mean, covariance)
     return SplitMeanGaussian(jnp.asarray(mean), jnp.zeros_like(x.mean), x.lower, x.variances)

@@ -34,103 +34,122 @@ def update_by_scalar(
 def update_by_scalar_given_products(
     root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v of x = V xi, given the `products` d_j f_j and f_j^2 d_j, which are 0 for mere rounding.
+    """Update x = V xi, Cov xi = diag(d), by the scalar measurement z = f' xi + v, given products that may be set to 0.
 
-    Returns the rows V and variances d given the measurement, its gain K = V diag(d) f / s, and the variance s of its
-    innovation. `noise` is Var v.
+    `root` is V (rows, n), `noise` is Var v, and `products` are (d_j f_j) and (f_j^2 d_j), each (n,). A caller who finds
+    that the slopes f are only rounding passes zeros instead, and x does not change.
+
+    Returns V and d given z, the gain K = V diag(d) f / s (rows,), and the innovation's variance s = f' diag(d) f + Var
+    v.
     """
     product, power = products
-    # s_j = Var v + sum_{k >= j} f_k^2 d_k, down to the variance of the noise alone; s_0 is that of the innovation.
+    # s_j = Var v + sum_{k >= j} f_k^2 d_k, j = 0 ... n: s_n is the noise's variance alone, s_0 the innovation's.
     from_last = lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], dimension=0)
     s = lax.rev(lax.cumsum(from_last), (0,))
-    root_after, variances_after, w = update_root_columns(root, d, product, f, s)
-    return root_after, variances_after, w * reciprocal_or_one(s[0]), s[0]
+    updated_root, updated_d, w = update_root_columns(root, d, product, f, s)
+    return updated_root, updated_d, w * reciprocal_or_one(s[0]), s[0]
 
 
 def update_root_columns(
     root: jax.Array, d: jax.Array, product: jax.Array, f: jax.Array, s: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
-    n, lower = len(d), np.tril(np.ones(root.shape, bool))
-    w = lax.cumsum(lax.select(lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
-    over = reciprocal_or_one(s)  # where s is 0, so is what it divides
-    # s_j and s_{j+1}, and one over each.
-    s_here, s_next = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
-    over_here, over_next = lax.slice_in_dim(over, 0, n), lax.slice_in_dim(over, 1, n + 1)
-    # w_{j+1} in the place of w_j, of the rows below: what is above the diagonal of L stays zero.
-    later = lax.pad(lax.slice_in_dim(w, 1, n, axis=1), jnp.zeros((), w.dtype), [(0, 0, 0), (0, 1, 0)])
-    strictly = np.concatenate([lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
-    after = root - lax.select(strictly, later * (f * over_next), jnp.zeros_like(root))
-    kept = lax.select(is_positive(s_here), d * (s_next * over_here), d)
-    return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
+    """Return the columns V_j+ and variances d_j+ of a Gaussian's factors V diag(d) V' after a rank-one change, and w_0.
+
+    With w_j = sum_{k >= j} product_k V_k, Bierman's formulas are V_j+ = V_j - (f_j / s_{j+1}) w_{j+1} and
+    d_j+ = d_j s_{j+1} / s_j. After a scalar measurement f' xi + v of x = V xi, product_k = d_k f_k and
+    s_j = Var v + sum_{k >= j} f_k^2 d_k; w_0 / s_0 is then the gain.
+
+    Args:
+        root: V (rows, n), zero above its diagonal; V_j is its column j.
+        d: variances (n,) of xi.
+        product: d_k f_k (n,).
+        f: slopes (n,).
+        s: sums s_0 ... s_n (n + 1,).
+    """
+    n, is_lower = len(d), np.tril(np.ones(root.shape, bool))
+    # Column j of w is w_j.
+    w = lax.cumsum(lax.select(is_lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
+    reciprocal = reciprocal_or_one(s)  # where s is 0, so are the numerators over it
+    s_j, s_next = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
+    reciprocal_j, reciprocal_next = lax.slice_in_dim(reciprocal, 0, n), lax.slice_in_dim(reciprocal, 1, n + 1)
+    # Column j of this is w_{j+1}; the last one is 0.
+    w_next = lax.pad(lax.slice_in_dim(w, 1, n, axis=1), jnp.zeros((), w.dtype), [(0, 0, 0), (0, 1, 0)])
+    # w_{j+1} is zero above row j + 1, so V stays lower triangular.
+    is_strictly_lower = np.concatenate([is_lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
+    updated_root = root - lax.select(is_strictly_lower, w_next * (f * reciprocal_next), jnp.zeros_like(root))
+    updated_d = lax.select(is_positive(s_j), d * (s_next * reciprocal_j), d)
+    return updated_root, updated_d, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 
 def update_by_parts(
     measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]],
     root: jax.Array,
     d: jax.Array,
-    least: jax.Array,
+    rounding_variance: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Measure n parts of a vector one after another; return the rows, the variances d and the gains after them.
+    """Measure n parts of a vector one after another; return the rows of the factor, the variances d and all gains.
 
     Up to WRITTEN parts are written out, more are measured in a loop, so that the program stays short.
 
     Args:
-        measure_part: from the part's number, the rows, the variances and its entry of `least` to the rows and the
-            variances given the part, and its gain (rows,).
+        measure_part: from the part's number, the rows, the variances and its entry of `rounding_variance` to the rows
+            and the variances given the part, and its gain (rows,).
         root: rows (rows, columns) of x, and below them those of the n parts.
         d: variances (columns,).
-        least: variance (n,) up to which a part's slopes are rounding (`propagate_slope_rounding`).
+        rounding_variance: variance (n,) up to which a part's slopes are rounding (`propagate_slope_rounding`).
 
     Returns:
         Rows, variances, and gains (rows, n), a column for each part.
     """
-    n, gains = len(least), list[jax.Array]()
+    n, gains = len(rounding_variance), list[jax.Array]()
     first_part = len(root) - n  # number of the row of part 0
     if n > WRITTEN:
 
         def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
             """Measure part i of a vector of n, and put its gain into column i of the gains.
 
-            `least` (n,) are the variances up to which a part's slopes are rounding. Row `first_part` is that of part 0.
+            `rounding_variance` (n,) are the variances up to which a part's slopes are rounding. Row `first_part` is
+            that of part 0.
             """
-            root, d, least, gains = carry
-            root, d, gain = measure_part(i, root, d, least[i])
+            root, d, rounding_variance, gains = carry
+            root, d, gain = measure_part(i, root, d, rounding_variance[i])
             gains = jnp.where(np.arange(n) == i, gain[:, None], gains)
-            return root, d, propagate_slope_rounding(least, gain[first_part:], least[i]), gains
+            return root, d, propagate_slope_rounding(rounding_variance, gain[first_part:], rounding_variance[i]), gains
 
         no_gains = jnp.zeros((len(root), n), root.dtype)
-        root, d, _, all_gains = lax.fori_loop(0, n, measure_next, (root, d, least, no_gains))
+        root, d, _, all_gains = lax.fori_loop(0, n, measure_next, (root, d, rounding_variance, no_gains))
         return root, d, all_gains
     for i in range(n):
-        root, d, gain = measure_part(i, root, d, least[i])
-        least = propagate_slope_rounding(least, gain[first_part:], least[i])
+        root, d, gain = measure_part(i, root, d, rounding_variance[i])
+        rounding_variance = propagate_slope_rounding(rounding_variance, gain[first_part:], rounding_variance[i])
         gains.append(lax.expand_dims(gain, (1,)))
     return root, d, lax.concatenate(gains, 1)
 
 
-def propagate_slope_rounding(least: jax.Array, gain: jax.Array, measured: jax.Array) -> jax.Array:
-    """Return the rounding (m,) of the slopes of parts from which a measured one is taken, times its gain (m,).
+def propagate_slope_rounding(rounding_variance: jax.Array, gain: jax.Array, measured: jax.Array) -> jax.Array:
+    """Return the variance (m,) by rounding of the slopes of all components, after component i was measured.
 
-    Slopes become f_j - gain_j f_i: what rounding left of f_i, of a variance `measured`, is in those of all others.
+    The measurement changes the slopes f_j of component j to f_j - gain_j f_i. The rounding of f_i, of variance
+    `measured`, so adds gain_j^2 `measured` to that of f_j. Shapes: rounding_variance (m,) before it, gain (m,).
     """
-    return least + gain**2 * measured
+    return rounding_variance + gain**2 * measured
 
 
 def update_by_row(
-    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
+    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, rounding_variance: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Measure f' xi + v of x = V xi, Cov xi = diag(d); return V, d, the gain and the variance of the innovation.
 
-    `noise` is Var v. Slopes f with a variance f' diag(d) f of at most `least` are rounding, and must not change x: then
-    the noise is made so large that the measurement changes no digit. If `least` is None, the slopes are not judged.
+    `noise` is Var v. Slopes f with a variance f' diag(d) f of at most `rounding_variance` are rounding, and must not
+    change x: then the noise is made so large that the measurement changes no digit. If `rounding_variance` is None, the
+    slopes are not judged.
     """
     product = d * f
     power = f * product
-    if least is None:
+    if rounding_variance is None:
         return update_by_scalar_given_products(root, d, f, (product, power), noise)
-    is_rounding = jnp.sum(power) <= least
-    noise_or_large = where(is_rounding, noise + noise_beside_rounding(len(d), least), noise)
+    is_rounding = jnp.sum(power) <= rounding_variance
+    noise_or_large = where(is_rounding, noise + noise_beside_rounding(len(d), rounding_variance), noise)
     root, d, gain, variance = update_by_scalar_given_products(root, d, f, (product, power), noise_or_large)
     return root, d, gain, where(is_rounding, noise, variance)
 
@@ -139,71 +158,81 @@ Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 
 
-def update_by_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array) -> Measured:
-    """Measure the m rows of `root` below the n rows of the state, one after another.
+def update_by_rows(
+    root: jax.Array, d: jax.Array, means: jax.Array, variance: jax.Array, rounding_variance: jax.Array
+) -> Measured:
+    """Condition a state on m scalar measurements with uncorrelated noises, one after another.
 
-    Returns the rows (n + m, n) and variances (n,) given all measurements, `news` after them, the m innovations, each
-    given those before it, and the variances of the innovations.
+    The state is x = m + L xi, and component i is z_i = E z_i + f_i' xi + v_i. Measuring one changes the factor's rows L
+    and the slopes f of the others by the same formula, so they are the rows of one `root`.
+
+    Returns the rows (n + m, n), variances (n,) and means (n + m,) given all measurements, the m innovations, each given
+    those before it, and the variances of the innovations.
 
     Args:
         root: rows (n + m, n) of L, and of the m components' slopes below.
         d: variances (n,) of the columns.
-        news: the mean (n,) and below it the innovations times -1 (m,), since a gain adds the same to both.
+        means: of x (n,), and below it of each component minus its measured value, the innovation times -1 (m,).
         variance: of the components' noises (m,).
-        least: variance (m,) up to which slopes are rounding.
+        rounding_variance: variance (m,) up to which slopes are rounding.
     """
     measure = _update_by_rows_in_loop if writes_short_programs() and len(variance) > 1 else _update_by_rows_one_by_one
-    return measure(root, d, news, variance, least)
+    return measure(root, d, means, variance, rounding_variance)
 
 
 def _update_by_rows_one_by_one(
-    root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
+    root: jax.Array, d: jax.Array, means: jax.Array, variance: jax.Array, rounding_variance: jax.Array
 ) -> Measured:
-    """Write `update_by_rows` out, row after row: the m rows of `root` below the n of the state are measured.
+    """Measure the m rows of `root` below the state's n rows, written out row after row.
 
-    `news` is the mean and, below it, the innovations times -1. `least` is the variance up to which a row's slopes count
-    as rounding. The first row is not judged, since nothing was subtracted from its slopes.
+    Arguments and results are those of `update_by_rows`: `means` has the state's mean and, below it, the innovations
+    times -1; `rounding_variance` is the variance up to which a row's slopes count as rounding. The first row's slopes
+    never do, since nothing was subtracted from them.
     """
     n, innovations, variances = len(d), list[jax.Array](), list[jax.Array]()
     for i in range(len(variance)):
-        root, d, gain, total = update_by_row(root, d, root[n + i], variance[i], least[i] if i else None)
-        innovations.append(-news[n + i])
-        variances.append(total)
-        news = news + gain * innovations[i]
-        least = propagate_slope_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
-    return root, d, news, _stack_numbers(innovations), _stack_numbers(variances)
+        root, d, gain, innovation_variance = update_by_row(
+            root, d, root[n + i], variance[i], rounding_variance[i] if i else None
+        )
+        innovations.append(-means[n + i])
+        variances.append(innovation_variance)
+        means = means + gain * innovations[i]
+        rounding_variance = propagate_slope_rounding(
+            rounding_variance, gain[n:], rounding_variance[i] if i else rounding_of_products(n, innovation_variance)
+        )
+    return root, d, means, _stack_numbers(innovations), _stack_numbers(variances)
 
 
 def _update_by_rows_in_loop(
-    root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
+    root: jax.Array, d: jax.Array, means: jax.Array, variance: jax.Array, rounding_variance: jax.Array
 ) -> Measured:
     """Compute `update_by_rows` in a loop, which is a shorter program than `_update_by_rows_one_by_one`.
 
-    Each turn measures the row behind the n ones of the state and then moves it behind all others, so that the next row
-    to measure has the same place in every turn, and after the last one all are in their order again.
+    Each iteration measures row n, the first one below the state's n rows, and then moves it to the end. So the row to
+    measure always has the index n, and after the last iteration all rows are in their first order again.
     """
     n = len(d)
 
     def measure_next(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
-        """Measure row n of the root, behind the state's n rows; return what is next, and (innovation, its variance).
+        """Measure row n of the root and move it to the end; return the next carry, and (innovation, its variance).
 
-        Then row n is moved behind all others, so that the next row to measure takes its place. `news` holds the mean
-        and the innovations times -1. `least` holds the variances up to which slopes are rounding, -1 for the first row.
+        `means` holds the state's mean and the innovations times -1. `rounding_variance` holds the variances up to which
+        slopes are rounding, -1 for the first row.
         """
-        root, d, news, least = carry
-        rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, least[0])
-        innovation = -news[n]
-        # The first row has no rounding from rows before it, only that of its own products.
-        rounding = jnp.where(least[0] < 0, rounding_of_products(n, variance_of_row), least[0])
-        least = propagate_slope_rounding(least, gain[n:], rounding)
-        news = news + gain * innovation
-        carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, i=0)
+        root, d, means, rounding_variance = carry
+        rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, rounding_variance[0])
+        innovation = -means[n]
+        # The first row has no rounding from earlier rows, only that of its own products.
+        rounding = jnp.where(rounding_variance[0] < 0, rounding_of_products(n, variance_of_row), rounding_variance[0])
+        rounding_variance = propagate_slope_rounding(rounding_variance, gain[n:], rounding)
+        means = means + gain * innovation
+        carry = _move_row_to_end(rows, n), d, _move_row_to_end(means, n), _move_row_to_end(rounding_variance, i=0)
         return carry, (innovation, variance_of_row)
 
     # -1 is below every variance: before the first row nothing was rounded.
-    start = root, d, news, jnp.concatenate([jnp.full_like(least[:1], -1.0), least[1:]])
-    (root, d, news, _), (values, totals) = lax.scan(measure_next, start, variance)
-    return root, d, news, values, totals
+    start = root, d, means, jnp.concatenate([jnp.full_like(rounding_variance[:1], -1.0), rounding_variance[1:]])
+    (root, d, means, _), (values, totals) = lax.scan(measure_next, start, variance)
+    return root, d, means, values, totals
 
 
 def _move_row_to_end(rows: jax.Array, i: int) -> jax.Array:

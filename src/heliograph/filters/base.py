@@ -48,7 +48,7 @@ INSTEAD = {  # what other packages call what a filter does here
 
 @readable
 class AbstractFilter(Module):
-    """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
+    """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` returns the estimate.
 
     Deterministic: the same state and data give the same result. It receives no random key; a filter that draws holds
     one in its state, into which it folds the data (`docs/extend.md` has one). A component of z that is NaN did not
@@ -62,7 +62,7 @@ class AbstractFilter(Module):
         states: names of the states that are estimated, n of them.
         inputs: names of the inputs that `predict` takes.
         received: length of the measurement z; 0 for a filter that uses none, and then z may have any length.
-        kept: the premise, as `believes` keeps it beside the numbers; none of a filter that does not say it.
+        kept: the premise (the models that the claim is about), as `believes` keeps it; none where a filter has none.
     """
 
     claim: eqx.AbstractVar[Claim]
@@ -93,13 +93,13 @@ class AbstractFilter(Module):
         """Return mean (n,) and covariance (n, n): the prediction after `predict`, the posterior after `correct`.
 
         Raises:
-            ValueError: what is no state of such a filter.
+            ValueError: a state of another form than the filter's.
         """
         raise unwritten(self, "estimate")
 
     @property
     def remarks(self) -> bool:
-        """Whether `remark` may say anything; of a filter that has one of its own, it may."""
+        """True if the filter defines a `remark` of its own, which may have something to say."""
         return type(self).remark is not AbstractFilter.remark
 
     def remark(self, state: PyTree) -> Remark:
@@ -221,36 +221,36 @@ class AbstractFilter(Module):
         raise fail("smoothing", "a filter that keeps its covariance and says how its state moves", type(self).__name__)
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Return the estimate after step k: `estimate(state)`, but of a filter that looks its covariance up by k."""
+        """Return the estimate after step k: `estimate(state)`, unless the filter looks its covariance up by k."""
         return self.estimate(state)
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
-        """Filter rows by native code of its own, from number `begin` on behind a state; None of most filters."""
+        """Filter rows, the first of number `begin`, from `state` by native code of its own; most filters have none."""
         return None
 
     @property
     def is_linear(self) -> bool:
-        """True if of its state only the mean depends on data, affinely, and is the estimate of the plant's state.
+        """True if the estimate is the state's mean, an affine function of the data, and data change nothing else.
 
-        Then each of its steps is a `LinearStep`.
+        Covariances and gains are then known before any data, and each of its steps is a `LinearStep`.
         """
         return False
 
     @property
     def has_score_recursion(self) -> bool:
-        """True of a `LinearFilter` of which `score_rows` knows a recursion of the derivatives."""
+        """True if the derivatives of the log-likelihood have a recursion: of a `LinearFilter`, for `score_rows`."""
         return False
 
     def trace_log_likelihood(self, plain: Callable[..., jax.Array], z: Array, u: Array) -> jax.Array:
-        """Return plain(self, z, u), the log-likelihood of rows in a trace; a linear filter has better derivatives."""
+        """Return the log-likelihood of rows in a trace, plain(self, z, u); a linear filter has faster derivatives."""
         return plain(self, z, u)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
-        """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
+        """Return the same filter for these inputs and complete data, with covariances and gains computed in advance."""
         return self
 
     def given_record(self) -> "AbstractFilter":
-        """Return the same filter with covariances given its data: itself, but of a linear one behind random gains."""
+        """Return the filter with covariances given its data; only a linear filter behind random gains differs."""
         return self
 
     def with_past(self, steps: SmootherStep) -> "AbstractFilter":
@@ -266,27 +266,27 @@ class AbstractFilter(Module):
         return self
 
     def angles_used(self) -> FilterAngles | None:
-        """Return which states and received numbers it takes for angles; None where it does not say."""
+        """Return which states and received numbers it takes for angles; None if it is not known."""
         return None
 
     @property
     def attitude(self) -> Angles:
-        """Places of attitudes among its states, which it turns where others add; none of most filters."""
+        """Indices of attitudes among its states: a correction rotates them instead of adding. Most have none."""
         return ()
 
     @property
     def premise(self) -> Premise | None:
-        """Plant, sensor, channel and trigger that the claim is about; None of a filter that does not say."""
+        """Plant, sensor, channel and trigger under which the claim holds; None if the filter does not say."""
         return self.kept.premise
 
     @property
     def of_atoms(self) -> bool:
-        """True for a mixture over atoms, whose likelihood alone says which values its model excludes."""
+        """True for a mixture (particles, modes) that excludes a value only by a likelihood of 0 in every component."""
         return False
 
     @property
     def silence_tells(self) -> bool:
-        """True if a step at which nothing arrives changes the state and has a likelihood: then none is missing."""
+        """True if a step without a message is data: its sender stays silent by a rule, so silence has a likelihood."""
         return False
 
     @property
@@ -304,7 +304,7 @@ class AbstractSizedFilter(AbstractFilter):
     received: int = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles | None:
-        """Return no angles: what is given models with angles says so itself, or refuses them."""
+        """Return no angles; a filter whose models may have some overrides this, others refuse such models."""
         return FilterAngles((), ())
 
 

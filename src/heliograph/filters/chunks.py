@@ -1,17 +1,17 @@
-"""A long recording filtered in chunks of rows side by side, where a filter forgets how it began.
+"""A long recording filtered in chunks of rows side by side, where a filter forgets the state in which it began.
 
 The estimate after row k of a linear filter depends on its state W rows before by the product of W closed loops
-(I - K H) F. Where that is nothing, a chunk may begin with any state W rows ahead of its first row, and chunks are runs
-of one program, a lane each. Nothing is taken on trust: the state in which a chunk ends, which has all data, and that
-with which the next one began agree to `TOLERANCE` of a deviation, or the latter is filtered again from the former. The
-difference e that is left between two means has an e' P^-1 e that never grows, P the covariance that the filter claims.
+(I - K H) F. If that product is negligible, the filter has forgotten its start: a chunk may begin with any state W rows
+ahead of its first row, and the chunks are runs of one program, a SIMD lane each. Each joint is checked: the state in
+which a chunk ends and the one in which the next began agree to `TOLERANCE` of a deviation, or the latter chunk is
+filtered again from the former's end. The difference e that remains between two means has an e' P^-1 e that never grows,
+with P the covariance that the filter claims.
 
-Behind a random gain the noise grows with the moments of the state before data. Where these have no end, ever more rows
-are needed to forget: such recordings are filtered row after row.
+Behind a random gain the noise grows with the state's second moments before any data. If these grow without limit, ever
+more rows are needed to forget: such recordings are filtered row after row.
 
-Products of a row, of 4 states and 2 outputs: 257. The elements (A, b, C, eta, J) of a scan by an associative operation,
-which need no forgetting, take 257, 128 for the columns of A and 120 for the factors of J, before the row is filtered
-with the state that they give: 3.0 times as many, and W rows ahead of L chunks 1 + W / L times.
+A row of 4 states and 2 outputs takes 257 products, and W rows ahead of chunks of L rows make that 1 + W / L times as
+many. A scan by an associative operation on elements (A, b, C, eta, J) needs no forgetting, but 3.0 times as many.
 
 Source: the elements: Särkkä and García-Fernández, Temporal parallelization of Bayesian smoothers (2021).
 """
@@ -47,8 +47,8 @@ from heliograph.filters.settled_covariance import (
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 
 CHUNKS = 16  # at least: two cores with eight lanes each
-PROBES = 8  # joints at which forgetting is tried before all rows are filtered
-BLOCKS = 64  # places in a pass without data
+PROBES = 8  # chunks at which forgetting is tested before all rows are filtered
+BLOCKS = 64  # blocks of rows that one call predicts without data
 
 
 class ChunkLengths(NamedTuple):
@@ -58,13 +58,13 @@ class ChunkLengths(NamedTuple):
     ahead: int
 
 
-# Results of 2,048 rows in eight lanes are 4 MB, as fast as a fourth of them; in 512 rows positions and speeds of which
-# positions are measured every tenth of a second, or levels with a hundredth of their noise, are forgotten.
+# Results of 2,048 rows in eight lanes take 4 MB, and are as fast as a fourth of them. 512 rows suffice to forget the
+# position and speed of a target measured ten times a second, or a level that moves by a hundredth of its noise.
 LADDER = ChunkLengths(2048, 512), ChunkLengths(8192, 2048)
 
 
 class ScanResult(NamedTuple):
-    """The state after the last row, and what is kept of each row (rows, ...)."""
+    """The state after the last row, and the output of each row (rows, ...)."""
 
     last: PyTree
     outputs: PyTree
@@ -73,8 +73,9 @@ class ScanResult(NamedTuple):
 class ChunkStarts(NamedTuple):
     """How chunks begin: the state of each (chunks, ...), its first row (chunks,), and how long chunks are.
 
-    `settled`: the state in which chunks of complete rows stay but for their means, None where it was not found, and
-    which chunks it covers (chunks,); `complete`: which rows lack no number.
+    `settled`: the state whose covariances and gains complete rows no longer change, or None. `covered` (chunks,): which
+    chunks have complete rows and begin in that state, so that only means need be computed. `complete`: which blocks of
+    rows miss no number.
     """
 
     states: PyTree
@@ -99,7 +100,7 @@ def filter_in_chunks(
         filter: the filter.
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
-        output: what is kept of a row, a function of the filter, its state, the innovation and the row's number.
+        output: returns a row's output from the filter, its state after the row, the innovation and the row's number.
         state: the filter's state before the first row; by default that before any data.
         begin: number of the first row.
     """
@@ -144,8 +145,8 @@ def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResu
 def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> ChunkStarts | None:
     """Return how each chunk of rows begins; None where rows are few, or a start is forgotten too late.
 
-    The chunks of LADDER are tried from the shortest on, until the rows before a chunk suffice to forget the start. Of
-    each length it is tried first with settled covariances, which cost less, then without.
+    The lengths of LADDER are tried from the shortest on, until the rows ahead of a chunk suffice to forget the start,
+    each first with settled covariances, where only means are computed, then in full.
     """
     total = len(jax.tree.leaves(rows)[0])
     for lengths in LADDER:
@@ -153,22 +154,24 @@ def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> Chun
             return None
         first = np.arange(0, total, lengths.chunk)
         complete = find_complete_blocks(rows[0], lengths.ahead)
-        whole = complete.are_complete(first, lengths.chunk)
-        settled = find_settled_state(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
-        for law in [None] if settled is None else [settled, None]:
-            states = _find_start_states(WarmUpRun(recursion, rows, complete, law), start, first[1:])
+        is_complete = complete.are_complete(first, lengths.chunk)
+        settled = find_settled_state(recursion, start, rows, lengths.ahead) if np.mean(is_complete) > 0.5 else None
+        for settled_or_none in [None] if settled is None else [settled, None]:
+            warm_up = WarmUpRun(recursion, rows, complete, settled_or_none)
+            states = _find_start_states(warm_up, start, first[1:])
             if states is not None:
-                covered = whole & (False if law is None else law.matches(states))
+                begins_settled = False if settled_or_none is None else settled_or_none.matches(states)
                 return ChunkStarts(
-                    states=states, first=first, lengths=lengths, settled=law, covered=covered, complete=complete
-                )
+                    states=states, first=first, lengths=lengths, settled=settled_or_none,
+                    covered=is_complete & begins_settled, complete=complete,
+                )  # fmt: skip
     return None
 
 
 def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
-    """Return what a state holds beside its Gaussians, which no data change, after all blocks, and before each.
+    """Return the data-free parts of a filter's state (all but its Gaussians) after all blocks of rows, and before each.
 
-    `rows` (block, row, ...), of which the first has the number `first`.
+    Only predictions change them, so no row is corrected. `rows` are (block, row, ...), the first of number `first`.
     """
 
     def predict_row(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
@@ -176,7 +179,7 @@ def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, 
         return recursion.predict(state, *row), None
 
     def predict_block(state: PyTree, rows: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
-        """Predict over one block; what the state held before it is the output."""
+        """Predict over one block; return the next state, and the data-free parts before the block."""
         return jax.lax.scan(predict_row, state, rows)[0], beside_gaussians(state)
 
     blocks, size = jax.tree.leaves(rows)[0].shape[:2]
@@ -186,9 +189,9 @@ def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, 
 
 
 class WarmUpRun(NamedTuple):
-    """A run over the block of rows ahead of a row, to find the state before it; for many rows side by side.
+    """Warm-up: find the state before a row by filtering the `ahead` rows before it from a guess, many rows at once.
 
-    `settled`: covariances that stay as they are, of which only means are computed; None where they are not known.
+    `settled`: a state with settled covariances and gains, of which only the means are computed; None without one.
     """
 
     recursion: Recursion
@@ -202,20 +205,17 @@ class WarmUpRun(NamedTuple):
         return self.complete.size
 
     def states_before(self, rows: Int[np.ndarray, " n"], starts: PyTree, one_start_each: bool = False) -> PyTree | None:
-        """Return the states (n, ...) before these rows, from states `ahead` rows earlier; None without native code.
+        """Return the states (n, ...) before n rows, from guesses `ahead` rows earlier; None without native code.
 
-        Args:
-            rows: numbers of the rows.
-            starts: states at the rows 0, `ahead`, 2 `ahead`, ...; where `one_start_each`, (n, ...), `ahead` rows before
-                each of `rows`.
-            one_start_each: which of the two `starts` are.
+        `rows` are multiples of `ahead`. `starts` are guessed states at the rows 0, `ahead`, 2 `ahead`, ..., or, if
+        `one_start_each`, one for each of `rows`, `ahead` rows before it (n, ...).
         """
         first = rows - self.ahead
         windows = take_windows(self.rows, first, self.ahead)
         states = starts if one_start_each else jax.tree.map(lambda leaf: leaf[first // self.ahead], starts)
         if self.settled is None:
             return self._filter_windows(states, windows, first)
-        # Complete windows begin settled, and stay so; the others are filtered in full.
+        # In complete windows only the means are computed; the others are filtered in full.
         arguments = self.recursion, self.settled, means_of(states), windows, first
         choice = choose_code(means_after_settled_rows, arguments, differs_by_run=[False, False, True, True, True])
         if choice.code is None:
@@ -240,12 +240,13 @@ class WarmUpRun(NamedTuple):
 def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
     """Return the states with which chunks begin (chunks, ...), or None if the filter forgets its start too slowly.
 
-    Each is computed from any start `ahead` rows earlier, which is forgotten by then. Parts that depend on no data may
-    never be forgotten, and are computed over all rows. `first` holds the first rows of all chunks but the first.
+    Each is computed by filtering the `warm_up.ahead` rows before the chunk from the filter's first state `start`, which
+    is forgotten by then. Parts of the state that data do not change may never be forgotten: they are then computed over
+    all rows. `first` holds the first rows of all chunks but the first.
     """
     starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
     forgets = _start_is_forgotten(warm_up, starts, first)
-    # The start may not be forgotten because of a part that depends on no data: compute that part over all rows.
+    # Perhaps only a data-free part is not forgotten: compute that part over all rows.
     if forgets is False and jax.tree.leaves(beside_gaussians(start)) and warm_up.settled is None:
         starts = _replace_data_free_parts(warm_up.recursion, start, warm_up.rows, warm_up.ahead)
         forgets = starts is not None and _start_is_forgotten(warm_up, starts, first)
@@ -256,24 +257,29 @@ def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray,
 
 
 def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
-    """Return whether a wrong start is forgotten `ahead` rows later, or None without native code.
+    """Return whether a wrong state is forgotten W = `warm_up.ahead` rows later, or None without native code.
 
-    A start is forgotten before a chunk if two states agree: one computed from a start `ahead` rows before the chunk,
-    the other from a start 2 `ahead` rows before. At most PROBES chunks are tried, and more than half must agree.
-    `starts` has a start for every `ahead` rows, and `first` the first rows of chunks.
+    It is forgotten before a chunk if two states before the chunk agree: one filtered from a guess W rows earlier, the
+    other from a guess 2 W rows earlier. At most PROBES chunks are tested, and more than half must agree. `starts` has a
+    guess for each multiple of W rows, and `first` are the first rows of chunks.
     """
     probes = first[:: -(-len(first) // PROBES)]  # the stride is rounded up
     from_nearer = warm_up.states_before(probes, starts)
     if from_nearer is None:
         return None
+    # 2 W rows in two runs of W rows: the end of the first is the start of the second.
     earlier = warm_up.states_before(probes - warm_up.ahead, starts)
     from_farther = warm_up.states_before(probes, earlier, one_start_each=True)
+    # Differences of derivatives are judged by the largest derivatives in these states.
     scale_states = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), from_farther)
     return bool(np.mean(find_equal_states(from_nearer, from_farther, among=scale_states)) > 0.5)
 
 
 def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
-    """Return start states, one each `ahead` rows, whose parts that no data change (not Gaussians) are of those rows."""
+    """Return guesses of the state at each multiple of `ahead` rows, with the right data-free parts; None without code.
+
+    Data-free parts, all but the Gaussians, are predicted over all rows; the Gaussians are those of the state `start`.
+    """
     # Predict over BLOCKS blocks of `ahead` rows at a time.
     parts_by_block, state, rows_at_once = list[PyTree](), start, BLOCKS * ahead
     for begin in range(0, len(jax.tree.leaves(rows)[0]), rows_at_once):
@@ -291,7 +297,7 @@ def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, 
 
 
 class ChunkPrograms(NamedTuple):
-    """How a chunk is scanned: in full, or settled by its means alone, and then what is kept of all chunks."""
+    """Functions that scan a chunk: `full`, or `settled` by means alone; `complete` adds what depends on no data."""
 
     full: Callable[..., Any]
     settled: Callable[..., Any]
@@ -306,13 +312,8 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     """Filter all chunks side by side from guessed first states; return the last state and the outputs (chunks, ...).
 
     Then, in order, each chunk whose guess differs from the state in which the chunk before it ended is filtered again,
-    from that state. None where rows are few, where the filter forgets too late, and without native code.
-
-    Args:
-        recursion: steps a state over a row.
-        start: state before the first row.
-        rows: data, each array (rows, ...).
-        programs: compiled functions that filter one chunk, in full or by its means alone (`ChunkPrograms`).
+    from that state. None where rows are few, where the filter forgets too late, and without native code. `start` is
+    the state before the first row, `rows` are arrays (rows, ...), and `programs` filter one chunk.
     """
     begun = find_chunk_starts(recursion, start, rows)
     if begun is None:
@@ -322,10 +323,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     # below say which arguments of a program differ from chunk to chunk.
 
     def scan(states: PyTree, which: Which) -> PyTree:
-        """Return the results of the chunks `which`, filtered in full by `programs.full` from the states `states`.
-
-        `recursion` steps the filter over `total` rows, and chunks of `length` rows begin at the rows `begun.first`.
-        """
+        """Return the results of the chunks `which`, filtered in full from `states` (the first of each chunk)."""
         calls = [
             (recursion, take(states, batch), windows, first, total)
             for batch, first, windows in take_windows_in_parts(rows, begun.first[which], length)
@@ -358,7 +356,7 @@ def scan_means_where_settled(
     A chunk is settled if its covariances and gains do not change from its first row on, so that only means change.
 
     Args:
-        begun: how the chunks begin: `begun.states` (chunks, ...), and in `begun.covered` whether each chunk is settled.
+        begun: states with which the chunks begin (chunks, ...), and in `begun.covered` whether each chunk is settled.
         scan_in_full: returns the results of some chunks from the states with which they begin.
         scan_means: returns the results of all chunks as if all were settled; None without native code.
     """
@@ -395,6 +393,6 @@ def rescan_wrong_starts(
 
 
 def replace_chunk(results: PyTree, which: Which, new_results: PyTree) -> None:
-    """Overwrite the results of some chunks with new ones, in place."""
-    for held, new in zip(jax.tree.leaves(results), jax.tree.leaves(new_results), strict=True):
-        held[which] = new
+    """Overwrite the results of the chunks `which` with new ones, in place."""
+    for leaf, new_leaf in zip(jax.tree.leaves(results), jax.tree.leaves(new_results), strict=True):
+        leaf[which] = new_leaf

@@ -1,8 +1,8 @@
-"""The Gaussians within a state of a linear filter: find, replace and compare them, beside what no data change.
+"""The Gaussians within a state of a linear filter: find, replace and compare them. Data do not change its other parts.
 
-A state may hold the derivatives of a Gaussian behind it, in some numbers of a model. With the closed loop
-L = F (I - K H) an error of the mean falls as L^k, and its derivative as sum_j L^(k - j) L' L^(j - 1), by the same rate
-beside a factor of k: what forgets how it began also forgets how its derivatives did, some rows later.
+After a Gaussian, a state may hold its derivatives in some parameters of the model. With the closed loop
+L = F (I - K H) an error of the mean falls as L^k, and its derivative as sum_j L^(k - j) L' L^(j - 1), at the same rate
+times a factor k. So if a filter forgets its start, its derivatives forget theirs too, some rows later.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,12 +16,12 @@ from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.numerics.types import Array, Bool, PyTree
 
 TOLERANCE = 1e-11  # of a deviation, between two states that should be the same
-ROUNDINGS = 16  # of a number, by which two ways to it differ; of means a million deviations from 0 twice were seen
+ROUNDINGS = 16  # eps by which two computations of one number may differ; 2 were seen, of means 1e6 deviations from 0
 ROUNDING = ROUNDINGS * float(np.finfo(np.float64).eps)
 
 
 class MomentSlopes(NamedTuple):
-    """Derivatives of the Gaussian before them in a state, in one number: of its mean (n,) and covariance (n, n)."""
+    """Derivatives of a Gaussian's mean (n,) and covariance (n, n) by one parameter; they follow it in a state."""
 
     mean: jax.Array
     covariance: jax.Array
@@ -30,28 +30,32 @@ class MomentSlopes(NamedTuple):
 def find_equal_states(
     states: PyTree, others: PyTree, tolerance: float = TOLERANCE, among: PyTree | None = None
 ) -> Bool[np.ndarray, " n"]:
-    """Return which states (n, ...) are the same as others, to a share of a deviation and some roundings of each number.
+    """Return which of two stacks of states (n, ...) agree, a flag (n,) for each pair.
 
-    The rounding of a mean far from zero enters all means, by the innovations. Derivatives are measured by the
-    deviations of their Gaussian as well, and as shares of the largest such derivative in the same number: of those
-    `among` which they are, or of the others.
+    Means may differ by `tolerance` deviations and some roundings. A mean far from zero is rounded more, and its
+    rounding enters all means through the innovations, so the largest |mean| / deviation scales the allowed rounding.
+    A derivative of a Gaussian is compared in the Gaussian's deviations too, relative to the largest derivative by the
+    same parameter in the states `among` (n', ...), by default `others`.
     """
-    # (number, other number, allowed difference besides roundings); the derivatives of a Gaussian come after it, and are
-    # measured by its deviations.
-    pairs = [(a, b, np.zeros(())) for a, b in zip(*map(_leaves_beside, (states, others)), strict=True)]
-    sizes = _find_largest_slopes(others if among is None else among)
+    # Each comparison: (number, other number, allowed difference beside some roundings of the number itself).
+    comparisons = [(a, b, np.zeros(())) for a, b in zip(*map(_other_leaves, (states, others)), strict=True)]
+    largest_slopes = _find_largest_slopes(others if among is None else among)
     for x, y in zip(*map(_moving_parts, (states, others)), strict=True):
         p, q = np.asarray(x.covariance), np.asarray(y.covariance)
         if isinstance(y, Gaussian):
-            deviation, outer = _deviations(q)
+            deviation, deviation_products = _deviations(q)
             ratio = np.abs(y.mean) / np.where(deviation > 0, deviation, np.inf)
-            # Largest mean in its deviations.
-            far = np.max(ratio, axis=-1, keepdims=True, initial=0.0)
-        size = 1.0 if isinstance(y, Gaussian) else next(sizes)
-        pairs += [(x.mean, y.mean, size * (tolerance + ROUNDING * far) * deviation), (p, q, size * tolerance * outer)]
-    near = [_are_near(*pair).reshape(len(pair[0]), -1).all(axis=1) for pair in pairs]
-    result: np.ndarray = np.all(near, axis=0)
-    return result
+            largest_ratio = np.max(ratio, axis=-1, keepdims=True, initial=0.0)
+            size = 1.0
+        else:  # derivatives of the Gaussian of the iteration before, in units of its deviations
+            size = next(largest_slopes)
+        comparisons += [
+            (x.mean, y.mean, size * (tolerance + ROUNDING * largest_ratio) * deviation),
+            (p, q, size * tolerance * deviation_products),
+        ]
+    agree = [_are_near(*numbers).reshape(len(numbers[0]), -1).all(axis=1) for numbers in comparisons]
+    all_agree: np.ndarray = np.all(agree, axis=0)
+    return all_agree
 
 
 def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -63,17 +67,18 @@ def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _find_largest_slopes(states: PyTree) -> Iterator[float]:
     """Yield the largest entry of each derivative of a Gaussian in the states (n, ...), in the Gaussian's deviations.
 
-    The parts of a state that data change are Gaussians. Each is followed by the derivatives of its mean and covariance.
+    A state holds each Gaussian and, after it, the derivatives of its mean m and covariance P by each parameter. They
+    are scaled: |dm_i| / s_i and |dP_ij| / (s_i s_j), with the deviations s.
     """
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):
             gaussian = part
             continue
-        deviations = _deviations(np.asarray(gaussian.covariance))
+        deviation, deviation_products = _deviations(np.asarray(gaussian.covariance))
         with np.errstate(invalid="ignore", divide="ignore"):
             scaled_slopes = [
-                np.where(deviation > 0, np.abs(slope) / deviation, 0.0)
-                for slope, deviation in zip(part, deviations, strict=True)
+                np.where(unit > 0, np.abs(slope) / unit, 0.0)
+                for slope, unit in ((part.mean, deviation), (part.covariance, deviation_products))
             ]
             yield max(float(np.max(slope, initial=0.0, where=np.isfinite(slope))) for slope in scaled_slopes)
 
@@ -97,12 +102,12 @@ def gaussians_of(state: PyTree) -> list[Gaussian]:
 
 
 def means_of(state: PyTree) -> list[Any]:
-    """Return the means of a state's Gaussians, and of their derivatives."""
+    """Return all parts of a state that data change: the means of its Gaussians, and the derivatives of these means."""
     return [part.mean for part in _moving_parts(state)]
 
 
 def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
-    """Return the state with the means of its Gaussians, and of their derivatives, replaced by `means` in order."""
+    """Return the state with other `means` of its Gaussians and other derivatives of means, as `means_of` lists them."""
     next_mean = iter(means)
 
     def replace_mean(part: PyTree) -> PyTree:
@@ -113,21 +118,21 @@ def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
 
 
 def beside_gaussians(state: PyTree) -> PyTree:
-    """Return what a state holds beside its Gaussians and their derivatives, with () in their places."""
+    """Return the state with () in place of each Gaussian and each derivative: the parts that data do not change."""
     return jax.tree.map(lambda part: () if _is_moving(part) else part, state, is_leaf=_is_moving)
 
 
-def with_gaussians(beside: PyTree, state: PyTree) -> PyTree:
-    """Return `state` with its Gaussians and their derivatives, and with all other parts replaced by those of `beside`.
+def with_gaussians(without_gaussians: PyTree, state: PyTree) -> PyTree:
+    """Return `state` with its own Gaussians and their derivatives, and all other parts of `without_gaussians`.
 
-    `beside` is a result of `beside_gaussians`, which leaves out Gaussians.
+    `without_gaussians` is a state as `beside_gaussians` returns it, with () in place of Gaussians and derivatives.
     """
-    other_parts = iter(_leaves_beside(beside))
+    other_parts = iter(_other_leaves(without_gaussians))
     return jax.tree.map(lambda part: part if _is_moving(part) else next(other_parts), state, is_leaf=_is_moving)
 
 
 def _moving_parts(state: PyTree) -> list[Any]:
-    """Return the parts of a state with means that depend on data."""
+    """Return the Gaussians of a state and their derivatives, in order: the parts with means, which depend on data."""
     return [part for part in jax.tree.leaves(state, is_leaf=_is_moving) if _is_moving(part)]
 
 
@@ -136,7 +141,7 @@ def _is_moving(part: Any) -> bool:
     return isinstance(part, Gaussian | MomentSlopes)
 
 
-def _leaves_beside(state: PyTree) -> list[np.ndarray]:
-    """Return the arrays that a state holds beside its Gaussians and their derivatives."""
+def _other_leaves(state: PyTree) -> list[np.ndarray]:
+    """Return the arrays of a state that belong to no Gaussian and to no derivative of one."""
     leaves: list[np.ndarray] = jax.tree.leaves(beside_gaussians(state))
     return leaves

@@ -14,12 +14,7 @@ import numpy as np
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.angles.angle import TURN, Angles
-from heliograph.numerics.linalg import (
-    NEGATIVE_TOLERANCE,
-    rounding,
-    squared_distance,
-    squared_distance_terms,
-)
+from heliograph.numerics.linalg import NEGATIVE_TOLERANCE, rounding, squared_distance, squared_distance_terms
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float, PyTree
 
@@ -90,10 +85,10 @@ class Judgement(NamedTuple):
     def judge_prediction(
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], are_inputs_invalid: Array
     ) -> "Judgement":
-        """Judge a prediction by itself, as a step without data; arguments as of `judge_step`.
+        """Judge a prediction by itself, as a step without data.
 
-        `states`, `estimates`: before and after the prediction. `are_inputs_invalid`: whether it had no numbers as
-        inputs. `claim`: "none" if the filter claims no covariance.
+        `states`, `estimates`: before and after the prediction. `are_inputs_invalid`: whether some input is no finite
+        number. `claim`: "none" if the filter claims no covariance.
         """
         (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
         no_innovation = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
@@ -115,12 +110,16 @@ class Judgement(NamedTuple):
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
         z: Float[Array, " m"], of_atoms: bool, angles: FilterAngles | None,
     ) -> "Judgement":  # fmt: skip
-        """Judge a correction alone, from states and estimates before and after it; `judge_step` says all arguments."""
+        """Judge a correction alone, from the states and estimates before and after it.
+
+        The innovation is that of the measurement z. `claim` is "none" without a covariance. `of_atoms`: the filter is a
+        mixture of components, each of which may exclude z. `angles`: which components of z are angles.
+        """
         prior, after = states
         expected, corrected = estimates
-        # `judge_step` needs states before and after a prediction: the state before the correction stands for both.
-        three = expected, expected, corrected
-        return judge_step(claim, (prior, prior, after), three, innovation, z, of_atoms, angles)
+        # `judge_step` takes a whole step: here the prediction has changed nothing.
+        three_states, three_estimates = (prior, prior, after), (expected, expected, corrected)
+        return judge_step(claim, three_states, three_estimates, innovation, z, of_atoms, angles)
 
     @staticmethod
     def find_far(innovation: Innovation) -> jax.Array:
@@ -138,7 +137,7 @@ class Judgement(NamedTuple):
             innovation: of z.
             z: the measurement (m,).
             angles: places of angles.
-            eps: rounding of a number of the precision in which z was told.
+            eps: relative rounding of the precision in which z was sent.
         """
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))
         known = jnp.maximum(READABLE * jnp.sqrt(jnp.maximum(variances, 0.0)), np.sqrt(eps) * TURN)
@@ -235,9 +234,9 @@ def judge_step(
     A value is far where the components larger than expected are too many deviations off
     (`largest_plausible_distance`): a smaller one takes the mean to where it has more digits, so that an estimate which
     is far off can return. It is unreadable where it is an angle of very many turns (`find_unreadable`). It is excluded
-    where all of it is determined and differs from the model, or where no atom of a mixture produces it. A state is
-    unsound where the one before it was not: a mean or variance that is no finite number, a negative variance, an
-    infinite number in it. So is a prediction.
+    where the model determines all of it and it differs, or where its density is 0 in each component of a mixture. A
+    state is unsound if a mean or variance in it is not finite, a variance is negative or a number is infinite, and the
+    state before it was sound. A prediction is judged like a state.
 
     Args:
         claim: of the filter; "none" where it claims no covariance, and nothing is judged by one.
@@ -245,9 +244,9 @@ def judge_step(
         estimates: of these states.
         innovation: of the measurement.
         z: the measurement (m,), NaN for what did not arrive.
-        of_atoms: whether the filter is a mixture, of which no atom may produce z.
-        angles: which components of z the filter takes for angles; None where it does not say.
-        spoilt: whether the inputs of the prediction were no numbers already.
+        of_atoms: whether the filter is a mixture (particles, modes) in which each component may exclude z.
+        angles: which components of z the filter takes for angles; None if it is not known.
+        spoilt: whether the inputs of the prediction were not finite.
     """
     (state_before, state_prior, state_after), (before, prior, after) = states, estimates
     of_value = _judge_value(innovation, z, of_atoms, angles.received if angles else ())
@@ -257,7 +256,7 @@ def judge_step(
     by_correction = loses_soundness | _overflows(state_prior, state_after)
     loses_soundness = _are_finite(before, claim) & ~_is_sound_prediction(prior, claim)
     by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
-    # The reason. Where several apply the last of these lines that does.
+    # If several reasons apply, the last of these lines wins.
     reason = jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE)
     reason = jnp.where(by_correction & of_value.came, Reason.UNSOUND, reason)
     reason = jnp.where(of_value.unreadable, Reason.UNREADABLE, reason)
@@ -267,7 +266,7 @@ def judge_step(
     distance, count = of_value.distance, of_value.arrived
     loses_digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(count.dtype)
     input_verdict = jnp.nan if claim == "none" else loses_digits
-    # No distance where nothing arrived, and from an estimate that was no number before.
+    # No distance if nothing arrived, or if the estimate was not finite before.
     distance = jnp.where((count > 0) & (is_sound | (reason > 0)), distance, jnp.nan)
     return Judgement(
         distance=distance,
@@ -278,9 +277,9 @@ def judge_step(
 
 
 class _JudgedValue(NamedTuple):
-    """Squared distance of what arrived and how much that is, what is wrong with it, and whether anything came.
+    """Judgement of a measurement: its squared distance, the number of components judged, flags of what is wrong.
 
-    Something came too where what was expected is no number.
+    `came` is True if any number arrived, also where the expected value is no number, so that nothing was judged.
     """
 
     distance: Array
@@ -295,8 +294,8 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, 
     """Judge a measurement z (m,), some of it `angles`, by its innovation e = z - expected and its covariance S.
 
     Far: components with |z| > |expected| whose squared distance e' S^-1 e exceeds `largest_plausible_distance`.
-    Excluded: every component is determined by the model (no variance), and one of them differs; or, `of_atoms`, no
-    atom produces z.
+    Excluded: every component is determined by the model (no variance), and one of them differs; or, for a mixture
+    (`of_atoms`), the likelihood of z is 0 in each component.
     """
     value, covariance, z = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance), jnp.asarray(z)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
@@ -313,7 +312,7 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, 
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = largest_plausible_distance(value.dtype)
     far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
-    # Excluded: all determined, and one of them differs; or no atom has a density at it, though its distance is finite.
+    # Excluded: all determined, and one differs; or the mixture's density is 0, though the squared distance is finite.
     excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)

@@ -18,9 +18,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Independent
-from heliograph.random_affine.outlier_noise import (
-    StudentT,
-)
+from heliograph.random_affine.outlier_noise import StudentT
 
 Vector = Float[jax.Array | np.ndarray, " m"]
 Matrix = Float[jax.Array | np.ndarray, "m branches"]
@@ -31,7 +29,7 @@ TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for roundin
 class NoiseBranches(NamedTuple):
     """Gaussian branches of each received component's noise: log probability, mean and variance, (m, branches) each.
 
-    least: the branch's own noise, below which the variance of an innovation is not.
+    `least`: variance of the branch's noise without the spread of the gain, a lower bound of the innovation's variance.
     """
 
     log_share: jax.Array
@@ -40,10 +38,7 @@ class NoiseBranches(NamedTuple):
     least: jax.Array
 
     def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
-        """Return the mean and variance of the mixture, (m,) each.
-
-        Branches are the Gaussians of the mixture, along the second axis.
-        """
+        """Return the mean and variance of the mixture of each component's branches, (m,) each."""
         share = jnp.exp(self.log_share)
         mean = jnp.sum(share * self.mean, axis=1)
         second_about_mean = self.variance + (self.mean - mean[:, None]) ** 2
@@ -51,12 +46,15 @@ class NoiseBranches(NamedTuple):
 
 
 class ReceivedNoise(Module):
-    """Noise of each received component that may hold outliers: of one output of the sensor, and of the last hop.
+    """Noise that may hold outliers in each of m received components: g times one output's noise, plus the last hop's.
 
-    `share`, `mean`, `variance`: branches of the output's noise, before the gain; `late_mean`, `late_variance` what the
-    last hop adds to each (m, branches). `output` (m, p) picks the output, `gain` is E[g] and `power` E[g^2] (m,).
-    `center` and `covariance` (m, m): the same noise without outliers, as it arrives. `degrees` (m,): Student's.
-    `least_degrees` (m,): of all Student's noises in it, infinite without one. Of at most two there is no variance.
+    Its law is a mixture of Gaussian branches, (m, branches) each: `log_share` is the log of a branch's probability,
+    `mean` and `variance` are those of the output's noise before the random gain g, and `late_mean` and `late_variance`
+    are those of the last hop's noise, which is added behind the gain. `output` (m, p) has a 1 at the output whose noise
+    the component carries. `gain` is E[g] and `power` E[g^2] (m,). `center` (m,) and `covariance` (m, m) are the moments
+    of the noise without outliers, as it arrives. `degrees` (m,): Student's degrees of freedom, NaN of other laws.
+    `least_degrees` (m,): the least of all Student noises in the component, infinity without one; up to two degrees
+    there is no variance.
     """
 
     log_share: Matrix
@@ -75,50 +73,51 @@ class ReceivedNoise(Module):
     def find_branches(self, sensor_mean: jax.Array) -> NoiseBranches:
         """Return mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensor_mean` (p,).
 
-        A branch j is one Gaussian of the noise's mixture, of mean m_j and variance r_j. Before the random gain g it
-        arrives with mean E[g] m_j and variance E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's
-        spread acts on the signal y and on the branch's mean together. With that of the signal alone, Var(g) y^2, it
-        is at least E[g^2] r_j.
-
-        `late_mean`, `late_variance`: of noise behind the gain.
+        Branch j of the output's noise has mean m_j and variance r_j, and y is the output's expected signal. Behind the
+        random gain g, g (y + noise) has the mean E[g] (y + m_j) and the variance E[g^2] r_j + Var(g) (y + m_j)^2. The
+        filter counts Var(g) y^2 with the signal, so the branch adds E[g] m_j and E[g^2] r_j + Var(g) m_j (m_j + 2 y),
+        which may be negative: the sum with Var(g) y^2 is at least E[g^2] r_j. The last hop's noise is added to both.
         """
         gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
-        signal = (self.output @ sensor_mean)[:, None]
-        without_spread = power * self.variance + self.late_variance
+        signal = (self.output @ sensor_mean)[:, None]  # y
+        least = power * self.variance + self.late_variance
+        # Var(g) m_j (m_j + 2 y), with Var(g) = E[g^2] - E[g]^2.
         squared_gain, twice_signal = gain**2, 2 * signal
         gain_variance, mean_and_signal = power - squared_gain, mean + twice_signal
-        by_spread = gain_variance * mean * mean_and_signal
-        variance = without_spread + by_spread
+        by_gain_variance = gain_variance * mean * mean_and_signal
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),
             mean=jnp.asarray(gain * mean + self.late_mean),
-            variance=jnp.asarray(variance),
-            least=jnp.asarray(without_spread),
+            variance=jnp.asarray(least + by_gain_variance),
+            least=jnp.asarray(least),
         )
 
 
 def separate_outlier_noise(
     sensor: AnySensor, channel: Channel, independent: bool
 ) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
-    """Return moments of z without the noise that may hold outliers, and that noise as it arrives at the filter.
+    """Split a channel's description: moments of z without the noise that may hold outliers, and that noise.
 
-    `independent`: whether its components must be independent, since they are used one after another.
+    The noise is that of the sensor and of the last hop, as it arrives at the filter. `independent`: whether its
+    components must be independent, since the filter uses them one after another.
 
     Raises:
         ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
     """
 
-    def describe(step: AbstractRandomAffine) -> SecondOrder:
-        """Return the moments of one step's channel without its outliers."""
-        return Polytope().describe(step.detach_outliers()[0])
+    def describe_without_outliers(step: AbstractRandomAffine) -> SecondOrder:
+        """Return the moments of one step's channel without the last hop's noise, if that may hold outliers."""
+        remaining_channel, _ = step.detach_outliers()
+        return Polytope().describe(remaining_channel)
 
-    def describe_noise(sensor: AbstractSensor, step: AbstractRandomAffine, plain: SecondOrder) -> ReceivedNoise:
+    def describe_noise(sensor: AbstractSensor, step: AbstractRandomAffine, moments: SecondOrder) -> ReceivedNoise:
         """Return the noise that may hold outliers at one step, as it arrives."""
-        return describe_outlier_noise(sensor.noise, step.detach_outliers()[1], plain, independent)
+        _, last_hop_noise = step.detach_outliers()
+        return describe_outlier_noise(sensor.noise, last_hop_noise, moments, independent)
 
-    plain: SecondOrder | OverTime = at_each_step(describe, channel)
-    noise: ReceivedNoise | OverTime = at_each_step(describe_noise, sensor, channel, plain)
-    return plain, noise
+    moments: SecondOrder | OverTime = at_each_step(describe_without_outliers, channel)
+    noise: ReceivedNoise | OverTime = at_each_step(describe_noise, sensor, channel, moments)
+    return moments, noise
 
 
 def describe_outlier_noise(
@@ -139,12 +138,12 @@ def describe_outlier_noise(
     # xp: numpy, or jax.numpy for numbers that are traced.
     rows, xp = np.arange(m), library(plain.power.center, sensed, late)
     squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
-    # Moments of the noise without its outliers, as it arrives.
+    # Moments of the noise without its outliers, as it arrives: Cov_ij = sum_ab E[G_ia G_jb] R_ab, with the gain G.
     base = sensed.without_outliers()
     covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
     center = plain.mean_gain @ base.mean
-    # The output whose noise each received number brings (m,).
-    source = _find_noisy_outputs(squares, base.covariance, plain)
+    # Index of the sensor's output whose noise each received number carries, (m,).
+    source = _find_noisy_outputs(squares, base.covariance)
     if late is not None:
         last = late.without_outliers()
         covariance, center = covariance + last.covariance, center + last.mean
@@ -165,12 +164,12 @@ def describe_outlier_noise(
     )  # fmt: skip
 
 
-def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
+def _find_noisy_outputs(squares: Array, covariance: Array) -> np.ndarray:
     """Return the sensor's output whose noise each received component carries, (m,).
 
     `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
     TOLERANCE: 1e-12, the share of a gain that is zero but for rounding. Free numbers (traced) cannot be compared:
-    then each component carries the output of its own number.
+    then component i carries the noise of output i.
 
     Raises:
         ValueError: one that carries the noise of several.
@@ -194,9 +193,10 @@ def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -
 
 
 def _check_weighable(covariance: Array, independent: bool) -> None:
-    """Raise ValueError where no noise could be weighed, or where components are correlated and may not be.
+    """Raise ValueError if a received number has no noise, or if components are correlated but must be `independent`.
 
-    Nor may they be tied: other weights would make another combination of them the one without noise, a wrong one.
+    Each combination of the numbers must have noise too (correlations of full rank): a filter that weighs components
+    differently would otherwise take a wrong combination for the one without noise.
     """
     if is_traced(covariance):
         return

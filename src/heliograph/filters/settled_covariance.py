@@ -1,13 +1,13 @@
 """Rows in which only means move: on complete rows the covariances of a linear filter converge, and its gains with them.
 
-What of a row depends on data, native code says itself: given a state whose means alone differ between runs, and a row
-that is complete, all other numbers after the row are common to all runs, unless plant, sensor or channel vary by time
-or by an input. If so, and two states a thousand rows apart are the same to the roundings of a number, this state is
-that of all further complete rows, and what follows from it is computed once. What is left of a row is the closed loop
-m = m- + K (z - H m-): of four states and two outputs a tenth of a filter's time.
+A row is complete if no number of it is missing. Native code finds which numbers depend on data: given states that
+differ between runs only in their means, and a complete row, all other numbers after the row are common to all runs,
+unless plant, sensor or channel vary by time or by an input. If so, and two states a thousand rows apart agree to
+rounding, the covariances and gains have settled: they are computed once, and each further complete row only needs the
+closed loop m = m- + K (z - H m-). For four states and two outputs this takes a tenth of a filter's time.
 
-Covariances at the end of a convergence may repeat in turns, a rounding apart; the one that is taken differs from them
-by as much. Means differ from those of a pass with all factors by roundings of their own.
+Settled covariances may still alternate by a rounding; the stored one differs from them by as much. Means differ by
+roundings from those of a pass that computes all covariances.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,14 @@ from heliograph.numerics.process.repeated_rows_in_memory import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 from straightline import present
 
-TURNS = 4  # times as many rows as forget, after which a state is compared with what it was after half of them
+TURNS = 4  # rows until covariances count as settled, in units of the rows in which the start is forgotten
 
 
 class SettledState(NamedTuple):
-    """A state that stays as it is over complete rows but for its means, and what is kept of such a row.
+    """A state of which complete rows change only the means, and the output of such a row.
 
-    Means, and of `outputs` the leaves that `varies` marks, are of any value.
+    `varies` has a flag for each leaf of `outputs`: True where it depends on data. Those leaves and the means of `state`
+    have no meaning here: each row has its own.
     """
 
     state: PyTree
@@ -45,8 +46,8 @@ class SettledState(NamedTuple):
     def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
         """Return the outputs of rows (chunks, rows, ...) from their leaves that vary with data.
 
-        `self.varies` says of each leaf whether it depends on data. All others are those of `self.outputs`, the output
-        of a settled row, and are repeated for each row.
+        `self.varies` has a flag for each leaf: whether it depends on data. All others are those of `self.outputs`, the
+        output of a settled row, and are repeated for each row.
         """
         chunks, rows = varying[0].shape[:2]
         leaves, structure = jax.tree.flatten(self.outputs)
@@ -69,8 +70,8 @@ class SettledState(NamedTuple):
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
 
     def select_varying(self, output: PyTree) -> list[Any]:
-        """Return those leaves of what is kept of a row that vary."""
-        return [leaf for leaf, v in zip(jax.tree.leaves(output), self.varies, strict=True) if v]
+        """Return the leaves of a row's output that depend on data."""
+        return [leaf for leaf, varies in zip(jax.tree.leaves(output), self.varies, strict=True) if varies]
 
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
         """Return which of the states (n, ...) equal this one in all but the means."""
@@ -79,26 +80,26 @@ class SettledState(NamedTuple):
         other_leaves, own_leaves = (jax.tree.leaves(with_means(x, no_means)) for x in (states, self.state))
         # Most states have the same numbers. Other factors may have the same covariance, so these are compared by it.
         are_same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(other_leaves, own_leaves, strict=True)]
-        covered: np.ndarray = np.all(are_same, axis=0)
-        unsure = np.flatnonzero(~covered)
+        is_equal: np.ndarray = np.all(are_same, axis=0)
+        unsure = np.flatnonzero(~is_equal)
         if len(unsure):
-            covered[unsure] = find_equal_states(
+            is_equal[unsure] = find_equal_states(
                 take(states, unsure), self.repeat_with_means([mean[unsure] for mean in means])
             )
-        return covered
+        return is_equal
 
 
 def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> SettledState | None:
-    """Find the state to which complete rows lead; None if there is no such state or no native code.
+    """Find the state to which complete rows converge, but for its means; None if it finds none or has no native code.
 
-    TURNS (4) times `ahead` rows are passed, in two windows. The state is settled if the second window changes only
-    its means.
+    The filter steps over TURNS (4) times `ahead` rows of zeros, in two windows. Covariances have settled if the second
+    window changed only means.
 
     Args:
         recursion: steps the filter over rows.
         start: the filter's state before any row.
         rows: measurements and inputs (rows, ...).
-        ahead: length of a window of rows.
+        ahead: number of rows in which the filter is supposed to forget its start.
     """
     row = jax.tree.map(lambda leaf: np.zeros_like(leaf[0]), rows)
     varies = find_data_dependent_leaves(recursion, start, row)
@@ -114,7 +115,7 @@ def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, output
 
     Args:
         varies: which leaves of `outputs` depend on data.
-        after_windows: states after each window, with the axes (run, window, ...) of length 1 and 2.
+        after_windows: states after each window, with axes (run, window, ...): one run, two windows.
         outputs: outputs of the last row of each window (1, 2, ...).
     """
     after_first = jax.tree.map(lambda leaf: leaf[:, 0], after_windows)
@@ -131,21 +132,25 @@ def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, output
 
 
 def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) -> tuple[PyTree, PyTree]:
-    """Repeat a row over two windows of numbers (2, rows): states, and what is kept of each one's last row (2, ...)."""
-    AfterRow = tuple[PyTree, PyTree]  # a state, and what is kept of the row before it
+    """Step from `start` over two windows of rows that all equal `row`; return states and outputs at the windows' ends.
+
+    `numbers` (2, rows) are the numbers of the rows of each window. Both results have a leading axis of two windows.
+    """
+    AfterRow = tuple[PyTree, PyTree]  # the state after a row, and the row's output
 
     def step(after_row: AfterRow, k: Any) -> tuple[AfterRow, Any]:
         """Step over the row as number k."""
         state, _ = after_row
+        # `step_settled` takes the means apart from the state; here they are the state's own.
         return step_settled(recursion, state, means_of(state), row, k), None
 
     def scan_window(after_row: AfterRow, window: Any) -> tuple[AfterRow, AfterRow]:
-        """Step over one window of numbers; its end is kept."""
+        """Step over one window of row numbers; return the state and output at its end, as carry and as result."""
         end, _ = jax.lax.scan(step, after_row, window)
         return end, end
 
     state = jax.tree.map(jnp.asarray, start)
-    # Before the first row zeros stand for what is kept, of the same shapes.
+    # The carry of `lax.scan` needs an output before the first row: zeros of the same shapes.
     shapes = jax.eval_shape(lambda: step((state, None), numbers[0, 0])[0][1])
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     ends: AfterRow = jax.lax.scan(scan_window, (state, zeros), numbers)[1]
@@ -153,10 +158,10 @@ def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, n
 
 
 def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
-    """Return for each leaf of a complete row's output whether it depends on data.
+    """Return for each leaf of a complete row's output whether it depends on data, or None if nothing can settle.
 
-    Returns None if more of the state than its means depends on data, or without native code. `choice.code.common` says
-    of each result whether runs with different data share it.
+    Returns None if other parts of the state than its means depend on data, or without native code. The compiled code
+    says for each result, in `choice.code.common`, whether it is the same for runs with different means and rows.
     """
     rows = jax.tree.map(lambda leaf: leaf[None], row)
     means = [np.asarray(mean)[None] for mean in means_of(start)]
@@ -164,12 +169,13 @@ def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree)
     choice = choose_code(step_settled, arguments, differs_by_run=[False, False, True, True, True])
     if choice.code is None:
         return None
-    after, outputs = jax.tree.unflatten(choice.code.tree, choice.code.common)
-    # The means may depend on data: True stands for them.
-    all_but_means = with_means(after, [True] * len(means_of(after)))
+    # Flags in the structure of `step_settled`'s results: the state after the row, and the row's output.
+    is_state_common, is_output_common = jax.tree.unflatten(choice.code.tree, choice.code.common)
+    # The means may depend on data: their flags are replaced by True.
+    all_but_means = with_means(is_state_common, [True] * len(means_of(is_state_common)))
     if not all(jax.tree.leaves(all_but_means)):
         return None
-    return tuple(not common for common in jax.tree.leaves(outputs))
+    return tuple(not common for common in jax.tree.leaves(is_output_common))
 
 
 def step_settled(
@@ -186,11 +192,12 @@ def step_settled(
 def scan_settled_rows(
     recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array, count: Array
 ) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Scan complete rows from a settled state with these means; return the last means, and what varies of each row.
+    """Scan complete rows from a settled state, whose covariances and gains no longer change.
 
-    From row `count` on, behind the end of the data, the means stay.
+    `means` are those before the first row, which has the number `first`. Rows from number `count` on fill up the last
+    chunk after the end of the data, and change no mean.
 
-    Settled: covariances and gains stay as they are. `first`: number of the first row.
+    Returns the last means, and for each row the leaves of its output that depend on data.
     """
 
     def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -241,15 +248,17 @@ def means_after_settled_rows(
 
 
 class CompleteBlocks(NamedTuple):
-    """Which blocks of `size` rows of measurements lack no number: `before`[i] of the first i blocks are complete."""
+    """Which blocks of `size` rows have no missing number: `complete_before`[i] counts them among the first i blocks."""
 
     size: int
-    before: Int[np.ndarray, " blocks+1"]
+    complete_before: Int[np.ndarray, " blocks+1"]
 
     def are_complete(self, begin: Int[np.ndarray, " n"], length: int) -> Bool[np.ndarray, " n"]:
-        """Return which windows of rows lack no number; begin and length are multiples of the size."""
-        first, end = (np.minimum(row // self.size, len(self.before) - 1) for row in (begin, begin + length))
-        return np.asarray(self.before[end] - self.before[first] == end - first)
+        """Return which windows of `length` rows from the rows `begin` on are complete; both are multiples of `size`."""
+        count = len(self.complete_before) - 1  # of blocks
+        first, end = (np.minimum(row // self.size, count) for row in (begin, begin + length))
+        # A window is complete if as many of its blocks are complete as it has.
+        return np.asarray(self.complete_before[end] - self.complete_before[first] == end - first)
 
 
 def find_complete_blocks(z: PyTree, size: int) -> CompleteBlocks:

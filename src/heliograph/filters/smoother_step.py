@@ -1,4 +1,4 @@
-"""Smoother step of a filter: what the way back, or the way ahead of one earlier state, needs of a step forward."""
+"""Smoother step of a filter: what a backward pass, or the forward update of one earlier state, needs of a step."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -47,7 +47,8 @@ class StepTrace(NamedTuple):
 class EarlierState(NamedTuple):
     """An earlier state x_j regressed on the present state x: x_j = mean + M L^-1 (x - E x) + noise.
 
-    Shapes: mean (N,), link M (N, N), lower (N (N - 1) / 2,) of L, noise (N, columns), uncorrelated with x.
+    M is `link` (N, N), `lower` has the entries of the unit lower triangular L below its diagonal (N (N - 1) / 2,), and
+    the noise (N, columns) is uncorrelated with x. Mean (N,).
     """
 
     mean: Float[jax.Array, " N"]
@@ -61,17 +62,19 @@ class EarlierState(NamedTuple):
 
 
 class SmootherStep(Module):
-    """Smoother step: the law of the filter's state, of N numbers, after a step, and that of the state before it.
+    """Smoother step: the law of the filter's state (N numbers) after a step, and the regression of the state before it.
 
-    The latter is given the state after the prediction and the data up to there, of which the step's measurement says
-    nothing more. Rauch, Tung and Striebel's recursion passes from the one to the other for all that moves by a
-    prediction with a white noise, whatever the correction. The plant's state is projection y + shift of the filter's
-    state y, y itself without them. Stacked along time, and over runs, it describes a whole run of a filter.
+    `after` is the Gaussian after the step. `before` regresses the state before the step on the predicted state, given
+    the data before the step; given both, the step's measurement says nothing more of it. So Rauch, Tung and Striebel's
+    recursion holds for any state that moves by a prediction with a white noise, whatever the correction is. The plant's
+    state is projection y + shift of the filter's state y, or y itself without them. Stacked along time, and over runs,
+    it describes a whole run of a filter.
 
-    claim: of estimates given later data too. manifold: which of the plant's states are angles, wrapped to between -pi
-    and pi in estimates, but never by a backward pass, and which are attitudes, whose law is one of turns from the mean.
-    limits: of the plant's states, on which estimates are conditioned.
-    nis: e' S^-1 e of the step's innovation, with mean `received`, the number of components that arrived.
+    claim: what smoothed covariances are said to be. manifold: which of the plant's states are angles, wrapped to
+    between
+    -pi and pi in estimates, but never by a backward pass, and which are attitudes, whose law is that of small rotations
+    from the mean. limits: of the plant's states, on which estimates are conditioned. nis: e' S^-1 e of the step's
+    innovation, with mean `received`, the number of components that arrived.
 
     Shapes: projection (n, N), shift (n,).
     """
@@ -104,23 +107,28 @@ class SmootherStep(Module):
 
     @property
     def end(self) -> Any:
-        """The law after the step, from which a pass back starts."""
+        """The filter's law after the step, from which a backward pass starts."""
         return self.after
 
     def back(self, later: Gaussian) -> Gaussian:
-        """Smooth the state before the step from the state after it, both given the same later data (one RTS step)."""
-        before, ahead = self.before.left.mean, self.before.ahead
-        return settle(self.manifold, before, rts_step(self.before, unsettle(self.manifold, ahead, later)))
+        """Smooth the state before the step from `later`, the smoothed law of the state after it (one RTS step).
+
+        Attitudes are not vectors: `unsettle` writes `later` as rotation vectors from the predicted mean, the RTS step
+        is linear in these, and `settle` turns the filtered mean before the step by its result.
+        """
+        filtered_mean, predicted_mean = self.before.left.mean, self.before.ahead
+        smoothed = rts_step(self.before, unsettle(self.manifold, predicted_mean, later))
+        return settle(self.manifold, filtered_mean, smoothed)
 
     def mean_back(self, later: jax.Array) -> jax.Array:
-        """Return the mean of the state before the step from that of the state after it, as `back` does.
+        """Return the smoothed mean m_s of the state before the step from `later` = m_s+, the one after it, (N,).
 
-        `before.ahead` and `before.left.mean` are the means after and before the step. The manifold takes attitudes as
-        small turns about them.
+        m_s = m + J (m_s+ - m+), with the filtered mean m before the step and the predicted mean m+. `unsettle` writes
+        attitudes as rotation vectors from m+, and `settle` turns m by the result.
         """
-        before = self.before
-        mean = before.mean_given(self.manifold.unsettle(before.ahead, later))
-        return jnp.asarray(self.manifold.settle(before.left.mean, mean))
+        filtered_mean, predicted_mean = self.before.left.mean, self.before.ahead
+        mean = self.before.mean_given(self.manifold.unsettle(predicted_mean, later))
+        return jnp.asarray(self.manifold.settle(filtered_mean, mean))
 
     def start(self) -> EarlierState:
         """Return the state after this step as an earlier state, to be carried on to later steps.
@@ -137,46 +145,58 @@ class SmootherStep(Module):
         )
 
     def ahead(self, point: EarlierState) -> EarlierState:
-        """Condition an earlier state on this step's data too.
+        """Regress an earlier state x_j on the state after this step, given this step's data too.
 
-        Before the step x = m + K e + d, e the change of the state after it and d what that does not tell. So
-        x_j = mean + M L^-1 (K e + d) + noise, of which the data tell e alone: M L^-1 d joins the noise.
+        `point` regresses it on the state x before the step: x_j = mean + M L^-1 (x - m) + noise. In turn
+        x - m = K e + d: the predicted state is x+ = m+ + L+ e, and d, of covariance `before.left`, is uncorrelated with
+        it. So x_j = mean + M L^-1 K L+^-1 (x+ - m+) + (M L^-1 d + noise). This step's measurement depends on x+ alone,
+        and moves its mean by `change`.
         """
         before = self.before
-        noise = WeightedColumns(point.through(before.left.root), before.left.variances)
-        after = EarlierState(
+        noise = WeightedColumns(point.through(before.left.root), before.left.variances)  # M L^-1 d
+        regressed = EarlierState(
             mean=point.mean,
-            link=point.through(before.gain),
-            lower=before.lower,
+            link=point.through(before.gain),  # M L^-1 K
+            lower=before.lower,  # L+
             noise=triangularise(join_columns(point.noise, noise)),
         )
         change = self.manifold.unsettle(before.ahead, self.after.mean) - before.ahead
-        after = after._replace(mean=point.mean + after.through(change[:, None])[:, 0])
-        # Of attitudes: errors about the mean after the step, in place of changes from that before the measurement.
+        regressed = regressed._replace(mean=point.mean + regressed.through(change[:, None])[:, 0])
+        # Attitudes: the errors so far are rotations from the predicted mean; the Jacobian makes them ones from the
+        # corrected mean.
         reset = self.manifold.reset_jacobian(change)
         if reset is None:
-            return after
-        return after._replace(link=after.through(jnp.linalg.inv(reset)), lower=jnp.zeros_like(after.lower))
+            return regressed
+        return regressed._replace(link=regressed.through(jnp.linalg.inv(reset)), lower=jnp.zeros_like(before.lower))
 
     def settle(self, law: Gaussian) -> Gaussian:
-        """Return the law of this step's state, its mean on the group, from one of changes from the mean after it."""
+        """Return the law of the state after this step, given that of its small rotations from the filtered mean.
+
+        Only attitudes change: the filtered mean is rotated by the mean rotation vector.
+        """
         return settle(self.manifold, self.after.mean, law)
 
     def find_law_of_earlier(self, point: EarlierState) -> Gaussian:
-        """Return the mean and covariance of an earlier state given all data up to this step."""
+        """Return the law of an earlier state given all data up to this step.
+
+        `point` is x_j = mean + M L^-1 (x - E x) + noise, so Cov x_j = (M L^-1) Cov(x) (M L^-1)' + Cov noise, with
+        Cov(x) that of the state after this step.
+        """
         explained = WeightedColumns(point.through(self.after.root), self.after.variances)
         return from_columns(point.mean, join_columns(explained, point.noise))
 
     def with_data(self, mean_before: jax.Array, mean_prior: jax.Array, mean_after: jax.Array) -> Self:
-        """Return the same step with other data of the same arrivals: other means."""
+        """Return this step for other data that arrived at the same times: covariances and gains stay, means change.
+
+        The means (N,) are those of the filter's state before the step, after its prediction and after its correction.
+        """
         before = self.before._replace(left=self.before.left._replace(mean=mean_before), ahead=mean_prior)
         return replace(self, after=self.after._replace(mean=mean_after), before=before)
 
     def estimate_from(self, law: Gaussian) -> Estimate:
-        """Return the estimate of the plant's state from the law of the filter's.
+        """Return the estimate of the plant's state, projection y + shift, from the law of the filter's state y.
 
-        `projection`: from the filter's state to the plant's; `shift`: a mean that was subtracted; `limits`: of states,
-        within which the law is cut.
+        Where the plant's states have `limits`, the law is truncated to them.
         """
         mean, columns = law.mean, law.columns
         if self.projection is not None:
@@ -212,15 +232,19 @@ def smoother_step_of(
 ) -> SmootherStep:
     """Build the smoother step from the Gaussians that a filter's states hold.
 
+    With x = m + L xi before the step, the predicted state is x+ = E x+ + slopes xi + w. This is all that the regression
+    of x on x+ needs.
+
     Args:
-        step: with the states around it; m + L xi is that before it.
-        moved: slopes (N, N) and noise (N, columns) of the move x+ = E x+ + slopes xi + w from x = m + L xi.
-        claim: of smoothed estimates.
+        step: the states around the step, each with the Gaussian of N numbers.
+        moved: (slopes (N, N), columns of the noise's covariance Cov w (N, columns)).
+        claim: what smoothed covariances are said to be.
         manifold: which of the plant's states are angles and attitudes.
         projection: from the filter's state to the plant's (n, N).
     """
     slopes, noise = moved
-    before, prior, after = (Gaussian(*map(jnp.asarray, gaussian_of(state))) for state in step[:3])
+    states = step.before, step.prior, step.after
+    before, prior, after = (Gaussian(*map(jnp.asarray, gaussian_of(state))) for state in states)
     return SmootherStep(
         after,
         condition_on_next_state(before, jnp.asarray(slopes), prior.mean, noise),
@@ -233,8 +257,8 @@ def smoother_step_of(
 def make_smoother_step(filter: Any, trace: StepTrace) -> SmootherStep:
     """Return a filter's smoother step, with the NIS of its innovation and with no stronger claim than the filter's.
 
-    A filter may return the smoother step of a filter inside it, with that filter's claim. The NIS is the squared
-    innovation over its covariance, and `count` the number of components that arrived.
+    A filter may return the smoother step of a filter inside it, with that filter's claim. The NIS is e' S^-1 e of the
+    innovation e with covariance S, and `count` the number of components that arrived.
     """
     step: SmootherStep = filter.smoother_step(trace)
     nis, count = innovation_distance(trace.innovation)

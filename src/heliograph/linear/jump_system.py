@@ -1,10 +1,11 @@
-"""Second moments of Markov jump linear systems, zeta+ = F_j zeta + w where the step is in mode j.
+"""Second moments of Markov jump linear systems: the state zeta moves by zeta+ = F_j zeta + w in a step of mode j.
 
 X_j = E[zeta zeta' 1{mode j}] follows X_j+ = F_j Y_j F_j' + S_j, Y_j = sum_i T_ij X_i, with T_ij = P(j in this step | i
-in the one before) and S_j the noise, P(j) Cov w, and all that random coefficients add. One mode is a covariance.
+in the one before). S_j is P(j) Cov w plus the covariances that random coefficients add. With one mode, X is E[zeta
+zeta'].
 
-Arrays are NumPy's or JAX's. X is (..., M, n, n), or (..., 1, n, n), its sum over the modes, before a step whose chain
-forgets the mode before: all rows of T are alike.
+Arrays are NumPy's or JAX's. X is (..., M, n, n). Before a step that draws its mode independently of the last one, so
+that all rows of T are equal, only the sum over the modes matters, and X may be (..., 1, n, n).
 
 Source: Costa, Fragoso and Marques, Discrete-time Markov jump linear systems (2005), chapter 3.
 """
@@ -26,7 +27,8 @@ Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a fi
 def mix_moments_of_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
     """Return Y_j = sum_i T_ij X_i, for each next mode j, of moments X_i by mode i and the chain's probabilities T_ij.
 
-    Moments that are not kept by mode have a single X. Then only the first row of T is used: each next mode's share.
+    If the next mode does not depend on the present one, a single X, the sum over the modes, is enough: then only the
+    first row of T is used, the probabilities of the next modes.
     """
     *axes, modes, n, _ = moments.shape
     sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
@@ -61,7 +63,7 @@ class JumpSystem(NamedTuple):
     added: Array
 
     def step(self, moments: Float[Array, "*axes _ n n"]) -> Any:
-        """Propagate X over one step, without an axis of time; or over each step from an X before it of its own."""
+        """Propagate X over one step, whose fields have no axis of time; with that axis, each step from its own X."""
         return propagate_by_mode(self.maps, mix_moments_of_modes(self.chain, moments), self.added)
 
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
@@ -74,9 +76,14 @@ class JumpSystem(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape (modes, n, n) of X before the first step; of one mode where X is the same in all."""
+        """Shape (modes, n, n) of X before the first step.
+
+        If all rows of the first step's chain are equal, its mode does not depend on the one before. Then the sum of X
+        over the modes is enough, and the shape is (1, n, n).
+        """
         _, modes, n, _ = self.maps.shape
-        return (1 if np.all(self.chain[0] == self.chain[0][:1]) else modes, n, n)
+        forgets_mode = np.all(self.chain[0] == self.chain[0][:1])
+        return (1 if forgets_mode else modes, n, n)
 
     def operator(self) -> Float[np.ndarray, "e e"]:
         """Return the matrix that takes X before the first step to X after the last, without noise.
@@ -134,7 +141,11 @@ class JumpSystem(NamedTuple):
         return np.asarray(by_step + by_step.swapaxes(-1, -2)) / 2  # symmetric, as rounding left it nearly
 
     def _propagate_one_period(self, moments: Array) -> Any:
-        """Propagate X from before the first step to after the last, summed over modes that are redrawn there."""
+        """Propagate X from before the first step to after the last, so that the next period can begin with it.
+
+        If `moments` has a single X (the first step of a period draws its mode anew), the result is summed over the
+        modes to a single X too.
+        """
         last = self.after(moments)[-1]
         return last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True)
 
@@ -142,7 +153,8 @@ class JumpSystem(NamedTuple):
 def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the e entries of their upper triangles.
 
-    Column k holds what the map makes of the k-th unit matrix: an entry and its mirror image at 1, all else at 0.
+    Column k is the map's result for the k-th unit matrix, which has an entry and its mirror image at 1, all others at
+    0.
     """
     _, where, basis = _place_in_upper_triangles(shape)
     matrix: Array = linear(basis)[:, *where].T
@@ -171,7 +183,7 @@ def _place_in_upper_triangles(
 ) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
     """Return how symmetric matrices of a shape (..., n, n) are built from the list of their upper triangles' entries.
 
-    The results are: for each number of the matrix its place in the list, the indices of the list's entries in the
+    The results are: for each number of the matrix its index in the list, the indices of the list's entries in the
     matrix, and for each entry of the list a unit matrix, 1 at the entry and at its mirror image and 0 elsewhere.
     """
     *leading, rows, columns = triangle_indices = np.nonzero(np.triu(np.ones(shape)))

@@ -1,7 +1,8 @@
 """Linear plants behind links whose losses the receiver knows: gains, certificates of a bounded mean error, its limits.
 
-P is the error covariance before a measurement is used, U_i the part of E P in which mode i of the links comes next;
-after mode i it is V_i, so that U_j = sum_i T_ij V_i.
+P is the error covariance before a measurement is used. U_i = E[P 1{the next mode of the links is i}], and
+V_i = E[P+ 1{mode i}] after a step of mode i, so that U_j = sum_i T_ij V_i with the chain's probabilities T_ij. Modes of
+one "kind" cannot be told apart by the receiver, and share a gain.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,10 +18,10 @@ from heliograph.numerics.types import Float, Int
 
 BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it
 CONVERGED = 1e-13  # relative change of the gains from step to step
-ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of what follows it
-NEGLIGIBLE = 1e12  # how far covariances outgrow the noises before these are left out
-WEIGHT = 1e-9  # probability of a mode below which it has none
-SEEN = 1e-6  # share that a mode counts with in the search for gains, if it is left for good sooner or later
+ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of the policy iteration after it
+NEGLIGIBLE = 1e12  # ratio of covariances to the noises' from which on the noises hardly matter
+WEIGHT = 1e-9  # probability of a mode below which it counts as 0
+SEEN = 1e-6  # probability that a mode gets in the search for gains if the chain leaves it for good
 SIZE_LIMIT = 1024  # rows of the operator that acts on all entries of all covariances
 
 KindGains = tuple[Float[np.ndarray, "n _"], ...]
@@ -46,8 +47,9 @@ class KnownLossSystem(NamedTuple):
     def close_loop(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
         """Return the recursion V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, which holds for any gains.
 
-        V_j is the mean of the error covariance times the flag of mode j, and U is V mixed by the chain. `gains` has one
-        K for each kind of mode. Q and R are scaled by `noise`. If each step draws its mode anew, one V is enough.
+        V_j is E[error covariance x 1{mode j}], U_j = sum_i chain_ij V_i, and law_j = P(mode j). Mode j has the output
+        matrix C and the gain K of its kind `known[j]`, the modes that the receiver cannot distinguish; `gains` has one
+        K (n, m) for each kind. Q and R are scaled by `noise`. If each step draws its mode anew, one V is enough.
 
         Raises:
             ValueError: more than SIZE_LIMIT entries in all V_j.
@@ -61,17 +63,22 @@ class KnownLossSystem(NamedTuple):
         return JumpSystem(self.chain[None], np.array([loops]), noise * self.law[:, None, None] * np.array([added]))
 
     def solve_steady_covariances(self, gains: KindGains) -> Parts:
-        """Return the steady U under gains of a radius below 1."""
-        bound: Parts = mix_moments_of_modes(self.chain, self.close_loop(gains).steady()[0])
-        return bound
+        """Return the steady U_j = E[P 1{next mode j}] (modes, n, n) under these gains, P the error covariance.
+
+        The spectral radius of the closed loop must be below 1, else there is no steady covariance.
+        """
+        (V,) = self.close_loop(gains).steady()
+        U: Parts = mix_moments_of_modes(self.chain, V)
+        return U
 
 
 def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
     """Return the spectral radius of the step from error covariances V to V+ under any gains, wherever they come from.
 
-    If it is below 1, the mean error covariance E P stays bounded under these gains, and so under the best ones. This is
-    checked by a witness, a V > 0 with V - V+ > 0 without noise: it exists exactly where the radius is below 1. The
-    steady V of unit noises is tried. If it is not a witness, infinity is returned.
+    If it is below 1, the mean error covariance E P stays bounded under these gains, and so under the best ones. A
+    computed radius below 1 is checked by a Lyapunov inequality: covariances V > 0 that a step without noise makes
+    smaller, V - V+ > 0, exist if and only if the radius is below 1. The steady V under unit noises is tried as this
+    proof; if rounding makes it none, infinity is returned.
 
     Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
     """
@@ -80,10 +87,11 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
     if radius >= BELOW_ONE:
         return radius
     unit_noises = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
-    (witness,) = jumps._replace(added=unit_noises).steady()
-    witness_after = propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, witness), 0.0)
-    decrease: Parts = witness - witness_after
-    is_proved = min(np.linalg.eigvalsh(decrease).min(), np.linalg.eigvalsh(witness).min()) > 0
+    (V,) = jumps._replace(added=unit_noises).steady()
+    # V_j+ = F_j (sum_i T_ij V_i) F_j' without noise; `jumps` has a single step.
+    V_next = propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, V), 0.0)
+    decrease: Parts = V - V_next
+    is_proved = min(np.linalg.eigvalsh(decrease).min(), np.linalg.eigvalsh(V).min()) > 0
     return radius if is_proved else float("inf")
 
 
@@ -92,8 +100,8 @@ def find_gains(system: KnownLossSystem) -> KindGains:
 
     K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. First the best filter's
     covariance recursion, with mean covariances, runs until its gains converge or keep E P bounded. Then policy
-    iteration, which converges faster, improves the gains. If E P is still not bounded, the gains A C+ are tried too,
-    with which an output that shows all of x leaves no old error.
+    iteration, which converges faster, improves the gains. If E P is still not bounded, the gains A C^+ (pseudo-inverse)
+    are tried too: if C shows all of x, A - K C is 0 and no old error remains.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
@@ -108,19 +116,21 @@ def find_gains(system: KnownLossSystem) -> KindGains:
 
 
 def _iterate_covariances(system: KnownLossSystem) -> KindGains:
-    """Return the gains that the covariance recursion ends with: converged, certified, or of ITERATIONS steps.
+    """Return the gains with which the covariance recursion ends: it converges, bounds E P, or does ITERATIONS steps.
 
-    Where the covariances V grow beyond all bounds, they are divided by their size, and the noises with them.
+    Each step propagates V_j = E[error covariance x 1{mode j}] (modes, n, n) with the present gains, and takes the gains
+    that are best for the result. Gains depend only on the ratio of V to the noises, so if V grows without limit, V and
+    the noises are divided by its growth.
     """
     size = float(np.trace(system.process)) or 1.0  # without process noise any size serves
-    parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
-    noise, gains = 1.0, _improve_gains(system, parts, 1.0)
+    V: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
+    noise, gains = 1.0, _improve_gains(system, V, noise=1.0)  # `noise` scales the covariances of all noises
     for step in range(1, ITERATIONS + 1):
-        (parts,) = system.close_loop(gains, noise).after(parts)
-        growth = np.trace(parts.sum(axis=0)) / size
+        (V,) = system.close_loop(gains, noise).after(V)
+        growth = np.trace(V.sum(axis=0)) / size
         if growth > NEGLIGIBLE:
-            parts, noise = parts / growth, noise / growth
-        last_gains, gains = gains, _improve_gains(system, parts, noise)
+            V, noise = V / growth, noise / growth
+        last_gains, gains = gains, _improve_gains(system, V, noise)
         if _relative_change(last_gains, gains) < CONVERGED:
             break
         # Tested after 1, 2, 4, ... steps, since it costs more than a step: do the gains keep E P bounded already?
@@ -131,21 +141,23 @@ def _iterate_covariances(system: KnownLossSystem) -> KindGains:
 
 
 def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
-    """Return better gains by policy iteration: the best for what the last ones leave, until they stop improving.
+    """Return better gains by policy iteration, in at most POLISHING rounds.
 
-    What gains leave is their steady bound, or, where they have none, the covariances that grow fastest.
+    Each round finds the error covariances V under the present gains, and the gains that are best for V. V is the steady
+    covariance, if there is one. Else V is the direction in which covariances grow fastest, and the noises, which such a
+    growth makes negligible, are scaled by 1 / NEGLIGIBLE. The iteration ends if the gains get worse, or stay.
     """
     jumps = system.close_loop(gains)
     values, vectors = np.linalg.eig(jumps.operator())
     radius = float(np.max(np.abs(values)))
     for _ in range(POLISHING):
         is_bounded = radius < BELOW_ONE
-        parts = jumps.steady()[0] if is_bounded else _fastest_growing_covariances(jumps.shape, values, vectors)
-        next_gains = _improve_gains(system, parts, 1.0 if is_bounded else 1 / NEGLIGIBLE)
+        V = jumps.steady()[0] if is_bounded else _fastest_growing_covariances(jumps.shape, values, vectors)
+        next_gains = _improve_gains(system, V, noise=1.0 if is_bounded else 1 / NEGLIGIBLE)
         jumps = system.close_loop(next_gains)
         values, vectors = np.linalg.eig(jumps.operator())
         next_radius = float(np.max(np.abs(values)))
-        # Worse gains are dropped, and the last ones kept; so are gains that changed by rounding alone.
+        # If the new gains are worse, or differ only by rounding, the last ones are returned.
         if next_radius >= max(radius, BELOW_ONE) or _relative_change(gains, next_gains) < CONVERGED:
             break
         gains, radius = next_gains, next_radius
@@ -153,9 +165,14 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
 
 
 def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
-    """Return the covariances that grow by the spectral radius: a positive map has such an eigenvector."""
-    parts = unpack_triangle_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
-    return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
+    """Return the covariances V (modes, n, n) that a step without noise multiplies by its spectral radius, of trace 1.
+
+    `values` and `vectors` are the eigenvalues and eigenvectors of the step V -> V+, which acts on the entries of upper
+    triangles. It maps covariances to covariances, so (Perron and Frobenius) its largest eigenvalue is real, with
+    covariances as eigenvector. A small multiple of I makes them invertible.
+    """
+    V = unpack_triangle_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
+    return np.asarray(V / np.trace(V.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
 def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
@@ -185,15 +202,17 @@ def _relative_change(before: KindGains, after: KindGains) -> float:
     return float(largest_change / largest_entry) if largest_entry > 0 else 0.0
 
 
-UNSEEN = 1e-9  # of its size: what of an eigenvector an output or a noise may show that is taken for nothing
+UNSEEN = 1e-9  # relative: an output or a noise that shows less than this of a unit eigenvector shows nothing of it
 SAME = 1e-7  # relative: eigenvalues closer than this are one
 SETS_LIMIT = 256  # sets of modes that are tried for one eigenvalue
 
 
 class UnobservedGrowth(NamedTuple):
-    """Growth of an eigenvector while the links stay in modes that do not observe it: |a|^2 rho(chain among these).
+    """Growth of E P a step along eigenvectors of the plant while the links stay in modes that do not observe them.
 
-    From 1 on, the mean error of every filter grows without end, if noise reaches the eigenvector.
+    `growth` is |a|^2 times the spectral radius of the chain within these `modes`, with the `eigenvalue` a; `vectors`
+    (n, d) is a basis of the eigenvectors. If it is 1 or more, and noise excites an eigenvector, the mean squared error
+    of every filter grows without limit.
     """
 
     growth: float
@@ -239,13 +258,14 @@ def find_fastest_unobserved_mode(
 def _find_unobserving_modes(
     space: np.ndarray, outputs: Sequence[np.ndarray]
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
-    """List sets of modes whose outputs all miss a common eigenvector, each with a basis of these eigenvectors.
+    """List sets of the links' modes in which C v = 0 for a common eigenvector v, with a basis of these v (n, d).
 
     Args:
-        space: a basis of all eigenvectors of one eigenvalue (n, d).
-        outputs: the matrix C of each mode.
+        space: a basis of all eigenvectors of the plant for one eigenvalue (n, d).
+        outputs: the output matrix C of each mode of the links.
     """
-    # Maps the set of modes that miss a subspace to the subspace: the whole space, and its parts that outputs miss.
+    # From the set of modes that do not observe a subspace to the subspace: the whole space, and intersections of it
+    # with the null spaces of outputs.
     subspaces = {frozenset(_list_modes_not_observing(space, outputs)): space}
     for output in outputs:
         for subspace in list(subspaces.values()):

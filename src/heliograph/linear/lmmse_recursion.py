@@ -15,7 +15,8 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float
 
-SPAN, STILL = 100, 1e-12  # steps between comparisons, and what may be left, relatively, of a covariance's way
+SPAN = 100  # steps between two comparisons of a covariance, to see whether it has converged
+STILL = 1e-12  # relative change that a converged covariance may still make
 DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which it is nominal
 
 
@@ -23,7 +24,7 @@ Pair = tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]  # a covariance
 
 
 class NoiseRoots(NamedTuple):
-    """Roots of both noises of one step, with the rounding of what they are added to: Cov(w) = W W', Cov(v) = V V'."""
+    """Roots of both noises of one step, Cov(w) = W W' and Cov(v) = V V', with the rounding of state and measurement."""
 
     process: Float[np.ndarray, "N _"]
     received: Float[np.ndarray, "m _"]
@@ -38,9 +39,9 @@ class RecursionStep(NamedTuple):
 
 
 class CarriedRounding(NamedTuple):
-    """What rounding of the system's own covariances adds to that of the error, and its largest share of a claimed one.
+    """Error of the filter's covariance by rounding of the system's own covariances (N, N).
 
-    `worst` is that share of a claimed variance, of all steps so far, and `when` its step.
+    `worst` is its largest share of a claimed variance over all steps so far, and `when` the step of that.
     """
 
     covariance: Float[np.ndarray, "N N"]
@@ -67,15 +68,18 @@ class CarriedRounding(NamedTuple):
 
 
 def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
-    """Return roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
-    reach = np.abs(matrices.output) @ np.sqrt(size)
-    return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, reach**2))
+    """Return roots of Cov(w) and Cov(v), with the rounding of a state y whose E[y_i^2] is `size` (N,) joined to them.
+
+    A measurement z = C y + c + v is rounded by its size, at most |C| sqrt(size).
+    """
+    received_size = (np.abs(matrices.output) @ np.sqrt(size)) ** 2
+    return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, received_size))
 
 
 def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
     """Return a root W of a noise covariance plus that of rounding, W W' = Cov + rounding: their columns side by side.
 
-    `seconds` are the second moments (n,) of the numbers to which the noise is added. The sums are what is rounded.
+    `seconds` are the second moments (n,) of the numbers to which the noise is added, since the sums are rounded.
     """
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
@@ -95,8 +99,8 @@ def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noise
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """Return gains of the best linear filter of x = W y from z_1 ... z_k: a Kalman recursion, since w and v are white.
 
-    `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
-    "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
+    `claim` says what the covariance is: "exact" if the system's moments are the true ones. It is lowered to "nominal",
+    with a warning, if rounding of the system's own covariances is a visible share of the error's.
 
     Args:
         system: whose state y is estimated from its measurements z.
@@ -113,8 +117,8 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
     steady_from, before = system.steady_from, None  # before: the covariance, as it was SPAN steps ago
     for k in range(system.horizon):
-        # From `steady_from` on all steps of the system are the same. There, every SPAN steps, see whether the error
-        # covariance has come to rest: then all later gains are the last ones, to rounding.
+        # From `steady_from` on all steps of the system are the same. There, every SPAN steps, test whether the error
+        # covariance has converged: then all later gains are the last ones, to rounding.
         if k > steady_from and (k - steady_from) % SPAN == 0:
             now = covariance_of_root(root), rounding.covariance
             if before is not None and _has_converged(now, before, gains_by_step[-1].transition):
@@ -133,21 +137,26 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
 
 
 def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionStep) -> Gains:
-    """Return the gains of one step: y+ = (I - G C) A y + ... + G z, of which W y+ is the estimate, and covariances."""
-    projection, gain = system.projection, covariances.gain
-    keep = np.eye(len(gain)) - gain @ matrices.output
-    transition, offset = keep @ matrices.transition, keep @ matrices.drift - gain @ matrices.offset
+    """Return the gains of one step of the filter of y+ = A y + a + w, z = C y+ + c + v, and its covariances.
+
+    With the estimate s of y and Kalman's gain G, s+ = A s + a + G (z - C (A s + a) - c) is F s + G z + f, where
+    F = (I - G C) A and f = (I - G C) a - G c. The estimate of x = W y is W s+ = L s + J z + d with L = W F, J = W G and
+    d = W f. The expected measurement is C A s + C a + c.
+    """
+    W, gain = system.projection, covariances.gain
+    I_GC = np.eye(len(gain)) - gain @ matrices.output
+    transition, offset = I_GC @ matrices.transition, I_GC @ matrices.drift - gain @ matrices.offset
     return Gains(
         transition,
         gain,
         offset,
-        output=projection @ transition,
-        direct=projection @ gain,
-        output_offset=projection @ offset,
+        output=W @ transition,
+        direct=W @ gain,
+        output_offset=W @ offset,
         expected=matrices.output @ matrices.transition,
         expected_offset=matrices.output @ matrices.drift + matrices.offset,
-        covariance=covariance_of_root(projection @ covariances.root),
-        predicted=covariance_of_root(projection @ covariances.predicted),
+        covariance=covariance_of_root(W @ covariances.root),
+        predicted=covariance_of_root(W @ covariances.predicted),
         innovation=covariance_of_root(matrices.output @ covariances.predicted) + matrices.noise,
     )
 
@@ -194,11 +203,10 @@ def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
     """Return E[(x - xhat)(x - xhat)'] over time of a schedule run on a system that it need not have been designed for.
 
-    Mean and covariance of (y, s), the system's state and the schedule's, are propagated; nothing is assumed of the
-    gains.
+    Mean and covariance of (y, s), the system's state and the schedule's, are propagated; the gains may be any.
 
     Args:
-        system: the world, y+ = A y + a + w and z = C y+ + c + v, of which x = W y is to be known.
+        system: the true system, y+ = A y + a + w and z = C y+ + c + v, with x = W y to be estimated.
         schedule: gains for as many steps and measurements, s+ = F s + K z + f and xhat = L s + J z + d.
 
     Raises:
@@ -210,16 +218,16 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
     if schedule.horizon != system.horizon or received_by_schedule != m:
         got = f"{schedule.horizon} steps of {received_by_schedule} measurements"
         raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
-    # Of (y, s), s a known number at the start.
-    mean, spread = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
+    # Mean and covariance of (y, s); at the start s is a known number.
+    mean, covariance = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
     q = len(system.projection)
     covariances = []
     for k in range(system.horizon):
         gains = Gains(*(field[k] for field in schedule.gains))
-        mean, spread = _propagate_errors(system.step(k), gains, system.projection, mean, spread)
-        # The last q numbers are x - xhat; the first ones go on.
-        covariances.append(spread[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
-        mean, spread = mean[:-q], spread[:-q, :-q]
+        mean, covariance = _propagate_errors(system.step(k), gains, system.projection, mean, covariance)
+        # The last q numbers are x - xhat; the others, (y, s), go into the next step.
+        covariances.append(covariance[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
+        mean, covariance = mean[:-q], covariance[:-q, :-q]
     return np.array(covariances)
 
 
@@ -228,20 +236,25 @@ def _propagate_errors(
     gains: Gains,
     projection: Float[np.ndarray, "q N"],
     mean: Float[np.ndarray, " joint"],
-    spread: Float[np.ndarray, "joint joint"],
+    covariance: Float[np.ndarray, "joint joint"],
 ) -> tuple[Float[np.ndarray, " next"], Float[np.ndarray, "next next"]]:
     """Return mean and covariance of (y+, s+, x - xhat) after a step from those of (y, s) before it.
 
-    With z = C y+ + c + v: s+ = F s + K z + f and x - xhat = W y+ - L s - J z - d, so that three matrices lead to
-    (y+, s+, x - xhat): `of_next` from y+, `of_noise` from c + v, and `of_schedule` from s.
+    The system is y+ = A y + a + w, z = C y+ + c + v and x = W y+ (`projection`), and the schedule s+ = F s + K z + f
+    and xhat = L s + J z + d. Put together,
+
+        (y+, s+, x - xhat) = M y+ + N (c + v) + S s + (0, f, -d),
+        M = [I; K C; W - J C],  N = [0; K; -J],  S = [0; F; -L].
     """
-    size, m = len(step.transition), len(step.noise)
+    A, C, K, J = step.transition, step.output, gains.gain, gains.direct
+    size, m = len(A), len(step.noise)
     states = len(mean) - size
-    of_next = np.concatenate([np.eye(size), gains.gain @ step.output, projection - gains.direct @ step.output])
-    of_noise = np.concatenate([np.zeros((size, m)), gains.gain, -gains.direct])
-    of_schedule = np.concatenate([np.zeros((size, states)), gains.transition, -gains.output])
+    M = np.concatenate([np.eye(size), K @ C, projection - J @ C])
+    N = np.concatenate([np.zeros((size, m)), K, -J])
+    S = np.concatenate([np.zeros((size, states)), gains.transition, -gains.output])
     offset = np.concatenate([np.zeros(size), gains.offset, -gains.output_offset])
-    maps = np.concatenate([of_next @ step.transition, of_schedule], axis=1)  # from (y, s)
-    mean = maps @ mean + of_next @ step.drift + of_noise @ step.offset + offset
-    noise = propagate_by_mode(of_next, step.process, propagate_by_mode(of_noise, step.noise, 0.0))
-    return mean, propagate_by_mode(maps, spread, noise)
+    # In (y, s), w and v: [M A, S] (y, s) + M (a + w) + N (c + v) + offset.
+    maps = np.concatenate([M @ A, S], axis=1)
+    mean = maps @ mean + M @ step.drift + N @ step.offset + offset
+    noise = propagate_by_mode(M, step.process, propagate_by_mode(N, step.noise, 0.0))  # M Cov(w) M' + N Cov(v) N'
+    return mean, propagate_by_mode(maps, covariance, noise)

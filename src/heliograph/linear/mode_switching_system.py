@@ -1,4 +1,4 @@
-"""Linear system of a state whose motion and measurement are maps with the same modes."""
+"""Linear system of a state whose motion and measurement are random maps that share modes of a Markov chain."""
 
 import numpy as np
 
@@ -99,7 +99,7 @@ def _find_state_size(move: Channel, measure: Channel) -> int:
 
 
 def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
-    """Return E[(G, n)] and the covariances of its entries, of the map of each mode."""
+    """Return, for the map y -> G y + n of each mode, E[(G, n)] and the covariances of the entries of (G, n)."""
     means, spreads = zip(*((m.moments(1).mean[:-1], nominal_spread(m).center) for m in maps), strict=True)
     return np.array(means), np.array(spreads)
 
@@ -107,23 +107,31 @@ def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
 def _propagate_modes(
     move: Moments, rows: np.ndarray, moments: np.ndarray
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
-    """Return F, Cov(w) and E[y~+ y~+' 1{j}] of one step, in the notation of `modal_system`.
+    """Return the transition F, Cov(w) and the next second moments of the stacked state (y~ 1{mode j})_j.
+
+    In a step to mode j, y~ = (y, 1) becomes H_j y~ with a random H_j. Given mode i before, the next mode is j with
+    probability Pi_ij. So
+
+        F[j, i] = Pi_ij E H_j,   E_j+ = E H_j Y_j E H_j' + S_j,   Y_j = sum_i Pi_ij E_i,
+        Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl S_j,
+
+    where E_i = E[y~ y~' 1{i}] and S_j = sum_cd Cov(H_ac, H_bd) Y_j[c, d] is the noise of the random H_j.
 
     Args:
-        move: moments of the maps by mode.
-        rows: Pi, the chain's transition.
-        moments: E_i = E[y~ y~' 1{i}] before the step.
+        move: E H_j without its last row, and the covariances of the entries of H_j, by mode.
+        rows: Pi (modes, modes).
+        moments: E_i (modes, n + 1, n + 1) before the step.
     """
     mean, spread = move
     modes, size = len(moments), moments.shape[-1]
-    # E H_j of y~ = (y, 1): the mean maps with a last row that keeps the 1.
-    whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
-    # sum_i Pi_ij E_i, and what the randomness of the maps makes of it.
-    before = mix_moments_of_modes(rows, moments)
-    of_random_maps = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
-    # Cov(w)[j, l]: Pi_ij (delta_jl - Pi_il) is the covariance of the indicators of the next modes j and l, given i.
-    indicators = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
-    process = np.einsum("ijl,jac,icd,lbd->jalb", indicators, whole, moments, whole)
-    process[np.arange(modes), :, np.arange(modes), :] += of_random_maps
-    transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
-    return transition, process.reshape(modes * size, modes * size), propagate_by_mode(whole, before, of_random_maps)
+    # E H_j (modes, n + 1, n + 1), with the last row (0, ..., 0, 1), which keeps the constant of y~.
+    EH = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
+    Y = mix_moments_of_modes(rows, moments)
+    S = np.pad(np.einsum("jabcd,jcd->jab", spread, Y), ((0, 0), (0, 1), (0, 1)))
+    # Pi_ij (delta_jl - Pi_il): covariance of the indicators of the next modes j and l, given mode i.
+    indicator_covariance = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
+    # Blocks [j, a, l, b] of Cov(w) and [j, a, i, b] of F: entry (a, b) of block (j, l) or (j, i).
+    process = np.einsum("ijl,jac,icd,lbd->jalb", indicator_covariance, EH, moments, EH)
+    process[np.arange(modes), :, np.arange(modes), :] += S
+    transition = np.einsum("ij,jab->jaib", rows, EH).reshape(modes * size, modes * size)
+    return transition, process.reshape(modes * size, modes * size), propagate_by_mode(EH, Y, S)

@@ -47,17 +47,18 @@ def check_finite_moments(moments: Moments, k: int, order: int) -> None:
 class SteadyMomentTest:
     """Test for steady moments of x up to `order` under x+ = A x + noise with one law for all time, to rounding.
 
-    What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)
-    times as much. Moments are steady once that is below the rounding of their own scale, E[x_i^2]^(1/2) for each x_i.
+    Changes from step to step shrink by the spectral radius r of A, so all later changes sum up to at most the present
+    one over 1 - r. Moments are steady once this is below EPS of their own size: a change of at most EPS (1 - r) size.
+    The size of a moment is the product of E[x_i^2]^(1/2) over its factors x_i.
     """
 
     def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
-        """Set the tolerance for moments under A = `matrix`; if A or a law `varies` over time, they are never steady."""
-        rate = 1 - spectral_radius(matrix)
-        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate  # negative: moments are never steady
+        """Set the tolerance EPS (1 - r) for A = `matrix`; if it `varies` or r >= 1, moments are never steady."""
+        decay = 1 - spectral_radius(matrix)
+        self._tolerance = -1.0 if varies or decay <= 0 else EPS * decay
+        # Moments are E of all products of `order` factors of (x, 1). E[x_i^2] has x_i twice, and the 1 order - 2 times.
         n, index_of_moment = len(matrix), position(len(matrix) + 1, order)
         self._powers = np.array(list_exponents(n + 1, order))[:, :n]  # exponents of x in each moment
-        # Which moments are E[x_i^2]: their exponents are 2 of x_i, and order - 2 of the constant 1.
         self._squares = [index_of_moment[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
         self._last: Moments | None = None
 
@@ -79,7 +80,7 @@ def lift_modes(
     moments: Float[np.ndarray, " monomials"],
     projection: Float[np.ndarray, "n L"],
 ) -> LinearSystem:
-    """Return the system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
+    """Return the system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), that measures those of z.
 
     Args:
         plants: map x -> x+ of each step.
@@ -88,8 +89,8 @@ def lift_modes(
         moments: E[monomials of (x_0, 1)] of order 2 `degree`.
         projection: matrix that reads x off Y.
 
-    E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with M and K_j the moments of the plant
-    and of the route in mode j. Noises, with B = E[Y Y'] and x the Kronecker product:
+    E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with E[Y+ | Y] = M Y by the plant and
+    E[Z | Y] = K_j Y by the measurement in mode j. Noises, with B = E[Y Y'] and x the Kronecker product:
     Cov(w) = sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M' + diag(p+) x (B+ - M B M'),
     Cov(v) = sum_j p_j (E[Z Z' | j] - K_j B+ K_j').
     """
@@ -104,8 +105,8 @@ def lift_modes(
     varies = len(distinct) > 1
     lifts_by_id = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
     matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
-    # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
-    # That is not so of step 0, in which the chain does not move: the last one is at least step 1.
+    # If nothing varies and moments and law are steady, all later steps equal the last one, to rounding. Step 0, in
+    # which the chain does not move, is no such step.
     steady = SteadyMomentTest(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
     steps, roundings, last_law = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
@@ -136,20 +137,18 @@ def _compute_noise_and_next_law(
     moved: Float[np.ndarray, "L L"],
     second: Float[Array, "L L"],
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, " modes"]]:
-    """Return Cov(w) of a step of the N = modes x L products of Y and the modes' flags, and the modes' law after it.
+    """Return Cov(w) of a step of the stacked vectors Y 1{mode j} (modes x L numbers), and the modes' law p+ after it.
 
-    Args:
-        law: of the modes before the step, p.
-        chain: Pi[i, j] = P(next mode j | mode i).
-        moved: M B M', the second moments of Y that the plant's mean map makes of those before the step.
-        second: B+, those after the step.
+    Y has the monomials of x, and M is the mean map, E[Y+ | Y] = M Y. The random next mode and the plant's noise add
+    Cov(w) = sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M' + diag(p+) x (B+ - M B M'), x the Kronecker product. `law` is
+    p before the step, and `chain` Pi[i, j] = P(next mode j | mode i). `moved` is M B M' with B = E[Y Y'] before the
+    step, and `second` is B+ = E[Y+ Y+'].
     """
-    # The random next mode adds sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M', and the plant its own noise B+ - M B M'.
-    not_drawn = np.eye(len(law))[None] - chain[:, None, :]
-    drawn = np.einsum("i,ij,ijl->jl", law, chain, not_drawn)
-    next_law = law @ chain
-    kept_law = _keep_if_unchanged(law, next_law)
-    return np.kron(drawn, moved) + np.kron(np.diag(kept_law), second - moved), kept_law
+    # (j, l): sum_i p_i Pi_ij (delta_jl - Pi_il), the mean covariance of the next mode's flags given the mode before.
+    minus_chain = np.eye(len(law))[None] - chain[:, None, :]
+    flag_covariance = np.einsum("i,ij,ijl->jl", law, chain, minus_chain)
+    next_law = _keep_if_unchanged(law, law @ chain)
+    return np.kron(flag_covariance, moved) + np.kron(np.diag(next_law), second - moved), next_law
 
 
 def _average_noise(
@@ -166,7 +165,7 @@ def _average_noise(
 def _keep_if_unchanged(
     law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
 ) -> Float[np.ndarray, " modes"]:
-    """Return the law of the modes after a step, or the law before it if both are equal up to rounding."""
+    """Return the law after a step, or the same law as before if both agree to rounding: so a steady one is found."""
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -177,11 +176,11 @@ STORED_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
 def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int) -> LinearSystem:
     """Return the system of Y = monomials of x up to `degree`, measured by Z = monomials of z up to `degree`.
 
-    E[Y+ | Y] = A Y + a and E[Z | Y+] = C Y+ + c are exact, with A and C the moments of the plant and of the route,
-    Cov(w) = E[Y+ Y+'] - M E[Y Y'] M', Cov(v) = E[Z Z'] - K E[Y+ Y+'] K' (M, K with the constant). Both noises have
-    mean zero given the state's whole past, so the best linear filter of this system is the best filter of x that is
-    a polynomial of this degree in each z_k. Every monomial appears once (the half-vectorised square); x is read off as
-    the monomials of degree 1.
+    E[Y+ | Y] = A Y + a and E[Z | Y+] = C Y+ + c are exact: they follow from moments of the plant and of sensor and
+    channel. Cov(w) = E[Y+ Y+'] - M E[Y Y'] M' and Cov(v) = E[Z Z'] - K E[Y+ Y+'] K', where Y and Z end with the
+    constant 1, M = [A, a; 0, 1] and K = [C, c; 0, 1]. Both noises have mean zero given the state's whole past, so the
+    best linear filter of this system is the best filter of x that is a polynomial of this degree in each z_k. Every
+    monomial appears once (the half-vectorised square); x is read off as the monomials of degree 1.
 
     Args:
         plant: linear plant without inputs.
@@ -227,16 +226,17 @@ def _lift_chain(
 ) -> LinearSystem:
     """Return the linear system of a channel with memory, whose state is the monomials times the flag of each mode.
 
-    `moments` are those of x_0 up to twice the degree. `sizes` are the numbers of states and of outputs.
+    `routes` are the maps of each step, x -> x+ (plant) and x+ -> z (measurement). `moments` are those of x_0 up to
+    twice the degree. `sizes` are the numbers of states and of outputs.
     """
     n, m = sizes
     distinct = {id(r.measurement): r.measurement for r in routes}  # steps share one object where nothing varies
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
-    refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
+    refuse_lift(degree, n, m, len(routes), modes=max(len(modes.initial) for modes in modes_by_id.values()))
     # The state vector Y ends with the constant 1, on which x does not depend: its column is 0.
     projection = np.pad(make_linear_rows(n, degree), ((0, 0), (0, 1)))
-    chains = [modes_by_id[id(r.measurement)] for r in routes]
-    return lift_modes([r.plant for r in routes], chains, degree, moments, projection)
+    modes_by_step = [modes_by_id[id(r.measurement)] for r in routes]
+    return lift_modes([r.plant for r in routes], modes_by_step, degree, moments, projection)
 
 
 def _lift_steps(
@@ -289,32 +289,36 @@ def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> b
 class LiftedMap:
     """A map z = G y + n on monomials: E[Z | y] = K Y, and how moments of y of twice the degree become those of z.
 
-    `matrix` is K, (monomials of z, monomials of y) up to `degree`. `whole` takes moments of y of twice the degree to
-    those of z; it is formed for a map that stays, if it is small, and None of one that varies, which is used but once.
-    `given` has the degree of each of these monomials of y, `highest` [i, j] the highest degree of moments of y that
-    Cov(Z_i, Z_j | y) needs.
+    `matrix` is K, (monomials of z, monomials of y) up to `degree`. `moment_matrix` maps moments of y of twice the
+    degree to those of z; it is None if it would be large, or if the map varies over time, so that it would be used
+    once. `moment_degrees` has the degree of each of these monomials of y, and `highest_degree`[i, j] the highest degree
+    of moments of y that Cov(Z_i, Z_j | y) needs.
     """
 
     def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):
-        """Lift the map z = G y + n; `whole`, its matrix of twice the degree, is None if it `varies` or is too large."""
+        """Lift the map z = G y + n (`route`) to monomials up to `degree`; `varies`: it is another one at each step.
+
+        Z_i - E[Z_i | y] is a polynomial of y whose degree is deg Z_i, or deg Z_i - 1 if all gains in Z_i are known,
+        since then each of its terms has a factor n. Cov(Z_i, Z_j | y) has the sum of the degrees of both.
+        """
         self.route, self.degree = route, degree
         self.matrix = np.asarray(route.moments(degree).matrix)
         rows, columns = (count_monomials(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
-        small = not varies and rows * columns <= STORED_ENTRIES
-        self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
-        self.given = degrees(route.inputs, 2 * degree)
-        # Monomials of z that hold no output of a random gain, and the highest moments of y in Cov(Z_i, Z_j | y).
+        is_stored = not varies and rows * columns <= STORED_ENTRIES
+        self.moment_matrix = np.asarray(route.moments(2 * degree).matrix) if is_stored else None
+        self.moment_degrees = degrees(route.inputs, 2 * degree)
         exponents = np.array(list_exponents(route.outputs + 1, degree))[:, :-1]
         has_known_gains = ~np.any(exponents[:, ~route.known_gains], axis=1)
-        lowered_degrees = degrees(route.outputs, degree) - has_known_gains
-        self.highest = lowered_degrees[:, None] + lowered_degrees
-        self.highest[~has_known_gains[:, None] & ~has_known_gains] = 2 * degree
+        deviation_degrees = degrees(route.outputs, degree) - has_known_gains
+        self.highest_degree = deviation_degrees[:, None] + deviation_degrees
+        # Where both have a random gain, all moments are used.
+        self.highest_degree[~has_known_gains[:, None] & ~has_known_gains] = 2 * degree
 
     def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
         """Return E[monomials of z] from E[monomials of y], both up to twice the degree."""
         with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses what overflows
-            if self.whole is not None:
-                return np.asarray(self.whole @ np.asarray(moments))
+            if self.moment_matrix is not None:
+                return np.asarray(self.moment_matrix @ np.asarray(moments))
             return np.asarray(push_moments(self.route, 2 * self.degree, moments))
 
     def mean_conditional_covariance(
@@ -322,18 +326,16 @@ class LiftedMap:
     ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
         """Return E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
 
-        Where the outputs in Z_i have a known gain, every term of Z_i - E[Z_i | y] has an n: it is a polynomial of y of
-        degree deg Z_i - 1, and lowers that of Cov(Z_i, Z_j | y) by one, as Z_j does. Moments of y of a higher degree,
-        which would only cancel, are left out for that entry: what y is worth, far from zero or growing, costs no digits
-        of the noise.
+        `moments` are those of y up to twice the degree. Entry (i, j) needs only those up to `highest_degree`[i, j]: in
+        the difference higher ones cancel, so they are set to 0. Else they would cost digits where y is large.
         """
-        n, m = self.route.inputs + 1, self.route.outputs + 1
-        K, covariance, rounding = self.matrix, np.zeros(self.highest.shape), np.zeros(len(self.highest))
-        for degree in range(int(self.highest.max()) + 1):
-            entries = self.highest == degree  # those that need moments of y up to this degree
+        n, m, shape = self.route.inputs + 1, self.route.outputs + 1, self.highest_degree.shape
+        K, covariance, rounding = self.matrix, np.zeros(shape), np.zeros(len(self.highest_degree))
+        for highest in range(int(self.highest_degree.max()) + 1):
+            entries = self.highest_degree == highest  # entries that need moments of y up to this degree
             if not entries[:-1, :-1].any():
                 continue
-            needed = np.where(self.given <= degree, np.asarray(moments), 0.0)
+            needed = np.where(self.moment_degrees <= highest, np.asarray(moments), 0.0)
             second_of_y = np.asarray(products_of_monomials(needed, n, self.degree))
             second_of_z = np.asarray(products_of_monomials(self.push_moments(needed), m, self.degree))
             covariance = np.where(entries, second_of_z - K @ second_of_y @ K.T, covariance)
@@ -393,7 +395,6 @@ def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int
     if entries > MEMORY_LIMIT_ENTRIES:
         got = (
             f"{entries:,} ({n - 1} monomials of {states} states{of_modes} and {m - 1} of {outputs} outputs, "
-            f"{horizon} steps); "
-            "use a lower degree, a shorter horizon, or fewer states or outputs"
+            f"{horizon} steps); use a lower degree, a shorter horizon, or fewer states or outputs"
         )
         raise fail(f"lift of degree {degree}", f"at most {MEMORY_LIMIT_ENTRIES:,} entries", got)

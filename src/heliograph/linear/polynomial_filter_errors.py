@@ -42,9 +42,9 @@ from heliograph.random_affine.series_and_stack import Series, Stack
 def quadratic_system_with_linear_estimate(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule
 ) -> LinearSystem:
-    """Return the system of all products up to degree 2 of (x, q, z), q the estimate of a linear filter.
+    """Return the system of all products up to degree 2 of (x, q, z), where q is the estimate of a linear filter.
 
-    Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
+    Its measurement is z, z z' and z q' of the present step: components of its state, so without noise of their own.
 
     Args:
         plant: linear plant without inputs.
@@ -62,8 +62,8 @@ def quadratic_system_with_linear_estimate(
         raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
     total = 2 * n + m
     refuse_lift(2, total, m + n, horizon)
-    # At the start (x_0, q_0, 0), q_0 a known number: an affine function of x_0. Moments up to order 4, of which
-    # `second` = E[Y Y'] of the products Y up to degree 2.
+    # At the start (x_0, q_0, 0), with a known q_0, is an affine function of x_0. `moments` are up to order 4, and
+    # `second` is E[Y Y'] of the products Y up to degree 2.
     start_map = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
     moments = push_through_known_map(start_map, 4, initial_monomial_moments(plant_0, 4))
     second = products_of_monomials(moments, total + 1, 2)
@@ -110,7 +110,10 @@ def _make_filter_map(g: Gains) -> np.ndarray:
 
 
 class _MomentCache:
-    """Moments of plant and link for the quadratic system, computed again only where the model changes."""
+    """Moments of plant and link for the system of products of (x, q, z), computed again only where the model changes.
+
+    x is the state, q the estimate of a linear filter (n numbers each), and z the measurement (m numbers).
+    """
 
     def __init__(self) -> None:
         """Start without kept moments: none of a plant's noise, and none of a measurement."""
@@ -120,9 +123,10 @@ class _MomentCache:
         self.measurement_moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
-        """Return the map (x, q, z) -> (x+, q) of a plant's step; x and q have n numbers each, and z has m.
+        """Return the map (x, q, z) -> (x+, q) of a plant's step x+ = A x + w: the last z, of m numbers, is dropped.
 
-        z is dropped. The noise acts on x+ alone. Its table is kept as long as the plant's noise is the same object.
+        q, the estimate of the linear filter, does not change in this part of the step. The noise is (w, 0). Its table
+        of moments is stored, and used again as long as the plant's noise is the same object.
         """
         n = plant.inputs
         if self.joint_noise is None or plant.noise is not self.last_plant_noise:
@@ -136,31 +140,35 @@ class _MomentCache:
     def make_measurement_moments(self, measurement: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrices that map the moments of (x+, q) of order 2 and 4 to those of (x+, q, z+).
 
-        `measurement` is the random map from x+ (n numbers) to z+. The matrices of the last measurement are kept.
+        `measurement` is the random map from x+ (n numbers) to z+, and q (n numbers) the estimate of the linear filter.
+        The matrices of the last measurement are stored, and used again if it is the same object.
         """
         if measurement is not self.last_measurement:
-            take_x = known(np.eye(n, 2 * n))
-            keep_and_measure = Stack([known(np.eye(2 * n)), Series([take_x, measurement])])
-            second, fourth = keep_and_measure.moments(2), keep_and_measure.moments(4)
+            take_x = known(np.eye(n, 2 * n))  # (x+, q) -> x+
+            append_z = Stack([known(np.eye(2 * n)), Series([take_x, measurement])])  # (x+, q) -> (x+, q, z+)
+            second, fourth = append_z.moments(2), append_z.moments(4)
             self.last_measurement = measurement
             self.measurement_moments = np.asarray(second.matrix), np.asarray(fourth.matrix)
         return self.measurement_moments
 
 
 def _make_received_products(n: int, m: int) -> np.ndarray:
-    """Return rows, each with one 1, that read z, z z' and z q' off all monomials up to degree 2 of (x, q, z).
+    """Return rows, each with one 1, that select z, z z' and z q' among all monomials up to degree 2 of (x, q, z).
 
-    x and q have n numbers each, and z has m. A monomial is found by its exponents of (x, q, z, 1).
+    x is the state and q its linear estimate, of n numbers each, and z the measurement, of m numbers. A monomial is
+    identified by its exponents of (x, q, z, 1), whose sum is 2.
     """
     total = 2 * n + m
-    places = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
-    expected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
+    index_of_monomial = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
+    # z and z z': exponents of (z, 1) behind zeros for x and q; the last one, of the constant alone, is left out.
+    selected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
+    # z_i q_j: exponent 1 of q_j, variable n + j, and of z_i, variable 2 n + i.
     for i in range(m):
         for j in range(n):
-            expected.append(tuple(int(v in (n + j, 2 * n + i)) for v in range(total + 1)))
-    rows = np.zeros((len(expected), len(places) - 1))
-    for row, powers in zip(rows, expected, strict=True):
-        row[places[powers]] = 1.0
+            selected.append(tuple(int(variable in (n + j, 2 * n + i)) for variable in range(total + 1)))
+    rows = np.zeros((len(selected), len(index_of_monomial) - 1))
+    for row, powers in zip(rows, selected, strict=True):
+        row[index_of_monomial[powers]] = 1.0
     return rows
 
 

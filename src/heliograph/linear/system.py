@@ -36,11 +36,11 @@ class Steps(NamedTuple):
 
 @readable
 class LinearSystem(Module):
-    """Linear system y+ = A y + a + w, z = C y+ + c + v, of which x = W y is to be estimated.
+    """Linear system y+ = A y + a + w, z = C y+ + c + v, with x = W y to be estimated.
 
-    w and v have mean zero given all earlier y and are uncorrelated with each other. Random coefficients fit: take A and
-    C as their means, and as Cov(w), Cov(v) what is left over, E[(H - EH) y y' (H - EH)'] plus noise. A measurement
-    that shares the step's noise (a relay that listens while it sends) is made a component of y and read with v = 0.
+    w and v have mean zero given all earlier y and are uncorrelated with each other. A random coefficient H fits too:
+    its mean is A or C, and E[(H - EH) y y' (H - EH)'] counts as part of Cov(w) or Cov(v). A measurement that shares the
+    step's noise (a relay that listens while it sends) is made a component of y and read with v = 0.
 
     Args:
         steps: matrices of each step.
@@ -65,7 +65,7 @@ class LinearSystem(Module):
     start_rounding: Float[np.ndarray, "N"]
     kept: StaticPremise = eqx.field(
         static=True, default=NOTHING, init=False, repr=False, compare=False
-    )  # what it was made of
+    )  # models that it was made of
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class LinearSystem(Module):
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
-        # Shapes of one step: A, a, Cov w of the state and C, c, Cov v of what is received, as `Steps` has them.
+        # Shapes of one step in the order of `Steps`: A, a, Cov w of the state, and C, c, Cov v of the measurement.
         shapes: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
         named = zip(Steps._fields, steps, shapes, strict=True)
         self.steps = Steps(*(array(f"system {name}", value, (time, *shape)) for name, value, shape in named))
@@ -114,7 +114,7 @@ class LinearSystem(Module):
 
 
 def repeat_last_step(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
-    """Return the parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
+    """Stack arrays of the first steps (time, ...), and repeat the last one for all later steps of the horizon."""
     values = np.array(parts)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 
@@ -190,7 +190,7 @@ class Gains(NamedTuple):
     innovation: Matrices
 
 
-PERHAPS = ("predicted", "innovation")  # fields that may be unknown
+MAY_BE_NAN = ("predicted", "innovation")  # fields of `Gains` that may be unknown
 
 
 @readable
@@ -212,20 +212,29 @@ class Schedule(Module):
     claim: Claim = eqx.field(static=True)
     kept: StaticPremise = eqx.field(
         static=True, default=NOTHING, init=False, repr=False, compare=False
-    )  # what it was made for
+    )  # models that it was made for
 
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
-        """Check and hold the gains of each step, the filter's state before the first, and the claim."""
+        """Check and hold the gains of each step, the filter's state before the first, and the claim.
+
+        The claim says what the covariances are: exact, an upper bound, nominal, or none. Sizes are time, n of the
+        filter's state, m of z and q of the estimate.
+        """
         instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
         time, n, m = np.shape(gains.gain)
         q = np.shape(gains.output_offset)[-1]
-        shapes: tuple[tuple[int, ...], ...] = (
-            (time, n, n), (time, n, m), (time, n), (time, q, n), (time, q, m), (time, q), (time, m, n), (time, m),
-            (time, q, q), (time, q, q), (time, m, m),
-        )  # fmt: skip
-        named = zip(Gains._fields, gains, shapes, strict=True)
-        self.gains = Gains(*((_array_or_nan if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
+        shape_of_field: dict[str, tuple[int, ...]] = {
+            "transition": (time, n, n), "gain": (time, n, m), "offset": (time, n),
+            "output": (time, q, n), "direct": (time, q, m), "output_offset": (time, q),
+            "expected": (time, m, n), "expected_offset": (time, m),
+            "covariance": (time, q, q), "predicted": (time, q, q), "innovation": (time, m, m),
+        }  # fmt: skip
+        checked = {}
+        for name, value in gains._asdict().items():
+            check_array = _array_or_nan if name in MAY_BE_NAN else array
+            checked[name] = check_array(f"schedule {name}", value, shape_of_field[name])
+        self.gains = Gains(**checked)
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
         if not isinstance(claim, str) or claim not in STRENGTH:

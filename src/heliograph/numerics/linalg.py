@@ -18,13 +18,13 @@ PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, gi
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
 # How far a component that others determine may be from what they say: OFF_SUPPORT deviations and OFF_VALUE of its size.
 OFF_SUPPORT, OFF_VALUE = 1e-6, 1e-9
-KNOWN = 16  # roundings of its size: a deviation of no more says that a component is known
+KNOWN = 16  # a component whose deviation is at most so many roundings of its size is known
 
 
 def symmetric(a: jax.Array) -> jax.Array:
-    """Return a symmetric matrix from what is symmetric but for rounding: its upper triangle, mirrored.
+    """Return a matrix that is symmetric up to rounding as an exactly symmetric one, by mirroring its upper triangle.
 
-    Native code does not compute the lower one.
+    Native code then does not compute the lower triangle.
     """
     return lax.select(np.triu(np.ones(a.shape, bool)), a, lax.transpose(a, (1, 0)))
 
@@ -41,12 +41,12 @@ def symmetrize(a: Float[jax.Array, "... n n"]) -> Float[jax.Array, "... n n"]:
 
 
 def outer(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a b' as a matrix product, in which a known zero stays one."""
+    """Return a b' as a matrix product, in which an entry known to be zero stays known to be zero."""
     return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
 def scale(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a_i b_i as matrix products of one number each, in which a known zero stays one."""
+    """Return a_i b_i as matrix products of one number each, in which an entry known to be zero stays known."""
     return lax.dot_general(a, b, (((), ()), ((0,), (0,))))
 
 
@@ -82,9 +82,9 @@ def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) ->
 def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return lower L (n, n) with A = L L' of a positive semidefinite A, and the reciprocals (n,) of its diagonal.
 
-    A column of L is the first column of what is left of A, times the reciprocal root of its pivot, or 0 for a zero
-    column. A pivot is judged relative to the component's own diagonal entry, so that units do not decide what is
-    singular. More than WRITTEN columns are computed in a loop, so that the program stays short.
+    Column j of L is the first column of the Schur complement A - sum_{k < j} L_k L_k', times the reciprocal root of its
+    pivot, or 0 for a zero column. A pivot is judged relative to the component's own diagonal entry, so that units do
+    not decide what is singular. More than WRITTEN columns are computed in a loop, so that the program stays short.
     """
     n, remainder, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
     if not 0 < n <= WRITTEN:
@@ -95,7 +95,7 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
         column = remainder[:, 0] * scales[j]
         columns.append(jnp.concatenate([jnp.zeros(j, a.dtype), column]))
-        # What is left is the Schur complement of the pivot.
+        # The Schur complement of the pivot.
         remainder = remainder[1:, 1:] - outer(column[1:], column[1:])
     return jnp.stack(columns, axis=1), jnp.stack(scales)
 
@@ -105,10 +105,10 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     n, whole = len(a), diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Subtract column j of the factor from what is left of the matrix, and put it and its scale in their places.
+        """Compute column j of the factor and its scale, and subtract L_j L_j' from the remaining matrix.
 
-        `whole`: the matrix's diagonal, by which a pivot is judged. A scale is the reciprocal root of a pivot. `growth`:
-        the largest ratio so far of an entry of `whole` to its pivot.
+        `whole` is the matrix's diagonal, by which a pivot is judged. A scale is the reciprocal root of a pivot.
+        `growth` is the largest ratio so far of an entry of `whole` to its pivot.
         """
         remainder, lower, scales, growth = carry
         scale = compute_pivot_reciprocal_root(remainder[j, j], whole[j], growth)
@@ -126,9 +126,10 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: jax.Array) -> jax.Array:
     """Return 1 / sqrt(pivot); it is 0 for a pivot that is zero up to rounding, and NaN for a negative one.
 
-    `whole`: the diagonal entry of the matrix of which the pivot is left. `growth`: the largest ratio so far of a
-    diagonal entry to its pivot. Dividing by such a pivot multiplies rounding errors by this ratio, so a pivot may be so
-    far below zero by rounding. For a zero pivot the root is taken of infinity, which makes its derivative 0.
+    `whole` is the matrix's diagonal entry from which the pivot was computed, by subtracting squares. `growth` is the
+    largest ratio so far of a diagonal entry to its pivot: dividing by such a pivot multiplies rounding errors by this
+    ratio, so that rounding may make a later pivot negative by as much. For a zero pivot the root is taken of infinity,
+    which makes its derivative 0.
     """
     is_zero_or_more = pivot >= -negative_tolerance(pivot, growth) * whole
     if_not_positive = jnp.where(is_zero_or_more, jnp.inf, jnp.nan)
@@ -137,7 +138,7 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
-    """Return the share of its diagonal entry by which a pivot below zero is rounding of a singular matrix."""
+    """Return the share of its diagonal entry that a negative pivot may have by rounding, in a singular matrix."""
     eps = float(np.finfo(like.dtype).eps)
     return jnp.maximum(rounding(NEGATIVE_TOLERANCE, like, 1000), 10 * eps * growth)
 
@@ -157,7 +158,7 @@ def cholesky(a: Float[Array, "n n"]) -> Float[jax.Array, "n n"]:
 def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[jax.Array, "n k"]:
     """Solve A X = B for a positive semidefinite A and B in its range.
 
-    Of a component that those before it determine, X is zero: B' X is B' A^+ B whatever is chosen there. An indefinite A
+    A row of A that depends on those above it has the row 0 in X: B' X = B' A^+ B whatever that row is. An indefinite A
     gives NaN.
 
     Shapes: (n, n), (n, k) -> (n, k).
@@ -182,14 +183,14 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
 
 @jax.jit
 def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the numerators B_i - sum_{j < i} L_ij Y_j of L Y = B (n, k): each row of Y is taken off those below it.
+    """Return the numerators B_i - sum_{j < i} L_ij Y_j of the solution Y of L Y = B (n, k), by forward substitution.
 
     Y_i is numerator i times `scales`, the reciprocals of L's diagonal (n,). Above WRITTEN rows it is a loop.
     """
     n, remainder, numerators = len(b), b, list[jax.Array]()
 
     def take_off(j: jax.Array, rows: jax.Array) -> jax.Array:
-        """Take row j of Y, which is `rows[j] * scales[j]`, times its entries of L, off the rows below it."""
+        """Subtract L_ij Y_j from each row i below row j, with Y_j = `rows[j] * scales[j]`."""
         is_below = (np.arange(n) > j)[:, None]
         return jnp.where(is_below, rows - outer(lower[:, j], rows[j] * scales[j]), rows)
 
@@ -204,9 +205,10 @@ def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
     """Return x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
-    A component that those before it determine, or that is known to its rounding, counts 1, what is expected of it in
-    the limit, where x says what they say, and is infinite where it does not; `size` (n,) is what x is a difference of,
-    for its rounding.
+    Each component of x adds its squared difference from what the components before it predict, over the variance of
+    that. If the components before it determine it, or it is known up to rounding, this is 0 / 0: it adds 1, the mean of
+    any other component's square, if it agrees with the prediction, and infinity if not. `size` (n,) is the size of the
+    numbers whose difference x is, which decides the rounding.
     """
     return jnp.sum(squared_distance_terms(a, x, size, KNOWN)[0])
 
@@ -221,7 +223,8 @@ def squared_distance_terms(
     numbers whose difference x is.
     """
     variance = diagonal(a)
-    agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)  # see squared_distance
+    # Up to this a determined component agrees: shares of its deviation and of the size of the subtracted numbers.
+    agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)
     lower, scales = factor(a)
     unexplained = _substitute(lower, scales, x[:, None])[:, 0]  # of each component, by those before it
     determined = scales == 0  # `factor` gives 0 for a pivot that is zero

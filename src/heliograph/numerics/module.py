@@ -78,7 +78,7 @@ class Module(eqx.Module):
     formulas: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Let the formulas of a user's class have all digits."""
+        """Wrap the methods named in `formulas` of a new subclass, so that they compute in double precision."""
         super().__init_subclass__(**options)
         let_compute_in_float64(cls, cls.formulas)
 
@@ -126,7 +126,7 @@ def _write_repr(self: object) -> str:
 
 
 def _html(self: object) -> str:
-    """Return a table of the parts; what has parts itself opens where it stands."""
+    """Return an HTML table of the object's parts; a part that has parts itself can be opened in its cell."""
     return _format_table(self, DEPTH)
 
 
@@ -139,7 +139,7 @@ def _are_equal(self: object, other: object) -> bool:
 
 
 def format_on_one_line(value: object, depth: int) -> str:
-    """Return any value on one line: arrays by their size, what lies deeper than `depth` by its class name."""
+    """Return any value on one line: arrays by their type and shape, containers down to `depth` levels."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return _format_array(value)
 

@@ -30,15 +30,16 @@ def is_traced(*values: object) -> bool:
 
 
 DOUBLE = "with np.asarray, or after jax.config.update('jax_enable_x64', True)"
-MEANT_BITS = 12  # of a number of fewer, such as 2^-30, all are meant, whatever its shortest decimal is
+MEANT_BITS = 12  # a number of at most so many bits, such as 2^-30, was written as it is
 
 
 def find_rounded_to_single(value: object) -> tuple[float, float] | None:
-    """Return the first number of an array that was rounded to single precision, as it was meant and as it is.
+    """Return the first number of an array that was rounded to single precision: the number as meant, and as it is.
 
-    Known by its value, in double precision too: it is a number of single precision of many bits, and the shortest
-    decimal that single precision takes for it, which a user will have written, is another double. None if none is. A
-    number of up to MEANT_BITS bits (0.5, 2^-30) is taken as meant.
+    It is found by its value, so that it may stand in an array of double precision now. Single precision holds it
+    exactly, it has more than MEANT_BITS bits, and the shortest decimal that rounds to it in single precision, probably
+    what the user wrote, is another number in double precision: 0.1 has become 0.10000000149. Numbers of fewer bits
+    (0.5, 2^-30) are taken as meant. Returns None if there is none.
     """
     numbers: np.ndarray = np.asarray(value)
     if numbers.dtype.kind != "f":
@@ -46,7 +47,7 @@ def find_rounded_to_single(value: object) -> tuple[float, float] | None:
     finite = numbers[np.isfinite(numbers)].astype(float)
     with np.errstate(over="ignore", under="ignore"):
         as_single = finite.astype(np.float32)
-    as_written = as_single.astype(str).astype(float)  # the shortest decimal that single precision takes for it
+    as_written = as_single.astype(str).astype(float)  # the shortest decimal that rounds to it in single precision
     # A number has more than MEANT_BITS bits if its mantissa, times 2 to that power, is no whole number.
     mantissa, _ = np.frexp(finite)
     has_many_bits = mantissa * 2.0**MEANT_BITS != np.floor(mantissa * 2.0**MEANT_BITS)
@@ -195,9 +196,9 @@ def equal_to_rounding(a: Any, b: Any) -> bool:
 
 
 def within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
-    """Return whether probabilities `own`, each off by up to `room`, are within a radius of the believed ones.
+    """Return whether probabilities `own`, each uncertain by +- `room`, lie within +- `radius` of those `believed`.
 
-    It is False if that is not known, for traced numbers, or for another shape.
+    It is False for traced numbers, which cannot be compared, and for arrays of different shapes.
     """
     if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
         return False

@@ -36,8 +36,12 @@ def write_short_programs(short: bool = True) -> Iterator[None]:
 
 
 def evaluate_at_points(function: Callable[[jax.Array], jax.Array], points: jax.Array) -> jax.Array:
-    """Return f of each point (points, n), as rows (points, p): side by side, or one after another in a loop."""
-    values: jax.Array = jax.lax.map(function, points) if _short.get() else jax.vmap(function)(points)
+    """Return f of each point (points, n), as rows (points, p).
+
+    Within `write_short_programs`, f is traced once and called in a loop, which is a shorter program. Otherwise all
+    points are evaluated at once (`vmap`), which is faster.
+    """
+    values: jax.Array = jax.lax.map(function, points) if writes_short_programs() else jax.vmap(function)(points)
     return values
 
 
@@ -70,5 +74,5 @@ def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
 
 
 def precision_in_use() -> type[np.floating[Any]]:
-    """Return the precision that numbers are rounded to, unless that of their arrays is less."""
+    """Return the precision whose rounding tolerances count; arrays of lower precision are rounded to their own."""
     return _precision.get()

@@ -1,9 +1,10 @@
-"""Smoothing of a long recording in chunks of rows side by side: a filter forgets how it began and how it will end.
+"""Smoothing of a long recording in chunks of rows side by side, where smoothed states forget data far before and after.
 
-A chunk is filtered from the state with which it begins (`heliograph.filters.chunks`) over its own rows and as many
-behind them as are forgotten, and passed through backwards from the filtered state there. Of the state between two
-chunks, that by which one of them was entered backwards and the one with which the later one was left have to agree;
-else the earlier one is smoothed again from the latter. What a step leaves for the way back stays in the lanes.
+A chunk is filtered from the state with which it begins (`heliograph.filters.chunks`), over its own rows and a number of
+rows after them. The backward pass begins there with the filtered law; when it reaches the chunk's own rows, it has
+forgotten that start. The smoothed law of the state between two chunks is then computed twice: as that after the earlier
+chunk, and as that before the later one. If the two differ, the earlier chunk is smoothed again from the latter.
+Smoother steps stay in the SIMD lane of their chunk.
 """
 
 from collections.abc import Callable
@@ -74,18 +75,18 @@ def smooth_chunk(
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
         state: the filter's state at the chunk's beginning.
-        rows: measurements and inputs of its own rows and of those behind them.
+        rows: measurements and inputs of its own rows and of those after them.
         first: number of its first row.
-        end: number of the row before which the pass back begins; rows from it on are not used.
-        later: the smoothed law with which the pass back begins, if it `is_given`; else it is the filter's there.
+        end: number of the row before which the backward pass begins; rows from it on are not used.
+        later: the smoothed law with which the backward pass begins, if `is_given`; else the filtered law is taken.
         is_given: whether `later` is used.
     """
     own = recursion.own
-    state_after, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
-    last_state, steps_behind = scan_chunk(recursion, state_after, take(rows, slice(own, None)), first + own, end)
+    state_at_end, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
+    last_state, steps_after = scan_chunk(recursion, state_at_end, take(rows, slice(own, None)), first + own, end)
 
     def pass_back(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, None]:
-        """Return the law before a row from that behind it; the same from row `end` on."""
+        """Return the smoothed law before a row from that after it; rows from `end` on leave it as it is."""
         step, k = item
         return select_state(k < end, step.back(law), law), None
 
@@ -97,23 +98,28 @@ def smooth_chunk(
 
     k = first + jnp.arange(len(rows[0]))
     law = select_state(is_given, later, gaussian_of(last_state))
-    entered, _ = jax.lax.scan(pass_back, law, (steps_behind, k[own:]), reverse=True)
-    left, estimate = jax.lax.scan(pass_back_and_estimate, entered, (steps, k[:own]), reverse=True)
+    law_after, _ = jax.lax.scan(pass_back, law, (steps_after, k[own:]), reverse=True)
+    law_before, estimate = jax.lax.scan(pass_back_and_estimate, law_after, (steps, k[:own]), reverse=True)
     return SmoothedChunk(
-        end=state_after, entered=entered, left=left, estimate=estimate, nis=steps.nis, received=steps.received
+        end=state_at_end,
+        law_after=law_after,
+        law_before=law_before,
+        estimate=estimate,
+        nis=steps.nis,
+        received=steps.received,
     )
 
 
-SmoothChunks = Callable[..., SmoothedChunk | None]  # of states, which chunks, and the laws behind them, if given
+# Arguments: first states of chunks, which chunks, and the smoothed laws after them (the filtered ones if left out).
+SmoothChunks = Callable[..., SmoothedChunk | None]
 
 
 def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
-    """Smooth all chunks side by side, and again those that a neighbour contradicts; None without native code.
+    """Smooth all chunks side by side, then again those whose ends differ from their neighbours'; None without code.
 
-    A chunk has `own` rows, of which it smooths the estimates, and a window of these and the `ahead` rows behind them.
-    It filters its window and passes back from the window's end, where it begins with the filtered law instead of the
-    smoothed one. Over the `ahead` rows that is forgotten, so it enters its own rows with the law that all later data
-    give.
+    A chunk smooths its `own` rows by a window of these and the `ahead` rows after them. It filters its window and
+    passes back from the window's end, beginning with the filtered law instead of the smoothed one. Over the `ahead`
+    rows that start is forgotten, so it enters its own rows with the law that all later data give.
     """
     total, (own, ahead) = len(rows[0]), begun.lengths
     windows = take_windows(rows, begun.first, own + ahead)
@@ -122,9 +128,8 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         """Filter the chunks `which` from their first states, then smooth them; None without native code.
 
-        A window has the `own` rows of a chunk and rows after them, and ends before the row `window_ends`. The pass back
-        begins at the end of the window. If `later` is given, it begins at the end of the chunk's own rows, where
-        `later` is the smoothed law. `recursion` steps the filter, and `begun.first` is each chunk's first row.
+        The backward pass begins at the end of each chunk's window, which is before the row `window_ends`. If `later` is
+        given, the smoothed law after each chunk's own rows, it begins there.
         """
         first = begun.first[which]
         is_given = np.full(len(first), later is not None)
@@ -137,18 +142,18 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:
-        """Smooth all chunks as if they were settled."""
+        """Smooth all chunks by their means alone, with the covariances and gains of `settled`."""
         return smooth_settled_chunks(recursion, settled, begun, windows)
 
-    # Means alone are computed of chunks in which covariances stand still: that takes a window in which everything
-    # arrived, and which does not reach beyond the last row.
+    # Only means are computed in chunks where covariances have settled: their window must be complete, and must not
+    # reach beyond the last row.
     is_complete = begun.complete.are_complete(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & is_complete)
     results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
     if results is None:
         return None
-    # Repaired in place: from the first chunk on, those that began in another state than that in which the one before
-    # them ends; then from the last one back, those that a later chunk contradicts.
+    # Results are repaired in place. From the first chunk on: each chunk that began in another state than that in which
+    # the chunk before it ends. Then from the last one back: each chunk whose smoothed law at its end is wrong.
     rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
     _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
     parts = results.estimate, results.nis, results.received  # (chunks, own, ...) each
@@ -159,19 +164,20 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: SmoothedChunk) -> None:
     """Smooth each chunk again whose smoothed law at its end is not that at the beginning of the next chunk.
 
-    `results` is changed in place. Smoothing passes back: it enters a chunk at its end with the law `entered`, and
-    leaves it at its beginning with the law `left`. Chunks are taken from the last to the first, since a chunk that is
-    smoothed again changes `left`, with which the chunk before it must agree. A chunk is filtered from the state in
-    which the chunk before it ends, and the first chunk from its state in `states`.
+    `results` is changed in place. The joint of two chunks has two smoothed laws of one state: `law_after` of the
+    earlier chunk and `law_before` of the later one. If they differ, the earlier chunk is smoothed again, with the
+    latter law at its end. Chunks are taken from the last to the first, since this changes the chunk's own `law_before`,
+    which is compared at the joint before it. A chunk is filtered again from the state in which the chunk before it
+    ends, and the first one from its state in `states`.
     """
-    disagrees_with_next = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
-    for chunk in range(len(disagrees_with_next) - 1, -1, -1):
-        if not disagrees_with_next[chunk]:
+    laws_at_ends, laws_at_starts = take(results.law_after, slice(None, -1)), take(results.law_before, slice(1, None))
+    disagrees_with_next = ~find_equal_states(laws_at_ends, laws_at_starts)
+    for c in range(len(disagrees_with_next) - 1, -1, -1):
+        if not disagrees_with_next[c]:
             continue
-        before, after = slice(chunk - 1, chunk), slice(chunk + 1, chunk + 2)
-        this = slice(chunk, chunk + 1)
-        state = take(results.end, before) if chunk else take(states, this)
-        replace_chunk(results, this, smooth(state, this, take(results.left, after)))
-        if chunk:
-            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, this))
-            disagrees_with_next[chunk - 1] = not agrees
+        previous_chunk, chunk, next_chunk = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
+        state = take(results.end, previous_chunk) if c else take(states, chunk)
+        replace_chunk(results, chunk, smooth(state, chunk, take(results.law_before, next_chunk)))
+        if c:
+            (agrees,) = find_equal_states(take(results.law_after, previous_chunk), take(results.law_before, chunk))
+            disagrees_with_next[c - 1] = not agrees

@@ -25,15 +25,16 @@ from heliograph.smoothing.forward_and_backward_pass import (
 
 BLOCKS = 10  # parts of a run, whose scatter gives the standard error of the NIS
 DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
-EXCESS = 1.05  # ratio to the expected NIS from which on it is told: less does little harm
+EXCESS = 1.05  # ratio to the expected NIS from which on a warning is given: less does little harm
 
 
 @compile_on_call
 def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
-    """Return the sums of s, h, s^2, s h and h^2 over the blocks of rows of one run.
+    """Return five sums of a run by which `nis_test` tests whether the filter is consistent.
 
-    In a block, s is the sum of the squared innovations e' S^-1 e (NIS), and h is the number of components of e that
-    arrived. All sums are 0 for a filter that has no NIS.
+    The run is cut into ten blocks of rows. In a block, s is the sum of the squared innovations e' S^-1 e (NIS), and h
+    the number of components of e that arrived. The result are the sums over the blocks of s, h, s^2, s h and h^2, or
+    zeros for a filter without NIS.
     """
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
@@ -72,7 +73,7 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:
     """Warn if a filter's squared innovations (NIS) are more than EXCESS times what its model predicts, beyond chance.
 
-    `sums` are those that `nis_test` takes. Up to DEVIATIONS standard errors may be chance.
+    `sums` are the results of `nis_sums`. An excess of up to DEVIATIONS standard errors may be chance.
     """
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
@@ -108,7 +109,7 @@ class AbstractSmoothing(Module):
         return jnp.asarray(self.sweep(steps).mean)
 
     def select_reference(self, values: A) -> A:
-        """Select from `values` along time (..., time, n), such as the truth, those that the estimates refer to."""
+        """Return for each estimate the value that it estimates, from `values` of each step (..., time, n)."""
         return values
 
     def check(self, horizon: int) -> None:
@@ -175,7 +176,11 @@ class FixedPoint(AbstractSmoothing):
         return smooth_fixed_point(steps, self.step)
 
     def select_reference(self, values: A) -> A:
-        """Repeat the value at that step, once per estimate of it."""
+        """Return the value at the smoothed step, once for each estimate of it (..., estimates, n).
+
+        `values` (..., time, n) have one row for each step of the run. The estimates are all of the state after step
+        `self.step`, given data up to it, up to the next step, ..., up to the last one.
+        """
         repeated: A = values[..., [self.step] * (values.shape[-2] - self.step), :]
         return repeated
 

@@ -1,6 +1,6 @@
-"""Passes of a smoother: the filter ahead, which collects a smoother step of each row, and back over these steps.
+"""Passes of a smoother: the filter's pass ahead, which collects a smoother step of each row, and passes over these.
 
-Back from the end of a run (fixed interval), back over each lag, or ahead with one state (fixed point).
+These go back from the end of a run (fixed interval), back over each lag, or ahead with one state (fixed point).
 """
 
 from typing import TypeVar
@@ -40,7 +40,7 @@ def smoother_steps(
         first_step: number of the first row's step; 0 by default.
 
     Raises:
-        ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
+        ValueError: arrays of other sizes than the filter's, a wrong step number, a filter that cannot be smoothed.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = check_data(filter, measurements, inputs)
@@ -69,8 +69,8 @@ def filter_rows_with_smoother_steps(
 def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
     """Return the filter planned for these inputs and complete data, with its smoother steps except their means.
 
-    A planned filter has covariances and gains that are computed ahead. If they depend on data, the filter is returned
-    as it is.
+    A planned filter has covariances and gains that were computed in advance. If they depend on data, the filter is
+    returned as it is.
     """
     planned = filter.planned(inputs)
     if planned is filter:
@@ -94,9 +94,9 @@ def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
     """Estimate each step's state given all data, by one backward pass over smoother steps, stacked along time."""
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
-        """Smooth the state between two steps: return its law, to go on with, and the estimate of the plant's state.
+        """Smooth the state between two steps from `later`, the smoothed law of the state after both.
 
-        `later` is the smoothed law after both steps.
+        Returns its law, which the pass goes on with, and the estimate of the plant's state.
         """
         previous, step = pair
         law = step.back(later)
@@ -112,9 +112,9 @@ def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
     """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
-        """Smooth the mean between two steps: return the filter's mean, to go on with, and the plant's part of it.
+        """Smooth the mean of the state between two steps from `later`, the smoothed mean of the state after both.
 
-        `later` is the smoothed mean after both steps.
+        Returns the filter's mean, which the pass goes on with, and the plant's part of it.
         """
         previous, step = pair
         mean = step.mean_back(later)
@@ -127,53 +127,63 @@ def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
 
 
 def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
-    """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
+    """Estimate each step's state given up to `lag` later steps.
+
+    For each step k there is a short backward pass, from the filtered law after step k + lag to that after step k. All
+    these passes run in parallel, `lag` steps of each.
+    """
     last = len(steps.mean) - 1
-    times = jnp.arange(last + 1)
+    k = jnp.arange(last + 1)
 
-    def pass_one_step_back(done: jax.Array, later: Gaussian) -> Gaussian:
-        """Pass, for each step k of `times`, from the state after step k + lag - done to the one before it.
+    def pass_one_step_back(passes: jax.Array, laws: Gaussian) -> Gaussian:
+        """Smooth, in the pass of each step k, the state before step j = k + lag - passes from that after it.
 
-        `done` counts the passes made. Beyond the step `last`, where the data end, nothing is passed and the law stays.
+        `laws` are the smoothed laws after the steps j, and `passes` is the number of steps passed so far. If j is
+        beyond the step `last`, where the data end, the law stays.
         """
-        ahead = times + lag - done
-        before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
-        is_step = ahead <= last
+        j = k + lag - passes
+        laws_before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(j, last)), laws)
+        has_data = j <= last
 
         def choose(passed: jax.Array, unchanged: jax.Array) -> jax.Array:
-            """Return for each step of `times` the entry of `passed` if it has a pass, else of `unchanged`."""
-            return jnp.where(is_step.reshape(-1, *[1] * (passed.ndim - 1)), passed, unchanged)
+            """Return the entries of `passed` in passes whose step j has data, and of `unchanged` in all others."""
+            return jnp.where(has_data.reshape(-1, *[1] * (passed.ndim - 1)), passed, unchanged)
 
-        chosen: Gaussian = jax.tree.map(choose, before, later)
+        chosen: Gaussian = jax.tree.map(choose, laws_before, laws)
         return chosen
 
-    # From the newest step that each one may use, as many steps back as the lag has.
-    newest = take_steps(steps.end, jnp.minimum(times + lag, last))
-    smoothed = jax.lax.fori_loop(0, lag, pass_one_step_back, newest)
+    filtered = take_steps(steps.end, jnp.minimum(k + lag, last))  # laws from which the passes begin
+    smoothed = jax.lax.fori_loop(0, lag, pass_one_step_back, filtered)
     estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(steps, smoothed)
     return estimate
 
 
 def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
-    """Estimate the state after the step number `step`, given the data up to it, and given those up to each later step.
+    """Estimate the state x_j after the step number j = `step`, given the data up to it, and up to each later step.
 
     Returns the stacked estimates, one for each of these ends of the data.
     """
-    start = take_step(steps, step)
+    fixed_step = take_step(steps, step)
 
-    def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
-        """Carry the law of the state after `step` over a later step, and estimate it given the data up to there."""
-        after = later_step.ahead(point)
-        return after, start.estimate_from(start.settle(later_step.find_law_of_earlier(after)))
+    def body(fixed_state: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
+        """Update x_j by the data of a later step, and estimate it given all data up to there.
 
-    _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
-    filtered = start.estimate_from(start.after)
+        `fixed_state` is the regression of x_j on the present state: each later step first carries the regression to
+        the new present state.
+        """
+        updated = later_step.ahead(fixed_state)
+        law = later_step.find_law_of_earlier(updated)
+        # Attitudes in `law` are rotation vectors from the filtered mean after step j.
+        return updated, fixed_step.estimate_from(fixed_step.settle(law))
+
+    _, later = jax.lax.scan(body, fixed_step.start(), take_steps(steps, slice(step + 1, None)))
+    filtered = fixed_step.estimate_from(fixed_step.after)
     estimates: Estimate = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), filtered, later)
     return estimates
 
 
 def _take_plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
-    """Return the mean of the plant's state for this mean of the filter's."""
+    """Return the mean of the plant's state, projection m + shift, for a mean m of the filter's state."""
     return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
 
 
@@ -189,12 +199,12 @@ def _append_last(rows: T, last: T) -> T:
 
 
 def take_step(steps: T, k: int) -> T:
-    """Take step k of what is stacked along time."""
+    """Return entry k of arrays that are stacked along time."""
     step: T = jax.tree.map(lambda leaf: leaf[k], steps)
     return step
 
 
 def take_steps(steps: T, which: slice | jax.Array) -> T:
-    """Take some steps of what is stacked along time."""
+    """Return some entries of arrays that are stacked along time."""
     chosen: T = jax.tree.map(lambda leaf: leaf[which], steps)
     return chosen

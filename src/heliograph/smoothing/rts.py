@@ -29,7 +29,7 @@ class Smoothed:
 
     Args:
         means: (steps, n).
-        covariances: what is claimed of their errors (steps, n, n).
+        covariances: claimed covariances of their errors (steps, n, n).
         claim: what the covariances are: "exact", "upper", "nominal" or "none".
         modes: probabilities of the modes given all rows (steps, M); None of a filter that weighs none.
     """
@@ -47,8 +47,8 @@ def rts_smoother(
 ) -> Smoothed:
     """Rauch-Tung-Striebel smoother: estimates of every state given all rows, by a pass back over those of a filter.
 
-    The estimates of `filter.run(z, u)` given the later rows too, of many rows in chunks side by side as there. It warns
-    where the innovations say that the filter is not consistent. Of a whole network:
+    The estimates are those of `filter.run(z, u)`, given the later rows too; many rows are smoothed in chunks side by
+    side. It warns if the innovations show that the filter is not consistent. A whole network is smoothed by
     `hg.run(..., smooth=hg.smoothing.FixedInterval())`.
 
     Args:
@@ -142,5 +142,5 @@ def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
 
 @compile_on_call
 def _smoothed_covariances(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    """Return the smoothed estimates for z = 0, of which the covariances are those of all data."""
+    """Return the smoothed estimates for measurements of zero; their covariances hold for any data."""
     return smoothing.sweep(data_free_smoother_steps(filter, u))

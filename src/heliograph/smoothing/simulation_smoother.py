@@ -64,18 +64,24 @@ def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> 
 
 
 def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
-    """Draw one path (steps, n) back from the last step."""
+    """Draw one path (steps, n) of the plant's states given all data, from the last step back.
+
+    The last state is drawn from its filtered law, each earlier one from its law given the state drawn after it.
+    """
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Draw the filter's state between two steps, given the drawn state `later` after both steps.
+        """Draw the filter's state between two steps, given the drawn state `later` = x+ after both steps.
 
-        Return it to go on with, and the plant's part of it.
+        The regression of x on x+ is x = m + J (x+ - m+) + noise, with the filtered mean m and the predicted mean m+.
+        Return x, which the pass goes on with, and the plant's part of it.
         """
         previous, step, key = pair
-        # The law of the state given the next state. Means of attitudes are settled on their group.
-        state_before, manifold = step.before.left, step.manifold
-        mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
-        x = manifold.settle(state_before.mean, _draw_gaussian(state_before._replace(mean=mean), key))
+        regression, manifold = step.before, step.manifold
+        filtered_mean, predicted_mean = regression.left.mean, regression.ahead
+        # An attitude x+ is replaced by the rotation vector that leads to it from m+, since the regression is linear.
+        # Its result is a rotation vector from m, by which `settle` rotates m.
+        mean = regression.mean_given(manifold.unsettle(predicted_mean, later))
+        x = manifold.settle(filtered_mean, _draw_gaussian(regression.left._replace(mean=mean), key))
         return x, _take_plant_state(previous, x)
 
     last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
@@ -92,6 +98,9 @@ def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
 
 
 def _take_plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
-    """Return the plant's state x of the filter's, angles between -pi and pi."""
+    """Return the plant's state (n,), projection y + shift, for the filter's state y = `x`; angles within -pi and pi.
+
+    Without a projection the filter's state is the plant's; `shift` is a mean that the filter subtracts.
+    """
     x = x if step.projection is None else step.projection @ x
     return wrap_angles(x if step.shift is None else x + step.shift, step.angles)

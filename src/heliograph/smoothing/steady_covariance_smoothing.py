@@ -1,7 +1,8 @@
 """Smoothing of chunks of complete rows in which covariances are steady: only means are computed, ahead and back.
 
-The pass back over the rows of a settled filter is a recursion as its pass ahead is: of the smoothed law, with the parts
-of a smoother step that depend on data as its rows. Its covariance settles too, some rows before the end.
+A filter has settled if its covariances and gains no longer change. Its backward pass is a recursion too, from the
+smoothed law after a row to that before it; its rows are the parts of smoother steps that depend on data. Some rows
+before the end, the covariance of the smoothed law settles as well.
 """
 
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ class SmootherStepRecursion(Recursion):
 
     Args:
         filter: the filter.
-        own: number of rows of a chunk, without those behind it that it is smoothed by.
+        own: number of rows of a chunk, without the rows after it whose data it is smoothed by.
     """
 
     filter: Any
@@ -48,44 +49,56 @@ class SmootherStepRecursion(Recursion):
 
 
 class SmoothedChunk(NamedTuple):
-    """Results of a chunk: the filter's state behind it, and what is smoothed of each row.
+    """Results of a chunk of rows.
 
-    The pass back entered it by one smoothed law, of the row behind it, and left it by another, of its first row.
+    end: the filter's state after its last row. law_after: smoothed law of the state after its last row, with which the
+    backward pass entered the chunk. law_before: smoothed law of the state before its first row, with which the backward
+    pass left the chunk. estimate: smoothed estimate of each row (rows, ...). nis: squared innovation e' S^-1 e of each
+    row, and `received` its number of components (rows,).
     """
 
     end: PyTree
-    entered: Gaussian
-    left: Gaussian
+    law_after: Gaussian
+    law_before: Gaussian
     estimate: Estimate
     nis: Array
     received: Array
 
 
 class BackwardRecursion(Recursion):
-    """The smoothed law passed back over rows (parts of smoother steps that vary, nothing), with an estimate of each."""
+    """Backward pass of the smoothed law over rows, with an estimate of each row.
+
+    A row is a pair: the leaves of its smoother step that depend on data, and an empty array in place of inputs.
+    `settled` is the filter's settled state, whose output is a smoother step.
+    """
 
     settled: SettledState
 
     def step(self, law: Gaussian, row: tuple[list[Array], Array], k: Array) -> tuple[Gaussian, Estimate]:
-        """Smooth the state before a row from the law behind it, of which the row's estimate is."""
-        step = self.settled.fill_row(row[0])
+        """Return the smoothed law of the state before a row, and the row's smoothed estimate.
+
+        `law` is the smoothed law of the state after the row, which gives the row's estimate. All leaves of the smoother
+        step that do not depend on data are those of the settled one.
+        """
+        varying_leaves, _ = row
+        step = self.settled.fill_row(varying_leaves)
         return step.back(law), step.estimate_from(law)
 
 
 def smooth_settled_chunks(
     recursion: SmootherStepRecursion, settled: SettledState, begun: ChunkStarts, windows: PyTree
 ) -> SmoothedChunk | None:
-    """Smooth chunks as if the filter's covariance stood still in all of them; None where that is not possible.
+    """Smooth chunks as if the filter's covariances had settled in all of them; None where that is not possible.
 
-    It is not where the smoothed law's covariance does not come to stand still, or without native code.
+    It is not possible if the covariance of the smoothed law does not settle, or without native code.
 
     Args:
         recursion: the filter over rows.
-        settled: the state at which its covariance stands still, and its smoother step there.
+        settled: the filter's settled state, and its smoother step there.
         begun: the states with which the chunks begin.
-        windows: the rows of each chunk and those behind it, (chunks, rows, ...).
+        windows: the rows of each chunk and those after it, (chunks, rows, ...).
     """
-    # The smoothed law that stands still, by repeating the settled smoother step.
+    # The smoothed law with a settled covariance, found by repeating the settled smoother step.
     back = BackwardRecursion(settled)
     leaves = zip(jax.tree.leaves(settled.outputs), settled.varies, strict=True)
     varying = [np.asarray(leaf)[None] for leaf, varies in leaves if varies]
@@ -97,11 +110,11 @@ def smooth_settled_chunks(
     choice = choose_code(_smooth_settled, arguments, differs_by_run=differs_by_chunk)
     if choice.code is None:
         return None
-    end, entered, left, estimates, nis = choice.results()
+    end, means_after, means_before, estimates, nis = choice.results()
     return SmoothedChunk(
         end=settled.repeat_with_means(end),
-        entered=smoothed.repeat_with_means(entered),
-        left=smoothed.repeat_with_means(left),
+        law_after=smoothed.repeat_with_means(means_after),
+        law_before=smoothed.repeat_with_means(means_before),
         estimate=smoothed.fill_rows(estimates),
         nis=nis,
         received=np.full(nis.shape, settled.outputs.received),
@@ -116,32 +129,33 @@ def _smooth_settled(
     rows: PyTree,
     first: Array,
 ) -> tuple[PyTree, ...]:
-    """Smooth one chunk in which covariances stand still: filter its means ahead, then pass them back.
+    """Smooth one chunk in which covariances have settled: filter its means ahead, then pass them back.
 
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
-        back: the pass back over settled smoother steps.
-        smoothed: the smoothed law at which its covariance stands still.
-        means: the filter's means at the chunk's beginning, one array for each Gaussian of its state.
-        rows: of the chunk and of those behind it.
+        back: the backward pass over settled smoother steps.
+        smoothed: the smoothed law with a settled covariance.
+        means: the filter's means before the first row, one array for each Gaussian of its state.
+        rows: of the chunk and of the rows after it.
         first: number of its first row.
 
     Returns:
-        The filter's means at the end of its own rows, the means of the smoothed laws by which it is entered and left,
-        the leaves of its estimates that vary (own, ...), and the squared innovations (own,).
+        The filter's means after the chunk's own rows, the smoothed means of the states after and before these rows, the
+        leaves of its estimates that depend on data (own, ...), and the squared innovations (own,).
     """
     own, settled, end = recursion.own, back.settled, first + len(rows[0])
-    means_after, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
-    rows_behind = take(rows, slice(own, None))
-    last, steps_behind = scan_settled_rows(recursion, settled, means_after, rows_behind, first + own, end)
+    # Steps are the leaves of smoother steps that depend on data, of the own rows and of those after them.
+    means_at_end, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
+    rows_after = take(rows, slice(own, None))
+    last_means, steps_after = scan_settled_rows(recursion, settled, means_at_end, rows_after, first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Return the smoothed means before a row from those behind it, and what varies of its estimate."""
+        """Return the smoothed means before a row from those after it, and the estimate's leaves that depend on data."""
         law, estimate = step_settled(back, smoothed.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
         return means_of(law), smoothed.select_varying(estimate)
 
-    law = [gaussian_of(with_means(settled.state, last)).mean]
-    entered, _ = jax.lax.scan(pass_back, law, steps_behind, reverse=True)
-    left, estimates = jax.lax.scan(pass_back, entered, steps, reverse=True)
+    filtered_mean = [gaussian_of(with_means(settled.state, last_means)).mean]
+    smoothed_after, _ = jax.lax.scan(pass_back, filtered_mean, steps_after, reverse=True)
+    smoothed_before, estimates = jax.lax.scan(pass_back, smoothed_after, steps, reverse=True)
     nis = settled.fill_row(steps).nis
-    return means_after, entered, left, estimates, jnp.broadcast_to(nis, (own,))
+    return means_at_end, smoothed_after, smoothed_before, estimates, jnp.broadcast_to(nis, (own,))

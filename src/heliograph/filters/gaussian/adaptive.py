@@ -41,13 +41,13 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 ITERATIONS = 5
-PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: as much as six noises of the filter's own variance say
+PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: the weight of six noises of the model's variance
 
 
 class AdaptiveBelief(NamedTuple):
-    """The state (n,) given the data, and of each noise variance the inverse gamma law: R = b / a (m,).
+    """Law of the state, and an inverse gamma law of each noise variance, used as R = b / a (m,).
 
-    Shapes: shape a, scale b (m,).
+    `shape` is a and `scale` is b, (m,) each.
     """
 
     gaussian: Gaussian
@@ -58,12 +58,14 @@ class AdaptiveBelief(NamedTuple):
 class AdaptiveFilter(AbstractWrapper):
     """Gaussian or robust filter whose noise variances are learned. Built by `adaptive_filter`.
 
-    Of each component that arrived, with a_0, b_0 of the filter's own variance r = b_0 / a_0:
+    The variance R of each component's noise has an inverse gamma law of shape a and scale b, used as R = b / a. Its
+    prior a_0, b_0 has the variance of the filter's model, b_0 / a_0. For a component that arrived,
 
         a' = rho a + (1 - rho) a_0,  b' = rho b + (1 - rho) b_0,  a = a' + 1/2,
         R = b / a and b = b' + w E / 2,  E = (z - t+)^2 + V+, five times, from the same prior,
 
-    w its weight (1 in a plain filter). A component that did not arrive leaves its law as it is.
+    with the noiseless measurement t, its mean t+ and variance V+ after an update with R, and the component's weight w
+    (1 in a filter that weighs nothing). A component that did not arrive leaves its law unchanged.
 
     Args:
         base: the filter whose noise variances are learned.
@@ -80,7 +82,7 @@ class AdaptiveFilter(AbstractWrapper):
     memory: Float[jax.Array | np.ndarray, ""]
 
     def within(self, state: AdaptiveBelief) -> Gaussian:
-        """Return the belief of the plant's state."""
+        """Return the Gaussian of the plant's state, without the laws of the noise variances."""
         return state.gaussian
 
     @compile_on_call
@@ -95,21 +97,21 @@ class AdaptiveFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
-        """Return the state as the filter does; what is known of the variances stays until something arrives."""
+        """Predict the plant's state as the base filter does; the laws of the noise variances stay until data arrive."""
         return AdaptiveBelief(self.base.predict(state.gaussian, u, k), state.shape, state.scale)
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
         """Correct the state and the law of the noise variances with what arrived of z (m,), NaN for what did not."""
-        # Moments of what arrives without its noise.
+        # Moments of the measurement without its noise.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))
         predicted = predict_behind_channel(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = wrap_near(jnp.asarray(z), predicted.signal, angles)
-        # How a robust base weighs outliers: by its rule, else by the Gaussian branches of the noise's law. Another base
-        # weighs nothing.
+        # How outliers are weighed: a robust base filter has a rule, or the Gaussian branches of the noise's law. Any
+        # other base filter weighs nothing.
         rule = base.rule if isinstance(base, RobustFilter) else None
         law = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
@@ -123,7 +125,7 @@ class AdaptiveFilter(AbstractWrapper):
             rule=rule,
             law=law,
         )
-        # The innovation that a Gaussian filter with the variances learned before reports.
+        # The reported innovation is Gaussian, with the noise variances learned before z.
         value, covariance, present = z - predicted.signal - noise.center, learned.covariance, ~jnp.isnan(z)
         both = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(predicted.signal))
@@ -131,7 +133,7 @@ class AdaptiveFilter(AbstractWrapper):
         return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
-        """Return the noise variances of what arrives, b / a, of one state or of several stacked."""
+        """Return the noise variances of the received components, b / a, of one state or of several stacked ones."""
         variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
         return variances
 
@@ -151,8 +153,8 @@ class AdaptiveFilter(AbstractWrapper):
 class VariationalUpdate(NamedTuple):
     """Result of one update: the state, a and b of the variances' law, predicted covariance of z, weights of components.
 
-    The covariance is by the variances known before: by those learned from a value itself no value would be far from
-    what was expected.
+    The covariance uses the noise variances before this update: a variance that was learned from a value would make
+    every value look plausible.
     """
 
     state: Gaussian
@@ -165,8 +167,8 @@ class VariationalUpdate(NamedTuple):
 class WeighedResiduals(NamedTuple):
     """Residuals of the received components with their weights, (m,) each.
 
-    residual: z less its expectation and the noise's mean; weight: with which it is used; reported: weight to report;
-    received: whether it arrived, and was not left out.
+    `residual` is z less its expected value and the noise's mean; `weight` divides the noise's variance in the update;
+    `reported` is the weight to report; `received` says whether the component arrived and has a weight above 0.
     """
 
     residual: jax.Array
@@ -185,15 +187,23 @@ def _weigh_residuals(
     center: jax.Array,
     variance: jax.Array,
 ) -> WeighedResiduals:
-    """Return the innovations e (m,) weighed by the noise's law, by a rule, or not at all, in this order.
+    """Weigh the innovations: by the branches of the noise's law if given, else by a rule if given, else all by 1.
 
-    `noise`: variances of the noise; `scaled_law`: its branches with these variances; `center`: its mean; `variance`:
-    its nominal variances, in which precisions are counted. Others as of `_variational_update`.
+    Args:
+        predicted: prediction of z without its noise.
+        e: innovations z - E z (m,), 0 where nothing arrived.
+        arrived: which components arrived (m,).
+        noise: present estimates of the noise's variances (m,).
+        rule: how a robust filter weighs outliers, or None.
+        scaled_law: Gaussian branches of the noise's law, scaled to the variances `noise`, or None.
+        center: mean of the noise (m,).
+        variance: variances (m,) of the noise in the model; the weight of branches is precision times these.
     """
-    # Branches: their expected precision is the weight, and their mean by it is taken off.
     if scaled_law is not None:
-        weight, shift = expected_branch_precision(predicted, e + center, variance, scaled_law)
-        residual = jnp.where(arrived, e + center - shift, 0.0)
+        # w = E[variance / r_j] over the branches j, of variance r_j and mean m_j. `branch_mean` is the mean of the m_j,
+        # weighted by precision; the residual is about it instead of about `center`.
+        weight, branch_mean = expected_branch_precision(predicted, e + center, variance, scaled_law)
+        residual = jnp.where(arrived, e + center - branch_mean, 0.0)
         return WeighedResiduals(residual=residual, weight=weight, reported=weight, received=arrived)
     if rule is not None:
         weight, reported = rule.iterate(predicted, _make_independent_noise(noise), e, arrived)
@@ -215,9 +225,9 @@ def _variational_update(
 ) -> VariationalUpdate:
     """Return the state x and the law of the noise variances R given z: x given R, then R given x, `ITERATIONS` times.
 
-    R_i is inverse gamma of shape a_i and scale b_i, used as R = b / a. Both are forgotten towards the prior, a grows by
-    1/2 for each value that arrived, and b by E[(z - t)^2] / 2 times its weight, t what would arrive without noise. The
-    state is corrected with the variances before the last b.
+    R_i is inverse gamma of shape a_i and scale b_i, used as R = b / a. First a and b are forgotten towards the prior.
+    Then a grows by 1/2 for each value that arrived, and b by w E[(z - t)^2] / 2, with the weight w of the value and the
+    noiseless measurement t. The state is corrected with the variances before the last b.
 
     Args:
         predicted: prediction of z without its noise.
@@ -226,33 +236,33 @@ def _variational_update(
         z: what arrived (m,), NaN where nothing did.
         center: mean of the noise (m,).
         variance: nominal variance of the noise (m,).
-        memory: share of a and b that is kept a step.
-        rule: how a robust filter weighs outliers; None for none, or with `law`.
-        law: the Gaussian branches of the noise, for the score update instead; None for none.
+        memory: share of a and b that a step keeps.
+        rule: weights of a robust filter; None if it has none, or uses `law`.
+        law: Gaussian branches of the noise, for a robust filter that updates by the score; else None.
     """
     arrived = ~jnp.isnan(z)
     # Forget towards the prior, and count the new value.
     prior_weight = PRIOR_SHAPE * (1 - memory)
     shape, scale = memory * shape_before + prior_weight, memory * scale_before + prior_weight * variance
-    after_shape = shape + 0.5
-    # Variational Bayes: an update with R = b / a, then b from what is known of the noise's square.
+    next_shape = shape + 0.5
+    # Variational Bayes: correct x with R = b / a, then b by the expected square of the noise given that x.
     e = jnp.where(arrived, z - predicted.signal - center, 0.0)
     noise = scale / shape
     for _ in range(ITERATIONS):
         scaled_law = None if law is None else _scale_branches(law, noise / variance)
         weighed = _weigh_residuals(predicted, e, arrived, noise, rule, scaled_law, center, variance)
-        used = divide_noise_by_weights(_make_independent_noise(noise), weighed.weight)
-        squared = expected_squared_residuals(predicted, used, weighed.residual, weighed.received)
-        noise = jnp.where(weighed.received, (scale + weighed.weight * squared / 2) / after_shape, noise)
+        weighted_noise = divide_noise_by_weights(_make_independent_noise(noise), weighed.weight)
+        squared = expected_squared_residuals(predicted, weighted_noise, weighed.residual, weighed.received)
+        noise = jnp.where(weighed.received, (scale + weighed.weight * squared / 2) / next_shape, noise)
     # The state with the variances before the last b.
     if scaled_law is not None:
         x = update_by_score(predicted, z, scaled_law).state
     else:
-        x = joint_update(predicted, e, weighed.received, used)
+        x = joint_update(predicted, e, weighed.received, weighted_noise)
     return VariationalUpdate(
         state=x,
-        shape=jnp.where(weighed.received, after_shape, shape_before),
-        scale=jnp.where(weighed.received, noise * after_shape, scale_before),
+        shape=jnp.where(weighed.received, next_shape, shape_before),
+        scale=jnp.where(weighed.received, noise * next_shape, scale_before),
         covariance=predicted.columns.covariance + jnp.diag(scale / shape),
         weight=jnp.where(arrived, weighed.reported, jnp.nan),
     )
@@ -272,16 +282,16 @@ def _scale_branches(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
     """Return the filter with the noise variances of its sensor learned on line.
 
-    At each step a share 1 - `memory` of what was learned is forgotten, and replaced by the filter's own variance. A
-    component that does not arrive forgets nothing. The process noise is taken as true: a Q that is too small makes the
-    learned R too large, so learn Q first, with `fit`.
+    At each step a share 1 - `memory` of the learned law is forgotten, and replaced by the variance of the filter's
+    model. A component that does not arrive forgets nothing. The process noise is taken as true: a Q that is too small
+    makes the learned R too large, so learn Q first, with `fit`.
 
     Claim: "nominal".
 
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
-        memory: share of what was learned that a step leaves, over 0 and at most 1 (never forget); a variance is known
-            from some 1 / (1 - memory) values (default 0.98).
+        memory: share of the learned law that a step keeps, above 0 and at most 1 (never forget); so some
+            1 / (1 - memory) values decide a variance (default 0.98).
 
     Raises:
         ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].
@@ -304,7 +314,10 @@ def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
     """Return the sensor's noise behind the filter's channel, over time if sensor or channel varies."""
 
     def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
-        """Return the sensor's noise in the received numbers at one step, by its `channel`'s second moments."""
+        """Return the sensor's noise in the received numbers at one step, by its `channel`'s second moments.
+
+        The last hop's noise is in the channel's moments already, so none is given apart.
+        """
         return describe_outlier_noise(sensed=sensor.noise, late=None, plain=channel, independent=True)
 
     noise: ReceivedNoise | OverTime = at_each_step(describe, filter.sensor, filter.channel)

@@ -41,10 +41,11 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     A linear plant or sensor needs no transform: its moments are exact.
 
-    `channel` is the filter's model; the world may have another. Its innovation covariance is M Cov(y) M' plus the
-    spread of the random gain under the nominal law; its likelihood is Gaussian with it, whatever the update bounds.
+    `channel` has the second moments of the filter's model of z = G y + n; the world may differ. With M = E G, the
+    innovation's covariance is M Cov(y) M' + Cov((G - M) y + n) by the nominal law, and the likelihood is Gaussian with
+    it. `rule` says how the error covariance is bounded if the law of G is uncertain.
 
-    `linear`: plant and sensor are, no gain is random and nothing is an angle, so that nothing but the mean depends on
+    `linear`: plant and sensor are linear, no gain is random and nothing is an angle, so that only the mean depends on
     data. `observed_angles`: which components of z are angles; z is then read within half a turn of its expectation.
     """
 
@@ -56,9 +57,9 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @property
     def attitude(self) -> Angles:
-        """Return the places of the plant's attitudes, which it turns."""
-        places: Angles = first(self.plant).manifold.rotations
-        return places
+        """Indices of the plant's attitudes: a correction rotates them instead of adding."""
+        indices: Angles = first(self.plant).manifold.rotations
+        return indices
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of its plant, and those that its channel delivers."""
@@ -75,7 +76,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z.
 
-        Angles in z are turned by whole turns to near what is expected of them.
+        Full turns are added to angles in z, so that they are within half a turn of their expected values.
 
         Args:
             z: measurements of a run, or of several.
@@ -108,44 +109,60 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the measurement z, with moments of h(x) about the prediction.
-
-        `unknown` is the part of the signal that decides gain and covariance. Where all is linear, the signal's mean is
-        left out, so that they depend on no data. `settle` turns corrected attitudes back to their group.
-        """
+        """Correct with the measurement z, with moments of the signal y = h(x) + v about the prediction."""
         channel, signal = at(self.channel, k), self.predict_signal(state, k)
-        unknown = signal.about_mean() if self.linear else signal
-        after, innovation = correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
+        # Gain and covariance: behind a known gain they do not depend on E y, which is data. So it is set to 0 there.
+        moments_for_gain = signal.about_mean() if self.linear else signal
+        after, innovation = correct_signal(
+            signal=signal,
+            channel=channel,
+            rule=self.rule,
+            z=jnp.asarray(z),
+            angles=self.observed_angles,
+            moments_for_gain=moments_for_gain,
+        )
+        # Attitudes: the corrected mean is a rotation vector from the predicted attitude, which is rotated by it.
         return settle(at(self.plant, k).manifold, state.mean, after), innovation
 
     @property
     def is_linear(self) -> bool:
-        """True where the gains depend on no data."""
+        """True if gains and covariances do not depend on data: all is linear, and no gain of the channel is random."""
         return self.linear
 
     @property
     def has_known_gain(self) -> bool:
-        """Whether no gain is random and all is linear, so that no moment before data matters."""
-        return self.linear
+        """True if no gain of the channel is random, so that no covariance needs E[x x'] (before any data)."""
+        return self.linear  # which says it, and more: plant and sensor are linear too
 
     @property
     def law_at_start(self) -> HasInitialMoments:
-        """The filter itself, which may start from another law of the first state than its plant."""
+        """Where the law of the first state stands: here, since the filter may start from another one than its plant."""
         return self
 
     def trace_log_likelihood(
         self, plain: Callable[..., jax.Array], z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
     ) -> jax.Array:
-        """Return plain(self, z, u), the log-likelihood; of the Kalman filter with derivatives by its covariances."""
+        """Return the log-likelihood of rows inside a traced function, for derivatives by free parameters.
+
+        Args:
+            plain: computes it by the filter's own steps, plain(self, z, u). JAX differentiates these.
+            z: measurements, NaN for what did not arrive.
+            u: inputs.
+
+        A linear filter (Kalman's) computes the same value with a derivative that goes by covariances instead of their
+        factors, which is faster.
+        """
         if not self.linear or stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor):
             return plain(self, z, u)
-        from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
+        from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # imported only where it is used
 
         return trace_log_likelihood(plain, self, z, u)
 
     def for_single_precision(self) -> AbstractFilter:
-        """Return the filter about an origin that moves."""
+        """Return the filter of small deviations from an origin that moves with the estimate.
 
+        Far from zero, single precision would round a state by more than its deviation; deviations keep their digits.
+        """
         return make_moving_origin_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -159,20 +176,30 @@ def correct_signal(
     rule: AbstractUpdate,
     z: jax.Array,
     angles: Angles = (),
-    unknown: Signal | None = None,
+    moments_for_gain: Signal | None = None,
 ) -> tuple[Gaussian, Innovation]:
-    """Condition a signal's prior on the components of z that arrived; without any, it stays as it is.
+    """Condition the state on z = G y + n, where the signal y = E y + slopes xi + v comes from x = m + L xi.
 
-    `unknown`: what of the signal decides gain and covariance, where that is less than all. The innovation has the
-    covariance and the density of the nominal law, whatever the rule bounds.
+    Args:
+        signal: moments of y, and the prior of x.
+        channel: second moments of G and n.
+        rule: how the error covariance is bounded if the law of G is uncertain.
+        z: measurement (m,), NaN where a component did not arrive. If none arrived, the prior is returned.
+        angles: which components of z are angles.
+        moments_for_gain: moments of y that gain and covariance use, by default `signal`.
+
+    Returns:
+        The posterior of x, and the innovation with the covariance and density of the nominal law of G, its center.
     """
-    unknown = signal if unknown is None else unknown
-    expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
-    # By the nominal law: the best update of a known one.
-    slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, make_received_noise(unknown, channel)
-    nominal, innovation = condition_on_measurement(unknown.prior, slopes, noise, z, expected, angles)
+    moments_for_gain = signal if moments_for_gain is None else moments_for_gain
+    expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)  # E z = M E y + E n
+    # The Kalman update by the nominal law: z = E z + M slopes xi + noise.
+    slopes = jnp.asarray(channel.mean_gain) @ moments_for_gain.slopes
+    noise = make_received_noise(moments_for_gain, channel)
+    nominal, innovation = condition_on_measurement(moments_for_gain.prior, slopes, noise, z, expected, angles)
+    # The rule returns `nominal` if the law is known, else an update that minimises a bound.
     received = ArrivedInnovation(jnp.asarray(innovation.value), ~jnp.isnan(z))
-    return rule.condition(unknown, channel, received, nominal), innovation
+    return rule.condition(moments_for_gain, channel, received, nominal), innovation
 
 
 def describe_channel_moments(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:

@@ -1,4 +1,4 @@
-"""Gaussian filters about an origin that moves with the estimate: a mean of a high and a low part, for few digits."""
+"""Gaussian filters of deviations from an origin that moves with the estimate, for single precision."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,12 +26,12 @@ from heliograph.random_affine.noise import AbstractNoise
 
 
 class PlantAboutCenter(AbstractPlant):
-    """A plant of x - center before a step and x - level after it: e -> f(center + e, u) - level, with its noise.
+    """A plant of deviations: e = x - center before a step becomes f(center + e, u) - level after it, plus its noise.
 
     Args:
-        model: the plant.
+        model: the plant, x+ = f(x, u) + w.
         center: origin before the step (n,).
-        level: origin after it (n,).
+        level: origin after it (n,), near f(center, u).
         unit: eps of the precision.
     """
 
@@ -60,7 +60,7 @@ class PlantAboutCenter(AbstractPlant):
 
 
 class SensorAboutCenter(AbstractSensor):
-    """A sensor of x - center, which says y - level: e -> h(center + e) - level, with its noise.
+    """A sensor of deviations: e = x - center gives the signal h(center + e) - level, plus its noise.
 
     Args:
         model: the sensor.
@@ -84,20 +84,20 @@ class SensorAboutCenter(AbstractSensor):
 def _evaluate_about(
     function: Callable[[jax.Array], jax.Array], e: jax.Array, center: Array, level: Array, unit: float
 ) -> jax.Array:
-    """Return f(center + e) - level, with the digits that rounding would take; its derivative is that of f.
+    """Return f(center + e) - level for a small e, without the rounding error of the large numbers f and level.
 
-    `unit`: eps of the precision.
+    The derivative by e is that of f. `unit` is eps of the precision.
     """
 
     @jax.custom_jvp
     def evaluate(e: jax.Array) -> jax.Array:
-        """Evaluate f in two parts, high and low."""
+        """Evaluate f(center + e) as a rounded number `high` plus its rounding error `low`, and subtract level."""
         value = compensate(function, unit)(split_sum(jnp.asarray(center), e))
         return jnp.asarray((value.high - level) + value.low)
 
     @evaluate.defjvp
     def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Differentiate f itself."""
+        """Differentiate f(center + e) by e, as f is written: rounding errors have no derivative."""
         return evaluate(*primals), jax.jvp(lambda e: function(center + e), primals, tangents)[1]
 
     value: jax.Array = evaluate(e)
@@ -105,15 +105,15 @@ def _evaluate_about(
 
 
 class CentredFilter(AbstractWrapper):
-    """Gaussian or robust filter that holds its state relative to an origin, which moves with the estimate.
+    """Gaussian or robust filter of small deviations e from an origin c, which moves with the estimate: x = c + e.
 
-    The plant about a center c is e -> f(c + e) - c', of an origin c' after the step, the sensor e -> h(c + e) - y, and
-    what is received z - M y: what the filter within sees is as large as its deviations, however far the center is.
-    Both are evaluated with what rounding takes (`numerics/compensated_arithmetic.py`); of
-    linear ones F e + (F c - c') is that. After each half of a step the mean c + e is c again as it is rounded, and e
-    what is left.
+    The base filter runs on deviations. Its plant is e -> f(c + e) - c', with an origin c' after the step. Its sensor is
+    e -> h(c + e) - y with y = h(c), and it receives z - M y, with the mean gain M. So its numbers are as small as its
+    deviations, however far away c is, and single precision keeps their digits. f and h are evaluated with their
+    rounding errors (`numerics/compensated_arithmetic.py`); of a linear plant, F e + (F c - c') is that. After each
+    prediction and each correction c becomes the rounded mean, and the mean of e its rounding error.
 
-    A gain that is random acts on the whole signal: behind one y is 0.
+    A random gain multiplies the whole signal, of which nothing may be subtracted: then y = 0.
 
     Args:
         base: the filter.
@@ -129,41 +129,41 @@ class CentredFilter(AbstractWrapper):
 
     @property
     def attitude(self) -> Angles:
-        """Return that there are none."""
+        """No attitudes: plants that have some are not treated about an origin."""
         return ()
 
     @in_float64
     def init(self) -> SplitMeanGaussian:
-        """Return the prior about its mean as single precision has it."""
+        """Return the prior: the origin `high` is the mean rounded to single precision, and the rest is a deviation."""
         return center_known(self.base.init())
 
     @predicts
     def predict(self, state: SplitMeanGaussian, u: ArrayLike = (), k: Step = 0) -> SplitMeanGaussian:
-        """Predict about the origin, which becomes what the center moves to.
+        """Predict the deviations e = x - c; the next origin is c' = f(c, u), rounded.
 
-        The state is a center (`high`) and a Gaussian of small deviations about it. `compensate` evaluates a function
-        with the rest that rounding takes (`low`); `unit`: eps of the precision.
+        The state is c (`high`) and the Gaussian of e. `compensate` evaluates a function as a rounded number (`high`)
+        plus its rounding error (`low`). `unit` is eps of the precision.
         """
         plant, u = at(self.base.plant, k), jnp.asarray(u)
         center, x = jnp.asarray(state.high), state.about_center
         unit = unit_of(center)
         if isinstance(plant, LinearPlant):
-            # F (c + e) = (F c, in two parts) + F e.
-            center_after = compensate(lambda c: plant.transition_matrix(u) @ c, unit)(Compensated(center))
-            after = _start_at_zero(self.base).predict(x, u, k)
-            return center_gaussian(center_after.high, after._replace(mean=after.mean + center_after.low))
-        # The plant about the center, evaluated with what rounding takes.
-        center_after = compensate(lambda c: plant.transition(c, u), unit)(Compensated(center, x.mean))
-        plant_about_center = _center_plant(plant, center, center_after.high, unit)
+            # F (c + e) - c' = F e + (F c - c'), where F c - c' is the rounding error `low` of F c.
+            next_center = compensate(lambda c: plant.transition_matrix(u) @ c, unit)(Compensated(center))
+            prediction = _start_at_zero(self.base).predict(x, u, k)
+            return center_gaussian(next_center.high, prediction._replace(mean=prediction.mean + next_center.low))
+        # The plant of deviations, e -> f(c + e, u) - c' + w; c' is f at the mean c + E e, rounded.
+        next_center = compensate(lambda c: plant.transition(c, u), unit)(Compensated(center, x.mean))
+        plant_about_center = _center_plant(plant, center, next_center.high, unit)
         base = eqx.tree_at(lambda f: f.plant, _start_at_zero(self.base), plant_about_center)
-        return center_gaussian(center_after.high, base.predict(x, u, k))
+        return center_gaussian(next_center.high, base.predict(x, u, k))
 
     @corrects
     def correct(self, state: SplitMeanGaussian, z: ArrayLike, k: Step = 0) -> tuple[SplitMeanGaussian, Innovation]:
-        """Correct about the origin: subtract the signal of the center from z, and correct the small deviations from it.
+        """Correct the deviations e = x - c with z - M h(c): M is the mean gain, and h(c) the origin's signal.
 
-        `compensate` evaluates the signal in two parts, `high` and the rest that rounding takes, `low`; `unit`: eps of
-        the precision.
+        `compensate` evaluates h(c) as a rounded number (`high`) plus its rounding error (`low`). The next origin is the
+        rounded mean.
         """
         sensor, channel, center = at(self.base.sensor, k), at(self.base.channel, k), jnp.asarray(state.high)
         unit, z = unit_of(center), jnp.asarray(z)
@@ -173,15 +173,20 @@ class CentredFilter(AbstractWrapper):
             signal = Compensated(jnp.zeros_like(signal.high), jnp.zeros_like(signal.high))
         z = z - channel.mean_gain @ signal.high
         if isinstance(sensor, LinearSensor) and self.known_gain:
+            # H (c + e) = H c + H e: the base filter's own sensor measures e, once all of H c is subtracted.
             z = z - channel.mean_gain @ signal.low
         else:
+            # Else the sensor of deviations, e -> h(c + e) - `signal.high`.
             base = eqx.tree_at(lambda f: f.sensor, base, _center_sensor(sensor, center, signal.high, unit))
         after, innovation = base.correct(state.about_center, z, k)
         return center_gaussian(center, after), innovation
 
     @estimates
     def estimate(self, state: SplitMeanGaussian) -> Estimate:
-        """Return the mean as it is rounded, angles between -pi and pi, and the covariance."""
+        """Return the rounded mean, with angles between -pi and pi, and the covariance.
+
+        The rounding error of the mean (`state.low`) is left out: the precision in use cannot hold the sum.
+        """
         mean = wrap_angles(jnp.asarray(state.high), first(self.base.plant).angles)
         return Estimate(mean, state.about_center.covariance, self.claim)
 
@@ -191,13 +196,13 @@ class CentredFilter(AbstractWrapper):
 
 
 def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFilter:
-    """Return a filter about an origin that moves with the estimate.
+    """Return the filter of deviations from an origin that moves with the estimate.
 
-    States far from zero then keep the digits of small changes. A filter whose plant has attitudes, or several modes of
-    motion, is returned as it is. `known_gain` is True if no gain of the channel is random or uncertain.
+    States far from zero then keep the digits of small changes. A filter whose plant has several modes of motion has no
+    single origin, and attitudes cannot be subtracted: such filters are returned as they are.
 
     Args:
-        filter: one that uses its fields plant, sensor and channel alone.
+        filter: a filter that uses no models but its fields plant, sensor and channel.
     """
     base: Any = filter
     if not isinstance(first(base.plant), AbstractPlant) or first(base.plant).attitude:
@@ -213,9 +218,10 @@ def _start_at_zero(base: Any) -> Any:
 
 
 def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
-    """Return the plant of deviations from a center, whose state starts at zero.
+    """Return the plant of deviations e = x - center, e -> f(center + e, u) - level + w, whose state starts at zero.
 
-    `level` is the origin after the step, which is subtracted from f. `unit` is eps of the precision.
+    `level` (n,) is the origin after the step. `unit` is eps of the precision. `deviation`, a law by which simulations
+    draw the first state, is not needed.
     """
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
@@ -225,9 +231,9 @@ def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float
 
 
 def _center_sensor(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
-    """Return the sensor of deviations from a center.
+    """Return the sensor of deviations e = x - center, e -> h(center + e) - level.
 
-    `level` is the signal h of the center, which is subtracted from h. `unit` is eps of the precision.
+    `level` (p,) is the signal h(center), rounded, or 0. `unit` is eps of the precision.
     """
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,

@@ -1,4 +1,8 @@
-"""A gate that recovers from locking out: it takes up a rival state once that explains what it refused for long."""
+"""A gate that recovers from locking out: it adopts an alternative estimate that uses what it has rejected for long.
+
+In names, the rival is this alternative estimate, the gate refuses a number that it rejects, and it gives in when it
+adopts the rival.
+"""
 
 from typing import Any, NamedTuple
 
@@ -29,22 +33,22 @@ from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Float
 
-CONTRADICTED = float(np.log(1000.0))  # the other numbers speak for the gated state 1000 to 1
-NEVER = -1.0  # step of the last giving in, before the first
+CONTRADICTED = float(np.log(1000.0))  # log likelihood ratio at which the other numbers rule the rival out, 1000 to 1
+NEVER = -1.0  # stands for the step at which the gate last gave in, if it never did
 
 
 class GateAndRival(NamedTuple):
-    """What a gate believes, and the rival state that believes what the gate refuses.
+    """The estimate of a gate, and the rival: an alternative estimate that also uses the numbers which the gate refuses.
 
     Args:
-        believed: the state of the gate.
-        rival: the state that was opened for each number that the gate refuses; `believed` while it refuses none.
-        refused: of each received number, how often in a row it was refused (m,).
-        elapsed: time since the first of these refusals; 0 of a plant without the input dt.
-        evidence: log likelihood of the numbers that are not refused, under the rival over that under the gate.
-        given_in: how often the gate has given in.
-        step: when it last did, -1 before.
-        moved: by how much each state moved then, from the gate's to the rival's (n,).
+        believed: the estimate of the gate.
+        rival: the alternative estimate; equal to `believed` while no number is refused.
+        refused: how often in a row each received number was refused (m,).
+        elapsed: time since the first of these refusals; 0 if the plant has no input dt.
+        evidence: log likelihood of the numbers that are not refused, under the rival minus that under the gate.
+        given_in: how often the gate has adopted the rival.
+        step: step at which it last did, -1 if it never did.
+        moved: change of each state then, from the gate's mean to the rival's (n,).
     """
 
     believed: Gaussian
@@ -58,24 +62,25 @@ class GateAndRival(NamedTuple):
 
 
 class GivingInFilter(AbstractSizedFilter):
-    """A gate that takes up its rival once it has refused a number for long, unless other numbers contradict.
+    """A gate that adopts its rival estimate once it has refused a number for long, unless other numbers contradict.
 
-    From the first refusal on a rival is carried beside the state of the gate: it uses what the gate refuses. Let e be
-    the innovation of a refused number, t its noiseless value and V = Var t under the rival. Of all changes of the state
-    that explain e the most probable one is delta = Cov(x, t) e / V: it says which states, and how far. Where the gate
-    would refuse e under the rival too, the rival's covariance becomes P + n diag(delta^2) / min(c, 1), each of the n
-    states by itself, since how they were tied is as doubtful as where they were. What t is then wider by is at least
-    e^2 / min(c, 1) (the inequality of Cauchy and Schwarz), so that e^2 is at most c variances, and e is used.
+    From the first refusal on, a second estimate, the rival, runs beside that of the gate, and uses what the gate
+    refuses. Let e be the innovation of a refused number, t its noiseless value and V = Var t under the rival. Of all
+    changes of the state that explain e, the most probable one is delta = Cov(x, t) e / V. If the gate would refuse e
+    under the rival too, the rival's covariance becomes P + n diag(delta^2) / min(c, 1). It is diagonal, since the
+    correlations of the n states are as doubtful as their means. By the inequality of Cauchy and Schwarz, Var t grows by
+    at least e^2 / min(c, 1), so that e^2 is at most c variances, and e is used.
 
-    Either the sensor is wrong or the state is. The numbers that are not refused tell: `evidence` sums their log density
-    under the rival less that under the gate, of each at most c / 2 off. If the rival is right, it falls to -log 1000
-    once in 1000 times at most (a ratio of likelihoods is a martingale); if the sensor is wrong, it falls the more the
-    longer the rival follows it. After `after` refusals in a row, or `seconds` of them, the gate gives in unless it has.
+    Either the sensor is wrong or the gate's state is. The numbers that are not refused decide: `evidence` sums their
+    log density under the rival minus that under the gate, at most c / 2 for each. If the rival is right, the sum falls
+    to -log 1000 with a probability of at most 1/1000 (a ratio of likelihoods is a martingale); if the sensor is wrong,
+    the sum falls the further the longer the rival follows it. After `after` refusals in a row, or `seconds` of them,
+    the gate gives in (adopts the rival), unless the sum has fallen so far.
 
     Args:
-        base: the gate.
-        after: number of refusals in a row; None for none.
-        seconds: time of refusals in a row; None for none.
+        base: the filter with the gate.
+        after: number of refusals in a row after which it gives in; None for no such limit.
+        seconds: time of refusals in a row after which it gives in; None for no such limit.
 
     Claim: "nominal".
     Source: Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in
@@ -92,10 +97,9 @@ class GivingInFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> GateAndRival:
-        """Return the belief before any data, with equal states of gate and rival and nothing refused.
+        """Return the state before any data: gate and rival have the same estimate, and no number is refused.
 
-        The rival is the state that explains what the gate refuses. `step` is the step at which the gate last gave in,
-        NEVER (-1) at first.
+        `step`, at which the gate last gave in, is NEVER (-1).
         """
         start, zero = self.base.init(), jnp.zeros(())
         return GateAndRival(
@@ -111,10 +115,10 @@ class GivingInFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: GateAndRival, u: ArrayLike = (), k: Step = 0) -> GateAndRival:
-        """Predict the gate's state and its rival over step k.
+        """Predict the gate's estimate and its rival over step k.
 
-        The rival is the state that explains what the gate refused. `elapsed` is the time since the first of the present
-        refusals in a row, 0 if nothing is refused.
+        `elapsed`, the time since the first of the present refusals in a row, grows by the input dt, and is 0 if no
+        number is refused.
         """
         elapsed = state.elapsed
         if TIME_STEP in self.inputs:
@@ -125,25 +129,25 @@ class GivingInFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: GateAndRival, z: ArrayLike, k: Step = 0) -> tuple[GateAndRival, Innovation]:
-        """Correct the gate's state with z (m,), and the rival with what the gate refuses too; then choose between them.
+        """Correct the gate's estimate with z (m,), and the rival with all of z; then choose between them.
 
-        The gate gives in, and the rival's state is believed from now on, where a number has been refused for long and
-        the numbers that were not refused do not contradict the rival.
+        The gate gives in, which makes the rival's estimate its own, if a number has been refused for long and the
+        numbers that were not refused do not contradict the rival.
         """
-        # The gate's own update, and which numbers it refused: how often in a row.
+        # The gate's own update, and how often in a row it has refused each number.
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
         after, innovation = self.base.correct(state.believed, z, k)
         left_out = arrived & (_get_weights_of_received(innovation) < 0.5)  # a gate's weights are 0 and 1
         refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
         suspect = refused > 0
-        # The rival, its prior widened where it would refuse what the gate does. It begins as the gate's state.
+        # The rival: it begins as the gate's estimate. Its prior is widened if it would refuse what the gate refuses.
         prior = _select_tree(jnp.any(state.refused > 0), state.rival, state.believed)
         opened = self._widen_prior(prior, z, left_out, k)
         rival, rival_innovation = self.base.correct(opened, z, k)
         evidence = state.evidence + self._compare_densities(rival_innovation, innovation, arrived & ~suspect)
-        # Give in after refusals for long enough, unless the other numbers contradict the rival. A rival ends where the
-        # gate gives in, or no number is refused any more: both states are then the chosen one.
+        # Give in after refusals for long enough, unless the other numbers contradict the rival. The rival ends if the
+        # gate gives in, or if no number is refused any more: it then equals the chosen estimate.
         gives_in = self._is_refused_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
         rival_continues = jnp.any(suspect) & ~gives_in
         jump = wrap_near(rival.mean, after.mean, self.angles_used().states) - after.mean
@@ -170,23 +174,26 @@ class GivingInFilter(AbstractSizedFilter):
         if self.after is not None:
             is_long = is_long | jnp.any(refused >= self.after)
         if self.seconds is not None:
-            # One refusal alone, after which nothing came, is an outlier however long ago it was.
+            # A single refusal after which nothing arrived is an outlier, however long ago it was.
             is_long = is_long | (jnp.any(refused > 1) & (elapsed >= self.seconds))
         return is_long
 
     def _widen_prior(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
-        """Return the rival's prior, widened so that the gate's rule lets it use the numbers (m,) that were `left_out`.
+        """Return the rival's prior, with a covariance so large that it can use the numbers that the gate `left_out`.
 
-        It is widened only for numbers that the rule would refuse under this prior too.
+        The prior P becomes P + n diag(sum delta^2) / min(c, 1). The sum is over the numbers (m,) that the gate's rule,
+        e^2 <= c S, refuses under this prior too, and delta is the most probable change of the state that explains e.
+        With H the slopes of the noiseless value t, H delta = e. So t's variance grows by n sum_i H_i^2 delta_i^2 /
+        min(c, 1) >= e^2 / min(c, 1) (Cauchy and Schwarz), and then e^2 <= c S.
         """
         predicted, _ = self.base.predict_received(prior, k)
         noise, rule = at(self.base.noise, k), _get_gate_rule(self.base)
-        # Innovation e, its variance S, and V = Var t of the state alone.
+        # Innovation e, its variance S (`total`), and V = Var t, by the state alone (`of_state`).
         total = predicted.columns.diagonal + jnp.diagonal(jnp.asarray(noise.covariance))
         e = wrap_near(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
         of_state = predicted.slopes**2 @ predicted.prior.variances
         needs_room = left_out & (e**2 > rule.c * total) & (of_state > 0)
-        # delta of each number that is to be used, (n, m); each state by itself.
+        # delta of each number that would be refused, (n, m).
         change = _find_most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
         # P + n diag(delta^2) / min(c, 1), summed over these numbers.
         n = len(self.states)
@@ -194,10 +201,10 @@ class GivingInFilter(AbstractSizedFilter):
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
 
     def _compare_densities(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
-        """Return the summed log density of the numbers that count (m,) under the rival less that under the gate.
+        """Return the summed log density of some numbers under the rival, the alternative estimate, minus the gate's.
 
-        The rival explains what the gate refused. Squares of innovations, in deviations, are clipped at the gate's limit
-        c.
+        `counts` (m,) says which numbers. Squares of innovations, over their variances, are clipped at the gate's limit
+        c, so that no outlier decides alone.
         """
 
         def log_density(innovation: Innovation) -> jax.Array:
@@ -215,14 +222,13 @@ class GivingInFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: GateAndRival) -> Estimate:
-        """Return the mean and covariance of the gate's state."""
+        """Return the mean and covariance of the gate's estimate (`believed`); the rival's is not reported."""
         return self.base.estimate(state.believed)
 
     def remark(self, state: GateAndRival) -> Remark:
-        """Say how often the gate has given in, when it last did, and which states moved how far then.
+        """Say how often the gate has adopted the rival estimate, when it last did, and how far each state moved then.
 
-        The state counts in `given_in` how often, and holds the step of the last time in `step` and in `moved` by how
-        much each state jumped then.
+        These are `given_in`, `step` and `moved` (n,) of the filter's state.
         """
         count = int(state.given_in)
         if not count:
@@ -233,12 +239,14 @@ class GivingInFilter(AbstractSizedFilter):
 
 
 def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
-    """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m).
+    """Return for each received number the most probable change of the state that explains its innovation, (n, m).
 
-    There are n states and m received numbers, with values t without noise. `of_state` (m,) holds V_i, the variance that
-    the state gives to t_i. Where it is 0, t_i does not depend on the state, and the change is 0.
+    t_i = E t_i + H_i (x - m) is number i without its noise, and e (m,) the innovations. Among the changes delta with
+    H_i delta = e_i, a Gaussian x has the highest density at delta = E[x - m | t_i - E t_i = e_i] = Cov(x, t_i) e_i /
+    V_i. `of_state` (m,) is V_i = Var t_i; if it is 0, t_i does not depend on the state, and the change is 0.
     """
     prior = predicted.prior
+    # Cov(x, t) = L diag(d) slopes' of x = m + L xi and t = E t + slopes xi + noise.
     cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
     return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))
 
@@ -260,11 +268,11 @@ def _select_tree(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
 
 
 def build_giving_in_filter(base: RobustFilter, rule: Gate) -> GivingInFilter:
-    """Return the filter with a gate that gives in when its rule says so.
+    """Return the filter whose gate adopts an alternative estimate after the refusals that its rule allows.
 
     Args:
-        base: the gate.
-        rule: its rule.
+        base: the filter with the gate.
+        rule: the gate's rule, with its limits `after` and `seconds`.
 
     Raises:
         ValueError: seconds of a plant without the input dt.

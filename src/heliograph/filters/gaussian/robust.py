@@ -60,9 +60,10 @@ class Huber(AbstractWeightingRule):
 
 
 class InverseMultiquadric(AbstractWeightingRule):
-    """Weight w = 1 / (1 + d^2 / c^2), d the innovation in its deviations: what is far loses all weight.
+    """Weight w = 1 / (1 + d^2 / c^2), d the innovation in its deviations: a value far away loses all weight.
 
-    Its covariance is that of the innovation, so that good values count after an outage, when the state is uncertain.
+    The deviation is that of the whole innovation, so that good values count after an outage, when the state is
+    uncertain.
     """
 
     c: Number
@@ -94,13 +95,17 @@ class WoLF(AbstractWeightingRule):
 
 
 class Gate(AbstractWeightingRule):
-    """Chi-squared gate: w = 1 where d^2 <= c, else 0. It may lock a filter out after an outage, unless it gives in.
+    """Chi-squared gate: w = 1 where d^2 <= c, else 0. It may lock a filter out after an outage.
+
+    Locked out, it rejects right values since its own state is wrong. With `after` or `seconds` it gives in: it accepts
+    what it has rejected for too long.
 
     Args:
         c: limit of the squared deviation d^2 (default 9).
-        after: how many refusals of a number in a row open the state for it; None for none.
-        seconds: for how long, where the plant has the input dt; None for none. Let it be so long that the other sensors
-            tell a wrong sensor from a wrong state (`heliograph.filters.gaussian.recovering_gate`).
+        after: number of rejections in a row after which a number is accepted; None for no such limit.
+        seconds: duration of rejections in a row after which a number is accepted, for a plant with the input dt; None
+            for no such limit. It should be so long that the other sensors tell a wrong sensor from a wrong state
+            (`heliograph.filters.gaussian.recovering_gate`).
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001).
     """
@@ -110,9 +115,9 @@ class Gate(AbstractWeightingRule):
     seconds: float | None = eqx.field(static=True)
 
     def __init__(self, c: "Float[ArrayLike, '']" = 9.0, after: int | None = None, seconds: float | None = None):
-        """Keep the limit c of a squared innovation over its variance, and when the gate gives in.
+        """Keep the limit c of a squared innovation over its variance, and when a rejected number is accepted.
 
-        It gives in `after` that many refusals in a row, or after `seconds` of refusals; if both are None, never.
+        It is after `after` rejections in a row, or after `seconds` of rejections; if both are None, never.
         """
         self.c = scalar("limit of the gate", c, low=TINY)
         self.after = None if after is None else check_count("after, of a gate", after)
@@ -120,18 +125,20 @@ class Gate(AbstractWeightingRule):
 
     @property
     def gives_in(self) -> bool:
-        """Whether it gives in at all."""
+        """True if the gate accepts a number after rejecting it for too long: `after` or `seconds` set a limit."""
         return self.after is not None or self.seconds is not None
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """Return 1 or 0."""
+        """Return 1 where d^2 (`squared`) is at most c, else 0."""
         return jnp.where(squared <= self.c, 1.0, 0.0)
 
 
 class StudentVB(AbstractWeightingRule):
     """Variational Bayes for Student's noise: `iterations` updates from the prior, each with the last one's weights.
 
-    w_i = (nu + 1) / (nu + E_i / r_i), E_i = (z_i - t_i+)^2 + V_ii+. The degrees nu are those of the noise law.
+    w_i = (nu + 1) / (nu + E_i / r_i) with E_i = (z_i - t_i+)^2 + V_ii+, where t is the measurement without its noise,
+    t+ and V+ its mean and covariance after the update, and r_i the noise's variance. nu are the noise's degrees of
+    freedom.
 
     Source: Piche, Sarkka and Hartikainen, Recursive outlier-robust filtering and smoothing for nonlinear systems using
     the multivariate Student-t distribution (2012).
@@ -173,15 +180,15 @@ class StudentVB(AbstractWeightingRule):
 class RobustFilter(AbstractGaussianStateFilter):
     """Mean and covariance, corrected by the score of the noise law or by one update with weighted noise.
 
-    Built by `robust_filter`. The channel is described without the noise that may hold outliers, whose law as it
-    arrives is `noise`: the gain's spread and the relays' noise are never weighed.
+    Built by `robust_filter`. Only the noise that may hold outliers is weighed, whose law as it arrives is `noise`. The
+    channel is described without it; the covariance of the gain and the relays' noise are never weighed.
 
     Args:
         sensor: the sensor, or its steps.
         channel: moments of the channel without the noise that may hold outliers.
         noise: that noise as it arrives.
         rule: weights, or None for the score update.
-        received_angles: circular components of what arrives.
+        received_angles: indices of received components that are angles.
     """
 
     sensor: AnySensor
@@ -198,19 +205,20 @@ class RobustFilter(AbstractGaussianStateFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with what arrived of z, by the rule's weights or by the noise's own law.
 
-        `self.rule` gives the components weights. If it is None, the noise's law is used, a mixture of Gaussian
-        branches, one component after another. It may depend on `sensor_mean`, the mean of the sensor's signal.
+        `self.rule` gives the components weights, for one joint update. If it is None, the noise's law is used: a
+        mixture of Gaussian branches, whose posterior moments are computed one component after another (the score
+        update). The law depends on `sensor_mean`, the mean of the sensor's signal, if the gain is random.
         """
-        before, sensor_mean = self.predict_received(state, k)
-        z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
+        predicted, sensor_mean = self.predict_received(state, k)
+        z = wrap_near(jnp.asarray(z), predicted.signal, self.received_angles)
         noise = at(self.noise, k)
         if self.rule is None:
-            law = noise.find_branches(sensor_mean)
-            after = update_by_score(before, z, law)
-            center, variance = law.mean_and_variance()
-            return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, by_law=True)
-        after = update_with_weights(before, z, noise.center, columns_of(noise.covariance), self.rule)
-        return after.state, _innovation_about_mean(before, z, noise.center, noise.covariance, after)
+            branches = noise.find_branches(sensor_mean)
+            after = update_by_score(predicted, z, branches)
+            center, variance = branches.mean_and_variance()
+            return after.state, _innovation_about_mean(predicted, z, center, jnp.diag(variance), after, by_law=True)
+        after = update_with_weights(predicted, z, noise.center, columns_of(noise.covariance), self.rule)
+        return after.state, _innovation_about_mean(predicted, z, noise.center, noise.covariance, after)
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""
@@ -259,9 +267,15 @@ def _innovation_about_mean(
     after: ScoreUpdate,
     by_law: bool = False,
 ) -> Innovation:
-    """Return the innovation about the noise's mean, with the covariance that the law says.
+    """Return the innovation z - E z, with the covariance Cov t + Cov(noise) of the model.
 
-    Its density is Gaussian, or `by_law` that of the mixture, which the score update has.
+    Args:
+        before: prediction of t, the measurement without the noise that may hold outliers.
+        z: what was received (m,), NaN where a component did not arrive.
+        center: mean of that noise (m,).
+        noise: its covariance (m, m).
+        after: result of the update, with the weights of components.
+        by_law: whether the density is that of the noise's mixture, as the score update found it; else it is Gaussian.
     """
     present = ~jnp.isnan(z)
     expected = before.signal + center

@@ -1,6 +1,7 @@
 """Arithmetic of robust updates: the score of a mixture, component after component, and weights before one update.
 
-x is the state, t what would arrive without the noise that may hold outliers, z = t + v; V = Cov(t).
+x is the state and z = t + v the measurement, with t the measurement without the noise v that may hold outliers, and
+V = Cov(t).
 """
 
 from typing import NamedTuple
@@ -26,9 +27,10 @@ SMALLEST = 1e-200  # weight: below, a component counts as missing
 
 
 class PredictedMeasurement(NamedTuple):
-    """Prediction of the measurement without its noise, t = E t + slopes xi + noise, of a state x = m + L xi.
+    """Prediction of t, the measurement without the noise that may hold outliers.
 
-    Shapes: prior of n states, signal (m,), slopes (m, n), noise (m, columns).
+    With the state x = m + L xi, t = E t + slopes xi + n, where n is all other noise. Shapes: `prior` of n states,
+    `signal` E t (m,), slopes (m, n), `noise` columns of Cov n (m, columns).
     """
 
     prior: Gaussian
@@ -38,12 +40,12 @@ class PredictedMeasurement(NamedTuple):
 
     @property
     def columns(self) -> WeightedColumns:
-        """Columns whose weighted products are Cov t."""
+        """Columns W and weights w of the covariance Cov t = W diag(w) W' = slopes diag(d) slopes' + Cov n (m, m)."""
         return join_columns(WeightedColumns(self.slopes, self.prior.variances), self.noise)
 
 
 class ScoreUpdate(NamedTuple):
-    """State after the update, weight of each component (0: left out, 1: in full), log density of what arrived."""
+    """State after the update, weight of each component (0: not used, 1: used in full), log density of z."""
 
     state: Gaussian
     weight: jax.Array
@@ -53,58 +55,73 @@ class ScoreUpdate(NamedTuple):
 def update_by_score(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches) -> ScoreUpdate:
     """Return exact posterior moments, component after component, for a Gaussian prior and noise of Gaussian branches.
 
-    With s_j = V_ii + r_j (at least `least`), u_j = (e - m_j) / s_j and q_j in proportion to p_j N(e; m_j, s_j), the
-    score g = sum q_j u_j: t_i moves by V_ii g, its variance becomes V_ii (sum q_j r_j / s_j + V_ii Var_q u), a sum of
-    positive terms, and x given t_i stays. The variance grows where the branch is not clear. The weight is
-    sum_j q_j / s_j over its value at e = 0.
+    Component i is z_i = t_i + noise, with the innovation e = z_i - E t_i and V = Var t_i. Its noise has branches j of
+    probability p_j, mean m_j and variance r_j. With s_j = V + r_j, u_j = (e - m_j) / s_j and q_j, the posterior
+    probability of branch j, in proportion to p_j N(e; m_j, s_j):
 
-    Shapes: the law's (m, branches).
+        score g = sum_j q_j u_j,  E[t_i | z_i] = E t_i + V g, Var[t_i | z_i] = V (sum_j q_j r_j / s_j + V Var_q u),
+
+    a sum of positive terms, which grows with Var_q u if z_i does not decide between the branches. The law of x given
+    t_i stays. The weight is sum_j q_j / s_j over its value at e = 0.
+
+    A random gain may lower r_j; it is kept at least at `law.least` - V, so that s_j >= `law.least`. The law's arrays
+    are (m, branches).
+
     Source: Masreliez, Approximate non-Gaussian filtering with linear state and observation relations (1975).
     """
     n, m, present = len(before.prior.mean), len(before.signal), ~jnp.isnan(z)
-    both = append_rows(before.prior, before.signal, before.slopes, triangularise_noise(before.noise))
+    # The joint Gaussian of (x, t): row n + i of its factor is that of t_i.
+    joint = append_rows(before.prior, before.signal, before.slopes, triangularise_noise(before.noise))
     weights, density = [], jnp.zeros_like(z[0])
     for i in range(m):
-        row = both.root[n + i]
-        v = row**2 @ both.variances
-        e = jnp.where(present[i], z[i] - both.mean[n + i], 0.0)
+        row = joint.root[n + i]
+        v = row**2 @ joint.variances  # V
+        e = jnp.where(present[i], z[i] - joint.mean[n + i], 0.0)
         branches = law.log_share[i], law.mean[i], jnp.maximum(law.variance[i], law.least[i] - v)
         score = _compute_score(e, v, *branches)
-        weights.append(
-            jnp.where(present[i], score.weight / _compute_score(jnp.zeros_like(e), v, *branches).weight, jnp.nan)
-        )
+        weight_at_zero = _compute_score(jnp.zeros_like(e), v, *branches).weight
+        weights.append(jnp.where(present[i], score.weight / weight_at_zero, jnp.nan))
         density = density + jnp.where(present[i], score.log_density, 0.0)
-        both = impose_moments_of_combination(both, jnp.where(present[i], row, 0.0), v * score.slope, score.left)
-    return ScoreUpdate(take_leading(both, n), _stack_entries(weights), density)
+        # Give t_i its posterior mean and variance; x follows by its regression on t_i.
+        joint = impose_moments_of_combination(
+            joint, jnp.where(present[i], row, 0.0), shift=v * score.slope, ratio=score.variance_ratio
+        )
+    return ScoreUpdate(take_leading(joint, n), _stack_entries(weights), density)
 
 
 class _Score(NamedTuple):
-    """Score of one component: slope g, share of t's variance that is left, weight sum q_j / s_j, and log density."""
+    """Score of one component z = t + noise, all ().
+
+    `slope` is the score g, by which E[t | z] = E t + V g. `variance_ratio` is Var[t | z] / V, `weight` is
+    sum_j q_j / s_j, and `log_density` that of z.
+    """
 
     slope: jax.Array
-    left: jax.Array
+    variance_ratio: jax.Array
     weight: jax.Array
     log_density: jax.Array
 
 
 def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
-    """Return the score of an innovation e about a t of variance v, with branches (branches,) of the noise.
+    """Return the score of an innovation e = z - E t, for z = t + noise, Var t = v and a noise of Gaussian branches j.
 
-    `log_share`, `mean`, `noise`: log probability, mean and variance of each branch; symbols as of `update_by_score`.
+    `log_share`, `mean` and `noise` (branches,) are log p_j, m_j and r_j: log probability, mean and variance of each.
+    With s_j = v + r_j and u_j = (e - m_j) / s_j, the posterior probability of branch j is q_j, in proportion to
+    p_j N(e; m_j, s_j). Then g = sum_j q_j u_j, and Var[t | z] / v = sum_j q_j r_j / s_j + v Var_q u.
     """
     s = v + noise
-    reach = LARGEST * jnp.sqrt(jnp.max(s))
-    difference = jnp.clip(e, -reach, reach) - mean
+    largest = LARGEST * jnp.sqrt(jnp.max(s))  # so that squares stay finite
+    difference = jnp.clip(e, -largest, largest) - mean
     u = difference / s
-    # q_j in proportion to p_j N(e; m_j, s_j), relative to the largest.
+    # log p_j N(e; m_j, s_j); q_j relative to the largest, so that none overflows.
     logs = log_share - (difference * u + jnp.log(2 * jnp.pi * s)) / 2
     top = jnp.max(logs)
     q = jnp.exp(logs - top)
     total = jnp.sum(q)
     q = q / total
     g = q @ u
-    left = q @ (jnp.maximum(noise, 0.0) / s) + v * (q @ (u - g) ** 2)
-    return _Score(slope=g, left=left, weight=q @ (1 / s), log_density=top + jnp.log(total))
+    variance_ratio = q @ (jnp.maximum(noise, 0.0) / s) + v * (q @ (u - g) ** 2)
+    return _Score(slope=g, variance_ratio=variance_ratio, weight=q @ (1 / s), log_density=top + jnp.log(total))
 
 
 @readable
@@ -112,19 +129,27 @@ class AbstractWeightingRule(Module):
     """Rule that weighs each component of a measurement: its noise r becomes r / w in one joint update."""
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """Return w (m,) from innovations e, e^2 over the innovation variance, and the noise's variance `scale`."""
+        """Return w (m,), by which each component's noise variance is divided: from 1 (used in full) down to 0.
+
+        Args:
+            e: innovations (m,).
+            squared: e_i^2 over the variance of the innovation, with the noise (m,).
+            scale: variance of the noise (m,).
+        """
         raise unwritten(self, "weights")
 
     def iterate(
         self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the weights of the update, and the weights to report, which are equal for a rule of one step.
+        """Return the weights (m,) with which the update divides the noise, and the weights (m,) to report.
 
-        They are functions of the innovations e, of e^2 over its variance (with noise), and of the noise's variance.
+        They are the same here: one evaluation of `weights`. A rule that iterates overrides this; it reports the weights
+        that follow from its last update. `before` is the prediction without the noise, whose covariance is `noise`, and
+        e (m,) are the innovations, of which `present` arrived.
         """
-        scale = noise.diagonal
-        squared = e**2 / (before.columns.diagonal + scale)
-        weights = self.weights(e, squared, scale)
+        noise_variance = noise.diagonal
+        squared = e**2 / (before.columns.diagonal + noise_variance)  # e_i^2 over the innovation's variance
+        weights = self.weights(e, squared, noise_variance)
         return weights, weights
 
 
@@ -153,12 +178,15 @@ def update_with_weights(
 
 
 def divide_noise_by_weights(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
-    """Return r_ij / sqrt(w_i w_j): each row over the root of its weight."""
+    """Return the columns of the covariance r_ij / sqrt(w_i w_j), for columns of r and weights w (m,)."""
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
 
 def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array, noise: WeightedColumns) -> Gaussian:
-    """Return the state after the components that are present, with noise of this covariance besides that of t."""
+    """Return the state conditioned on e = t - E t + noise, of which the components `present` (m,) arrived.
+
+    `noise` has the columns of the noise's covariance, besides the noise that the prediction of t itself has.
+    """
     return condition_on_observation(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
 
 

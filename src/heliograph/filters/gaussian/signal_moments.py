@@ -1,7 +1,8 @@
-"""Moments of the signal that a sensor sends, and conditioning on what of it arrives: slopes in the state, and noise.
+"""Moments of the signal that a sensor sends, and conditioning on the measurement that a channel makes of it.
 
-Notation: the prior is x = m + L xi, xi uncorrelated with variances d; the sensor's signal is y = E y + slopes xi + v, v
-its noise and what of it is not linear in xi; z = G y + n is the measurement behind a channel, M = E[G].
+Notation: the prior is x = m + L xi, with uncorrelated xi of variances d. The sensor's signal is y = E y + slopes xi +
+v, where v is its noise plus the part of h(x) that is not linear in xi. z = G y + n is the measurement behind a channel,
+with M = E[G].
 """
 
 from typing import NamedTuple
@@ -30,11 +31,14 @@ from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
-LOST = 100  # roundings of its variance, which elimination leaves of a combination free of a random gain
+LOST = 100  # eps of its variance: the rounding by elimination of a combination of outputs without a random gain
 
 
 class ArrivedInnovation(NamedTuple):
-    """Innovation z - E z (m,), and which components arrived (m,): an innovation may be NaN though its z arrived."""
+    """Innovation z - E z (m,), and which components of z arrived (m,).
+
+    The flags are needed: an innovation may be NaN, by an E z that is no number, though its z arrived.
+    """
 
     innovation: jax.Array
     present: jax.Array
@@ -43,8 +47,8 @@ class ArrivedInnovation(NamedTuple):
 class Signal(NamedTuple):
     """Moments of the sensor's signal y = E y + slopes xi + v under the prior x = m + L xi.
 
-    Shapes: mean (p,), slopes (p, n), noise (p, columns) of v, second = E[y y'] (p, p), size (p,), the second moments of
-    what y is computed from, of which the rounding stays unknown.
+    `mean` is E y (p,), `slopes` are (p, n), and `noise` has the columns of Cov v (p, columns). `second` is E[y y']
+    (p, p). `size` (p,) bounds E[y_i^2] of the numbers from which y is computed: their rounding is a share of it.
     """
 
     prior: Gaussian
@@ -65,7 +69,7 @@ class Signal(NamedTuple):
         return jnp.asarray((self.prior.root * self.prior.variances) @ self.slopes.T)
 
     def about_mean(self) -> "Signal":
-        """Return the moments of y - E y: all that the update behind a known gain depends on, whatever was estimated."""
+        """Return the moments of y - E y. Gain and covariance behind a known gain depend on these alone, not on data."""
         return self._replace(mean=jnp.zeros_like(self.mean), second=self.covariance)
 
 
@@ -80,45 +84,47 @@ def find_signal_moments(
     """Return the moments of the sensor's signal y = h(x) + v under the prior of x.
 
     Args:
-        plant: whose states may be angles.
+        plant: whose states may be angles or attitudes.
         sensor: h and the law of v.
-        transform: for an h that is not linear.
-        prior: the law of x.
-        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
-        noise: of v, in place of the sensor's.
+        transform: finds the moments of an h that is not linear.
+        prior: the law of x = m + L xi.
+        initial_power: E[x_i^2] before any data (n,): the size of the numbers that are rounded.
+        noise: columns of Cov v, in place of the sensor's; the mean of v is the sensor's.
     """
     law = sensor.noise
+    # h(x) = image.mean + slopes xi + c: `image.explained` is the covariance of slopes xi, and `image.curvature` Cov c.
     if isinstance(sensor, LinearSensor):
         image = linear_image(sensor.matrix, sensor.measure(prior.mean), prior)
     else:
         measure = continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles)
         image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
-    mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
-    second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
+    mean = image.mean + law.mean
+    # The noise of the signal is c + v.
+    signal_noise = join_columns(law.columns if noise is None else noise, image.curvature)
+    second = join_columns(image.explained, signal_noise).covariance + jnp.outer(mean, mean)  # Cov y + E y E y'
     size = bound_signal_power_at_start(sensor, initial_power) if isinstance(sensor, LinearSensor) else diagonal(second)
-    return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=noise, second=second, size=size)
+    return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=signal_noise, second=second, size=size)
 
 
 def bound_signal_power_at_start(sensor: LinearSensor, initial_power: jax.Array) -> jax.Array:
     """Return a bound of E[y_i^2] (p,) at the start, for y = H x + v: (|H| sqrt(E[x_i^2]) + |E v|)^2 + Var v.
 
-    `initial_power` (n,) is E[x_i^2] at the start, since at later steps the moments without data may grow for ever. The
-    noise counts without its outliers, since Student's law of at most two degrees of freedom has no variance.
+    `initial_power` (n,) is E[x_i^2] at the start; at later steps these moments, without data, may grow without limit.
+    The noise counts without its outliers, since Student's law of at most two degrees of freedom has no variance.
     """
     law = sensor.noise
-    bound = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(initial_power) + lax.abs(
-        jnp.asarray(law.mean)
-    )  # of |E y_i|
+    size_of_state_terms = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(initial_power)
+    bound = size_of_state_terms + lax.abs(jnp.asarray(law.mean))
     power: jax.Array = bound**2 + diagonal(law.without_outliers().covariance)
     return power
 
 
 def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns:
-    """Return the noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
+    """Return columns of the noise covariance of z given the state, Cov(M v + (G - M) y + n) plus rounding.
 
-    The noises v and n are made triangular, so that a combination of outputs free of both is known to eps. What the
-    random gain adds, E[(G - M) y y' (G - M)'], is formed as a matrix and eliminated, which leaves a hundred eps in a
-    combination free of it.
+    Moments of the gain G are those of its nominal law. The columns of M v and n are made orthogonal, so that a
+    combination of components without noise is known to eps. What the random gain adds, E[(G - M) y y' (G - M)'], is
+    formed as a matrix and eliminated, which leaves some hundred eps in a combination without a random gain.
     """
     return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
 
@@ -142,17 +148,26 @@ def factor_gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) ->
 
 
 def factor_spread(spread: jax.Array) -> WeightedColumns:
-    """Return factors of a covariance that was formed as a matrix; what is below a hundred eps of it counts as zero."""
+    """Return factors of a covariance that was formed as a matrix; each pivot is at least 100 eps of its variance.
+
+    So large is the rounding of a combination that has no variance.
+    """
     return eliminate(spread, LOST * unit_of(spread))
 
 
 def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
-    """Return Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
+    """Return columns of Cov(z given y) = Cov n + E[(G - M) y y' (G - M)'], for z = G y + n.
+
+    `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of the gain G are those of its nominal law.
+    """
     return join_columns(channel.noise, factor_gain_noise(channel.gain_spread, second, mean))
 
 
 def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:
-    """Condition the prior on what arrived behind the nominal law of the channel."""
+    """Condition the prior of x on the components of z = G y + n that arrived, G by its nominal law.
+
+    `signal` has the moments of y and the prior of x, `channel` those of G and n, and `z` the innovation z - E z.
+    """
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
     return condition_on_observation(signal.prior, slopes, z.innovation, make_received_noise(signal, channel), z.present)
 

@@ -1,7 +1,10 @@
 """Bounds on the covariance behind a channel of uncertain law, as Kalman updates of an inflated prior and noise.
 
-Notation as in `update`: e the prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the
-measurement, M = E[G], H the slopes of y in the state and R the covariance of the rest of y.
+Notation: e is the prior error with covariance P, y = yhat + H e + v the sensor's signal with Cov v = R, z = G y + n the
+measurement, M = E[G] and b = E[n] by the nominal law. The law of (G, n) is only known to lie in a set: D is the shift
+of E[G] from M under a law of the set. For Y = E[(y, 1)(y, 1)'], three maps bound second moments over the set:
+`channel.spread(Y)` that of (G - M) y + n - b, `channel.shift(Y)` that of its mean given y, D y, and `channel.power(Y)`
+that of G y.
 """
 
 from typing import TypeVar
@@ -67,64 +70,80 @@ def keep_where_unchanged(changes: jax.Array, after: T, before: T) -> T:
 
 
 def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalars: Array) -> Gaussian:
-    """Return the state after z by `Polytope`'s bound; scalars b1, b2 (2,), NaN to minimise the trace over them.
+    """Return the state after z with an upper bound of its error covariance, by Young's inequality (`Polytope`).
 
-    (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
-    update makes of the prior (1 + b1) P and, of z, of the noise (1 + b1)^2 [base + (1/b1 + 1/b2) shift +
-    (1 + b2) M R M'] + (1 + b1) ((1 + b1)(1 + b2) - 1) M H P H' M', positive terms; its gain is K / (1 + b1).
+    The error after a gain K is e+ = e - K M (H e + v) - K D y - K u, where u, the deviation of z from its mean given y,
+    is uncorrelated with the rest. Young's inequality, a b' + b a' <= beta a a' + b b' / beta, bounds the products of D
+    y with e (beta_1) and with M (H e + v) (beta_2):
+
+        E[e+ e+'] <= (1 + beta_1) P - K C - C' K' + K Omega K',  C = M H P,
+        Omega = base + (1 / beta_1 + 1 / beta_2) shift + (1 + beta_2) M (H P H' + R) M',
+
+    with base = spread(Y), shift = shift(Y). The gain K = C' Omega^-1 of least bound leaves
+    (1 + beta_1) P - C' Omega^-1 C. A Kalman update gives the same, with a = 1 + beta_1 and b = 1 + beta_2: of the
+    prior a P by the innovation times a, with the noise a^2 Omega - a M H P H' M' (a sum of positive terms below).
+
+    `scalars` (2,) are beta_1 and beta_2, NaN for those of least trace.
     """
     prior, present = signal.prior, z.present
+    # M H, M H P H' M' and M R M'.
     slopes, of_state, of_noise = _find_received_slopes_and_covariances(signal, channel, present)
-    w = augmented_second_moment(signal.second, signal.mean, 1.0)
-    base, shift = channel.spread(w, present), channel.shift(w, present)
-    # The scalars of least trace; C = Cov(x, z).
-    cross = (slopes * prior.variances) @ prior.root.T
+    second = augmented_second_moment(signal.second, signal.mean, 1.0)  # Y
+    base, shift = channel.spread(second, present), channel.shift(second, present)
+    # beta: the scalars that minimise the trace of the bound.
+    cross = (slopes * prior.variances) @ prior.root.T  # C
     trace = jnp.trace(prior.covariance)
-    parts = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, trace
-    beta = find_trace_minimising_scalars(young_fixed_point_map, scalars, parts)
+    terms = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, trace
+    beta = find_trace_minimising_scalars(young_fixed_point_map, scalars, terms)
     a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
-    # The same bound as a Kalman update.
+    # The Kalman update: a^2 Omega - a M H P H' M'.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
-    wide = prior._replace(variances=a * prior.variances)
-    return condition_on_observation(wide, slopes, a * z.innovation, factor_spread(noise), present)[0]
+    inflated_prior = prior._replace(variances=a * prior.variances)
+    return condition_on_observation(inflated_prior, slopes, a * z.innovation, factor_spread(noise), present)[0]
 
 
 def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
-    """Return the state after z by `ZeroMean`: the prior error has mean zero, its correlation with the gain is unknown.
+    """Return the state after z by a bound for prior errors e with E[e yhat'] = 0 (`ZeroMean`).
 
-    z = G y + n; y has mean yhat, covariance Pyy and slopes H in the state, whose covariance is P; M = E G. For each
-    beta > 0 the bound is P, updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C', with
-    C = Cov(x, y): what the received components explain of the state. Omega = power(Pyy) + spread(yhat yhat') +
-    shift(Pyy) / beta, the maps of second moments of (y, 1) that `channel` has.
+    Only y - yhat, of covariance Pyy, is then correlated with e, in an unknown way. For each beta > 0 the bound is P,
+    updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C' with C = Cov(x, y), the variance
+    of the state that the received components explain. Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta.
 
     Args:
         signal: moments of the state and of y, jointly.
-        channel: what is received of y.
+        channel: moments of G and n.
         z: innovation, and which components arrived.
-        scalar: log beta (1,), NaN for the one of least trace.
+        scalar: beta (1,), NaN for the one of least trace.
     """
     prior, present = signal.prior, z.present
     slopes, of_state, _ = _find_received_slopes_and_covariances(signal, channel, present)
-    # E[y y'] = yhat yhat' + Cov y: the gain's correlation is unknown with the error alone.
-    # Each part as a second moment of (y, 1).
+    # E[y y'] = yhat yhat' + Pyy; each term as a second moment of (y, 1), in which the constant 1 counts once.
     mean_part = augmented_second_moment(signal.second - signal.covariance, signal.mean, 1.0)
     covariance_part = augmented_second_moment(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     base = channel.power(covariance_part, present) + channel.spread(mean_part, present)
     shift = channel.shift(covariance_part, present)
-    # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
-    used = mask_received(channel, present)[:, None]
-    signals = join_columns(WeightedColumns(signal.slopes, prior.variances), signal.noise)
-    factors = triangularise_noise(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
-    explained = decorrelate(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
-    share = reciprocal_or_zero(factors.weights)
-    # The best beta, then the update with what is left of Omega as noise.
-    cross = (slopes * prior.variances) @ prior.root.T  # C', of what is received and the state
-    parts = base + unit_variance_where_absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
-    beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
+    # C Pyy^+ C' by columns: with Pyy = N diag(s) N', it is (C N^-T) diag(1 / s) (C N^-T)'. Only components of y that
+    # act on what arrived count.
+    is_received = mask_received(channel, present)[:, None]
+    signal_columns = join_columns(WeightedColumns(signal.slopes, prior.variances), signal.noise)
+    factors = triangularise_noise(signal_columns._replace(matrix=jnp.where(is_received, signal_columns.matrix, 0.0)))
+    explained = decorrelate(factors.matrix, jnp.where(is_received, signal.cross.T, 0.0)).T  # C N^-T
+    explained_weights = reciprocal_or_zero(factors.weights)  # 1 / s
+    # The beta of least trace, then the update with the noise Omega - M H P H' M'.
+    cross = (slopes * prior.variances) @ prior.root.T  # Cov(z, x)
+    terms = (
+        base + unit_variance_where_absent(present),
+        shift,
+        cross @ cross.T,
+        jnp.sum(explained**2 @ explained_weights),
+    )
+    beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, terms)[0]
     noise = factor_spread(base + shift / beta - of_state)
     after, _ = condition_on_observation(prior, slopes, z.innovation, noise, present)
-    wider = from_columns(after.mean, join_columns(after.columns, WeightedColumns(explained, beta * share)))
-    return keep_where_unchanged(jnp.any(present), wider, after)
+    bounded = from_columns(
+        after.mean, join_columns(after.columns, WeightedColumns(explained, beta * explained_weights))
+    )
+    return keep_where_unchanged(jnp.any(present), bounded, after)
 
 
 def _find_received_slopes_and_covariances(

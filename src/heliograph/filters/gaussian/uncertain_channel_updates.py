@@ -1,7 +1,9 @@
 """Measurement updates behind an uncertain channel: the gain that minimises a bound on the error covariance.
 
-Notation inside: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the measurement,
-M = E[G] nominal, D_v = E_v[G] - M the shift under a possible law v.
+Notation inside: e is the prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the
+measurement, M = E[G] by the nominal law, and D_v = E_v[G] - M the shift of the mean gain under another possible law v.
+A "claim" says what a covariance is: exact, an upper bound of the errors' covariance, or nominal (what approximations
+say).
 """
 
 from collections.abc import Callable
@@ -46,19 +48,20 @@ class AbstractUpdate(Module):
         return second_order(channel)
 
     def described(self) -> "AbstractUpdate":
-        """Return the update that corrects once the channel is described.
+        """Return the rule that corrects with an already described channel: this one, unless another corrects alike.
 
-        Updates that differ in the description alone share it, so that filters with one correction share a compiled
-        program.
+        `Interval` differs from `Polytope` only in `describe`, and returns a `Polytope` here. So filters with the same
+        correction share one compiled program.
         """
         return self
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero.
+        """Return the gain K (n, m), and the bound (n, n) of the error covariance after the update.
 
-        A rule of your own gives this; those of the library give `condition`, from which it follows.
+        A rule of your own defines this or `condition`; each follows from the other. The library's rules define
+        `condition`. Columns of K are zero for components that did not arrive.
 
         Args:
             prior: covariance (n, n) of the state before the update, `signal.prior`.
@@ -70,15 +73,13 @@ class AbstractUpdate(Module):
             raise unwritten(self, "correct")
 
         def update(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
-            """Return the mean after an update with this innovation, and the posterior.
-
-            The derivative of the mean by the innovation is the gain. `present` says which components arrived. `signal`
-            and `channel` hold the moments of the signal, and the uncertain moments of the channel.
-            """
+            """Return the mean after an update with this innovation z - E z (m,), and the posterior."""
             z = ArrivedInnovation(innovation, present)
-            after = self.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
+            nominal, _ = condition_on_received(signal, channel, z)  # the Kalman update by the nominal law
+            after = self.condition(signal, channel, z, nominal)
             return jnp.asarray(after.mean), after
 
+        # The mean is linear in the innovation, and its derivative is the gain.
         gain, after = jax.jacfwd(update, has_aux=True)(jnp.zeros(len(present)))
         return gain, jnp.asarray(after.covariance)
 
@@ -88,7 +89,7 @@ class AbstractUpdate(Module):
         Args:
             signal: moments of the sensor's signal.
             channel: what `describe` returned.
-            z: z - E z, and what of it arrived.
+            z: innovation z - E z, and which components of z arrived.
             nominal: the prior conditioned by the nominal law, the best update if that law is known to be true.
         """
         prior = signal.prior
@@ -99,10 +100,12 @@ class AbstractUpdate(Module):
         return keep_where_unchanged(jnp.any(z.present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:
-        """Return the claim of the bound behind a channel of this kind, of a filter for which all else is exact.
+        """Return what the covariance after this update is: "exact", "upper" (a bound) or "nominal" (approximate).
+
+        It is said for a filter in which all else is exact. A rule that does not say more is nominal.
 
         Args:
-            uncertain: whether probabilities of the channel are known up to a radius only.
+            uncertain: whether the channel's probabilities are known only up to a radius; else its law is known.
         """
         return "nominal"
 
@@ -140,15 +143,16 @@ class Polytope(AbstractUpdate):
 
 
 class ZeroMean(AbstractUpdate):
-    """Tighter value under the filter's premise E[e | data] = 0, hence E[e yhat'] = 0; no bound where that is not so.
+    """Tighter value that assumes E[e | data] = 0, hence E[e yhat'] = 0; it is no bound where that is not so.
 
     Then only e_y, not all of y, is correlated with e:
 
     E[e+ e+'] <= P + beta Pxy Pyy^-1 Pyx - K M Pyx - (.)' + K Omega K',
     Omega = power(Pyy) + shift(Pyy) / beta + spread(yhat yhat').
 
-    The premise holds before the first correction alone: behind a law that is off, the estimate is biased given the data
-    from then on. So behind uncertain probabilities the claim is "nominal"; errors of four times it were found.
+    The assumption holds only before the first correction: if the true law is not the nominal one, the estimate is
+    biased given the data from then on. So with uncertain probabilities the claim is "nominal"; errors of four times the
+    value were found.
 
     Args:
         scalar: beta > 0; None, the default, minimises the trace over beta at each step.
@@ -160,7 +164,10 @@ class ZeroMean(AbstractUpdate):
     scalar: np.ndarray
 
     def __init__(self, scalar: float | None = None):
-        """Keep the positive scalar of the bound; NaN for None, which means that the trace is minimised over it."""
+        """Keep beta, the positive scalar of the bound `P + beta Pxy Pyy^-1 Pyx ...`; None, stored as NaN, minimises it.
+
+        None means that each step takes the beta of least trace.
+        """
         self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
@@ -193,7 +200,7 @@ class Interval(AbstractUpdate):
         self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Return moments of the chain's gain in the worst case over the interval of each hop.
+        """Return bounds of the second moments of the chain's gain, from the intervals of each hop's moments.
 
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
@@ -207,7 +214,7 @@ class Interval(AbstractUpdate):
         return combine_hop_ranges(channel, find_greatest_variance)
 
     def described(self) -> AbstractUpdate:
-        """Return Young's bound, as for a polytope."""
+        """Return `Polytope` with these scalars: with the described channel both correct alike."""
         return Polytope(scalars_from_array(self.scalars))
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
@@ -215,7 +222,7 @@ class Interval(AbstractUpdate):
         return condition_by_young_bound(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
-        """Return "upper" where the law is uncertain."""
+        """Return "upper" where the law is uncertain, else "exact"."""
         return "upper" if uncertain else "exact"
 
 

@@ -27,11 +27,10 @@ class Unscented(AbstractTransform):
 
         mean = f(m) + d,  covariance = sum_i e_i e_i' / (2 c) + (beta - alpha^2) d d',  d = sum_i e_i / (2 c),
 
-    which, where alpha is small and the weight of m large and negative, loses no digits but those of f itself, whose
-    rounding is divided by alpha^2. Merwe's points are these;
-    Julier's are those with alpha = 1 and beta = 0, and `Cubature` has kappa = 0 besides. The covariance is positive
-    semidefinite for every f where alpha^2 kappa + beta n >= 0 (by Cauchy and Schwarz, d d' is at most n / c times the
-    sum), and indefinite for some f elsewhere.
+    In this form a small alpha, which makes the weight of m large and negative, costs no digits but those of f itself,
+    whose rounding is divided by alpha^2. These are Merwe's points. Julier's have alpha = 1 and beta = 0, and those of
+    `Cubature` kappa = 0 besides. The covariance is positive semidefinite for every f if alpha^2 kappa + beta n >= 0 (by
+    Cauchy and Schwarz, d d' is at most n / c times the sum), and else indefinite for some f.
 
     Args:
         alpha: spread of the points, above 0.
@@ -74,25 +73,34 @@ class Unscented(AbstractTransform):
             )
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Return the moments of f(x) from its values at the mean and the 2 n points.
+        """Return the moments of f(x) from its values at the mean and the 2 n sigma points.
 
-        With a_j and b_j what is odd and even in xi_j at m +- sqrt(c d_j) L_j, b the mean of all b_j: slopes a_j, and
-        sum_j (b_j - b)(b_j - b)' / c + (alpha^2 kappa / n + beta) d d', d = n b / c, which is a sum of squares.
+        The state is x = m + L xi with Var xi_j = v_j, and the points are m +- h_j L_j with h_j = sqrt(c v_j) and
+        c = alpha^2 (n + kappa). Let f_j+ and f_j- be the values of f there, less f(m); a_j = (f_j+ - f_j-) / 2 is the
+        odd part in xi_j, b_j = (f_j+ + f_j-) / 2 the even one, and b the mean of all b_j. The class's formulas become
+
+            mean = f(m) + s,  s = sum_j b_j / c = n b / c,
+            covariance = sum_j a_j a_j' / c + sum_j (b_j - b)(b_j - b)' / c + (alpha^2 kappa / n + beta) s s',
+
+        a sum of squares, since sum_j b_j b_j' / c = sum_j (b_j - b)(b_j - b)' / c + (c / n) s s'.
         """
         n = x.mean.shape[0]
         self.check(n)
         alpha, beta, kappa = (jnp.asarray(number) for number in (self.alpha, self.beta, self.kappa))
-        scale = alpha**2 * (n + kappa)
-        steps, here = square_root(scale * x.variances), function(x.mean)
-        ahead, behind = (values - here[:, None] for values in evaluate_beside_mean(function, x, steps))
-        # Sums and differences are twice a_j and b_j.
-        even = ahead + behind
-        middle = jnp.sum(even, axis=1) * (1 / n)
-        shift = middle * (n / (2 * scale))
-        weights = jnp.full(n, 1 / (4 * scale))
-        with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
-        curvature = WeightedColumns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), with_shift)
-        return Image(here + shift, WeightedColumns(ahead - behind, weights), 2 * steps, curvature)
+        c = alpha**2 * (n + kappa)
+        steps, value_at_mean = square_root(c * x.variances), function(x.mean)  # h_j and f(m)
+        plus, minus = (values - value_at_mean[:, None] for values in evaluate_beside_mean(function, x, steps))
+        # Columns 2 b_j and 2 a_j, so that their weights are 1 / (4 c); xi_j changes by 2 h_j along 2 a_j.
+        twice_even, twice_odd = plus + minus, plus - minus
+        twice_mean_even = jnp.sum(twice_even, axis=1) * (1 / n)
+        shift = twice_mean_even * (n / (2 * c))  # s
+        weights = jnp.full(n, 1 / (4 * c))
+        curvature = WeightedColumns(
+            matrix=jnp.concatenate([twice_even - twice_mean_even[:, None], shift[:, None]], axis=1),
+            weights=jnp.append(weights, alpha**2 * kappa / n + beta),
+        )
+        explained = WeightedColumns(twice_odd, weights)
+        return Image(value_at_mean + shift, explained, unit=2 * steps, curvature=curvature)
 
 
 @accept_limits
@@ -109,14 +117,14 @@ def unscented_filter(
 ) -> "GaussianFilter":
     """Return the unscented Kalman filter (UKF) on its channel's second moments; points are redrawn after predictions.
 
-    By default the points are those of `cubature_filter`, sqrt(n) deviations from the mean, and so are the means; the
-    covariance has Merwe's beta = 2 besides, by which that of a quadratic function of one Gaussian number is exact, so
-    that a step is never surer of itself than cubature's. Julier's points are alpha = 1, beta = 0.
+    By default the points, sqrt(n) deviations from the mean, are those of `cubature_filter`, and give the same means.
+    Merwe's beta = 2 adds a term to the covariance, which makes it exact for a quadratic function of one Gaussian
+    number, and never smaller than cubature's. Julier's points are alpha = 1, beta = 0.
 
-    Other packages take alpha = 0.001. For quadratic functions of one number alpha changes nothing, as the variance is
-    4 m^2 P + (alpha^2 kappa + beta) P^2. For all others such points make a second derivative at the mean, which says
-    nothing of what lies a deviation away, and divide the difference of values so near each other by alpha^2: of the
-    digits of f, six are lost.
+    Other packages take alpha = 0.001. For a quadratic function of one number alpha changes nothing if kappa = 0: the
+    variance of x^2 is 4 m^2 P + (alpha^2 kappa + beta) P^2. For all other functions such points only find the second
+    derivative at the mean, not the function a deviation away. They divide the difference of nearly equal values by
+    alpha^2, which costs six digits of f.
 
     Args:
         plant: the plant, n states.

@@ -18,7 +18,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 class RecordedBelief(NamedTuple):
-    """The filter's own state, and the covariance of its error given the data up to now, (n, n)."""
+    """State `own` of the linear filter itself, and the covariance of its error given the data up to now, (n, n)."""
 
     own: LinearBelief
     covariance: Float[Array, "n n"]
@@ -27,15 +27,16 @@ class RecordedBelief(NamedTuple):
 class LinearFilterOfRecord(AbstractSizedFilter):
     """A linear filter with its own gains and estimates, and the covariances that its errors have in this recording.
 
-    Behind a random gain G the filter's S counts E[x x'] over all runs. In one run of a plant that wanders x x' is
-    nowhere near that mean, for as long as the plant remembers, so the squares of one recording say nothing of S. Given
-    the data E[x x'] = m m' + P, of which the mean over all runs is the filter's own: with J = I - K E[G] C
+    Behind a random gain G the filter's innovation covariance S uses E[x x'] before any data, a mean over all runs. In
+    one run of a wandering plant x x' stays far from that mean for as long as the plant remembers, so that the squared
+    innovations of one recording do not test S. Given the data E[x x'] = m m' + P; its mean over all runs is the
+    filter's own E[x x']. So here
 
-        S = E[G C (m m' + P) C' G'] - (E[G] C m)(E[G] C m)' + ...     as the filter computes it, from these moments
+        S = E[G C (m m' + P) C' G'] - (E[G] C m)(E[G] C m)' + ...     the filter's formula with E[x x'] = m m' + P
         P+ = P - K H P - P H' K' + K S K',  H = E[G] C
 
-    Squares are compared with S in sum, not one by one: where m m' + P came out small it is more often too small. The
-    posterior is taken for one that the mean and covariance of the linear filter describe: a nominal claim.
+    The sum of squares may be compared with that of S, not each square by itself: a small m m' + P is more often too
+    small. The claim is nominal, since the law of x given the data is not that of a linear filter's mean and covariance.
 
     Args:
         filter: the linear filter, whose state is a `LinearBelief`.
@@ -49,9 +50,9 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> RecordedBelief:
-        """Return the filter's prior."""
+        """Return the filter's prior; before any data, the error covariance given the data is the state's own."""
         own = self.filter.init()
-        return RecordedBelief(own, own.state_covariance)
+        return RecordedBelief(own, covariance=own.state_covariance)
 
     @predicts
     def predict(self, state: RecordedBelief, u: ArrayLike = (), k: Step = 0) -> RecordedBelief:
@@ -70,25 +71,23 @@ class LinearFilterOfRecord(AbstractSizedFilter):
         """
 
         def correct_mean(mean: jax.Array, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return the corrected mean and the innovation (0 for what is missing), from the predicted mean and z.
+            """Return the corrected mean and the innovation (0 where nothing arrived) for a predicted mean and z.
 
-            `state.own` is the filter's own state. Its covariance and gain depend on no data, so that the mean and the
-            innovation are affine in both arguments.
+            Gain and covariance do not depend on data, so both results are affine in both arguments.
             """
             gaussian = state.own.gaussian._replace(mean=mean)
             after, innovation = self.filter.correct(state.own._replace(gaussian=gaussian), value, k)
             return after.gaussian.mean, jnp.nan_to_num(innovation.value)
 
         mean, P = state.own.gaussian.mean, jnp.asarray(state.covariance)
-        after, own = self.filter.correct(state.own, z, k)
-        # The gain K, and H, the derivative by the mean of what is expected of z, from the filter's own arithmetic: its
-        # innovation is z - H m - c.
-        arrived = ~jnp.isnan(own.value)
-        (_, gain), (slope, _) = jax.jacfwd(correct_mean, (0, 1))(mean, jnp.asarray(z))
-        H, K = jnp.where(arrived[:, None], -slope, 0.0), jnp.where(arrived, gain, 0.0)
-        # The covariance of the innovation where the moments before data are those of the estimate.
-        given = LinearBelief(from_covariance(mean, P), mean, P)
-        _, innovation = self.filter.correct(given, z, k)
+        after, own_innovation = self.filter.correct(state.own, z, k)
+        arrived = ~jnp.isnan(own_innovation.value)
+        # The filter computes m+ = m + K e with the innovation e = z - H m - c: K = dm+/dz and -H = de/dm.
+        (_, gain), (minus_H, _) = jax.jacfwd(correct_mean, (0, 1))(mean, jnp.asarray(z))
+        H, K = jnp.where(arrived[:, None], -minus_H, 0.0), jnp.where(arrived, gain, 0.0)
+        # S by the filter's formula, with E[x x'] = m m' + P in place of the moments before any data.
+        moments_given_data = LinearBelief(from_covariance(mean, P), state_mean=mean, state_covariance=P)
+        _, innovation = self.filter.correct(moments_given_data, z, k)
         S = jnp.where(arrived[:, None] & arrived, innovation.covariance, 0.0)
         P = P - K @ H @ P - (K @ H @ P).T + K @ S @ K.T
         return RecordedBelief(after, symmetric(P)), innovation

@@ -80,12 +80,12 @@ class LinearFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> LinearBelief:
-        """Return the prior, both as estimate and as the state's moments before data."""
+        """Return the prior law of x_0: as the estimate, and as the state's moments before any data."""
         return prior_belief(self.law_at_start)
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
-        """Predict both pairs of moments, of the estimate and of the state without data: A m + B u + E w, A P A' + Q."""
+        """Predict the moments of the estimate, and of the state before any data: A m + B u + E w and A P A' + Q."""
         motion = motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
         return predict_belief(state, motion)
 
@@ -113,17 +113,20 @@ class LinearFilter(AbstractSizedFilter):
 
     @property
     def is_linear(self) -> bool:
-        """Always True: its gains depend on the moments before any data."""
+        """Always True: its gains and covariances depend on moments before any data, so data move only the mean."""
         return True
 
     @property
     def has_score_recursion(self) -> bool:
-        """Whether the channel's law is known and no noise depends on the signal but by a random gain."""
+        """True if `score_rows` can differentiate the log-likelihood by a recursion.
+
+        It can for a known law of the channel, and a noise that depends on the signal only through a random gain.
+        """
         return not (stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor))
 
     @property
     def has_known_gain(self) -> bool:
-        """Whether no gain is random, so that no moment before data matters; of a traced law it counts as random."""
+        """True if no gain is random: then no covariance needs E[x x'] before data. A traced gain counts as random."""
         spread = stack_over_time(self.channel).gain_spread
         return not (is_traced(spread) or np.any(np.asarray(spread)))
 
@@ -133,7 +136,7 @@ class LinearFilter(AbstractSizedFilter):
         """Return the recursion that gives the log-likelihood of rows, its derivatives by free numbers and information.
 
         Args:
-            make: makes a filter from the free numbers; it `has_score_recursion`.
+            make: makes a filter from the free numbers; its `has_score_recursion` is True.
             x: values (p,) of the free numbers.
             half: number of the row at which the recording's second half begins. Information is summed by halves.
 
@@ -152,7 +155,10 @@ class LinearFilter(AbstractSizedFilter):
     def trace_log_likelihood(
         self, plain: Callable[..., jax.Array], z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
     ) -> jax.Array:
-        """Return plain(self, z, u), the log-likelihood, with derivatives by covariances where the law is known."""
+        """Return plain(self, z, u), the log-likelihood of rows by the filter's steps, for derivatives by parameters.
+
+        If the channel's law is known, the same value gets a derivative that goes by covariances, which is faster.
+        """
         if not self.has_score_recursion:
             return plain(self, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
@@ -178,8 +184,8 @@ class LinearFilter(AbstractSizedFilter):
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, initial_power: jax.Array) -> Signal:
     """Return the moments of y = C x + v before any data, E y and E[y y'], with the slopes of the estimate's error.
 
-    They depend on the error covariance and on the state's moments before data, but not on the estimate. So derivatives
-    by the estimate leave them out. `initial_power` is E[x_i^2] at the start, the size of the numbers that are rounded.
+    They depend on the error covariance and on the state's moments before data, but not on the estimate: so gain and
+    covariance do not depend on data. `initial_power` is E[x_i^2] at the start, which decides the rounding.
     """
     y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
@@ -202,13 +208,14 @@ def correct_linear(
 ) -> tuple[LinearBelief, Innovation]:
     """Return the estimate corrected with the components of z (m,) that arrived, and the innovation.
 
-    The estimate gives the expected value of z. The moments before any data give the gain and the covariance. `rule`
-    says how uncertain probabilities of the channel are bounded. `initial_power` is E[x_i^2] before data, for rounding.
+    z = G y + n of the signal y = C x + v. The innovation is z - E[G] (C m + E v) - E n, with the estimate m. The gain
+    and covariance use E[y y'] before any data instead of m. `rule` says how uncertain probabilities of the channel are
+    bounded. `initial_power` is E[x_i^2] at the start, which decides the rounding.
     """
     before_data = signal_before_data(state, sensor, initial_power)
-    expected_y = jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean)
-    given_estimate = before_data._replace(mean=expected_y)
-    after, innovation = correct_signal(given_estimate, channel, rule, z, unknown=before_data)
+    expected_y = jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean)  # C m + E v
+    about_estimate = before_data._replace(mean=expected_y)
+    after, innovation = correct_signal(about_estimate, channel, rule, z, moments_for_gain=before_data)
     return state._replace(gaussian=after), innovation
 
 
@@ -348,12 +355,12 @@ def memoryless_filter(
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
         """Return the filter of a channel without memory.
 
-        Its claim is "nominal" if a delay or memory that matters was ignored (`matters`). `update` says how uncertain
-        probabilities are bounded.
+        Its claim is "nominal" if a memory that matters was ignored. `update` says how uncertain probabilities are
+        bounded.
         """
-        ignoring = linear_filter(plant, sensor, channel, update)
-        assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-        return _claim_nominal(ignoring) if matters else ignoring
+        filter = linear_filter(plant, sensor, channel, update)
+        assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
+        return _claim_nominal(filter) if matters else filter
 
     # Delays: the same filter for the system enlarged by past signals.
     is_late = check_maps("channel", [first(forgets)])[0].past
@@ -386,6 +393,6 @@ def as_current_filter(
     return _claim_nominal(filter) if first(channel).past or memory_matters(channel) else filter
 
 
-def _claim_nominal(ignoring: LinearFilter) -> LinearFilter:
-    """Return the same filter with claim nominal: it ignores delay or memory that the link has."""
-    return with_premise(replace(ignoring, claim="nominal"), ignoring.premise)
+def _claim_nominal(filter: LinearFilter) -> LinearFilter:
+    """Return the same filter with the claim "nominal", since it ignores a delay or memory that its link has."""
+    return with_premise(replace(filter, claim="nominal"), filter.premise)

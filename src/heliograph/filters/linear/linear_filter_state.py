@@ -20,8 +20,8 @@ from heliograph.numerics.types import Float
 class PlantMotion(NamedTuple):
     """Plant over one step, x+ = A x + b + w.
 
-    Shapes: matrix A (n, n), shift b (n,), covariance Cov w (n, n), noise (n, columns) its factors with the rounding
-    of x.
+    Shapes: matrix A (n, n), shift b (n,), covariance Cov w (n, n). `noise` has columns of Cov w plus the rounding of x
+    (n, columns).
     """
 
     matrix: jax.Array
@@ -31,9 +31,9 @@ class PlantMotion(NamedTuple):
 
 
 def motion_of_plant(plant: LinearPlant, u: jax.Array, initial_power: jax.Array) -> PlantMotion:
-    """Return the plant's motion under the input u; `initial_power` is E[x_i^2] before the first step, (n,).
+    """Return the plant's motion x+ = A x + b + w under the input u.
 
-    It is x+ = matrix x + shift + w. `covariance` is Cov w, and `noise` holds its factors, with rounding added.
+    `initial_power` (n,) is E[x_i^2] before the first step, which decides the rounding.
     """
     return PlantMotion(
         matrix=plant.transition_matrix(u),
@@ -44,9 +44,9 @@ def motion_of_plant(plant: LinearPlant, u: jax.Array, initial_power: jax.Array) 
 
 
 class LinearBelief(NamedTuple):
-    """The state given the data, and its mean and covariance before any data.
+    """Law of the state given the data (`gaussian`), and its mean and covariance before any data.
 
-    The latter is never diminished by a measurement, and so needs no factors. Shapes: the state (n,), state_mean (n,),
+    No measurement diminishes the covariance before data, so that it needs no factors. Shapes: state_mean (n,),
     state_covariance (n, n).
     """
 
@@ -86,25 +86,29 @@ class MomentsBeforeData(NamedTuple):
     covariance: Float[jax.Array, "n n"]
 
     def predict(self, matrix: jax.Array, shift: jax.Array, noise: jax.Array) -> "MomentsBeforeData":
-        """Return them after a step x+ = A x + b + w: A m + b and A P A' + Q."""
+        """Return mean and covariance before any data after a step x+ = A x + b + w: A m + b and A P A' + Q.
+
+        A is `matrix`, b the `shift` and Q = Cov w the `noise` (n, n). For an unstable plant these moments grow without
+        limit, and are kept so small that their squares, which later formulas take, are finite.
+        """
         covariance = matrix @ self.covariance @ matrix.T + noise
         return MomentsBeforeData(*_limit_to_finite_squares(matrix @ self.mean + shift, symmetric(covariance)))
 
     def measure(self, sensor: LinearSensor) -> SignalMoments:
         """Return the moments of the signal y = C x + v: its mean, E[y y'] and the columns of Cov v.
 
-        The law of v may depend on the signal's mean and variances. `state_part` is C Cov(x) C'.
+        The law of v may depend on the mean and variances of C x, as rounding noise does.
         """
         matrix, law = jnp.asarray(sensor.matrix), sensor.noise
         mean = matrix @ self.mean + law.mean
-        state_part = matrix @ self.covariance @ matrix.T
-        noise = law.given_signal(mean, diagonal(state_part))
-        second = symmetric(state_part + noise.covariance + outer(mean, mean))
+        state_covariance = matrix @ self.covariance @ matrix.T  # C Cov(x) C'
+        noise = law.given_signal(mean, diagonal(state_covariance))
+        second = symmetric(state_covariance + noise.covariance + outer(mean, mean))
         return SignalMoments(mean=mean, second=second, noise=noise.columns)
 
 
 def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
+    """Return moments before any data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
     Covariances are limited to `largest`, the root of the largest number, and means to the root of `largest`. Behind a
     known gain nothing depends on these moments.

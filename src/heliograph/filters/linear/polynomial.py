@@ -36,7 +36,7 @@ from heliograph.random_affine.outlier_noise import has_bounded_noise
 
 
 class CentredState(NamedTuple):
-    """State of the inner filter, which estimates x - E[x], and the mean E[x] (n,)."""
+    """State of the inner filter, which estimates x - E[x], and the unconditional mean E[x] (n,)."""
 
     inner: PyTree
     mean: Float[Array, " n"]
@@ -52,7 +52,8 @@ class PolynomialFilter(AbstractSizedFilter):
         inner: a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system.
         degree: of the monomials.
         endless: whether the last step's matrices hold for all later steps; False by default.
-        centre: what is subtracted from z, and added to the estimate, for an inner filter of x - E[x]; None by default.
+        centre: recursion of the unconditional mean E[x] for an inner filter of x - E[x]: E[z] is subtracted from z, and
+            E[x] added to the estimate. None, the default, if the inner filter is of x itself.
 
     Raises:
         ValueError: an inner filter whose measurement is no such vector of monomials.
@@ -66,13 +67,18 @@ class PolynomialFilter(AbstractSizedFilter):
     def __init__(
         self, inner: AbstractFilter, degree: int, endless: bool = False, centre: UnconditionalMean | None = None
     ):
-        """Wrap `inner`, a filter of z's monomials up to `degree`; see the class for `endless` and `centre`."""
+        """Wrap `inner`, a filter whose measurement is the vector of monomials of z up to `degree`.
+
+        `endless`: the inner filter's last matrices hold for all later steps. `centre`: recursion of the unconditional
+        mean, which is subtracted before the inner filter; None if nothing is. The inner filter's claim (what its
+        covariance is said to be: exact, upper bound or nominal) and the models it was made for are taken over.
+        """
         instance("inner filter", inner, AbstractFilter, "a filter")
         check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
         self.centre, self.kept = centre, inner.kept
         self.states, self.inputs = inner.states, inner.inputs
-        # How many numbers m are received, by the number of their monomials (the constant is left out).
+        # The number m of received numbers, found by the number of their monomials without the constant.
         fitting = [m for m in range(1, inner.received + 1) if count_monomials(m + 1, degree) == inner.received + 1]
         if not fitting:
             raise fail(
@@ -87,17 +93,17 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """Return the inner filter's state, and the mean that is subtracted before it."""
+        """Return the inner filter's initial state, and E[x_0], which is subtracted before that filter."""
         return CentredState(self.inner.init(), _initial_mean(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: CentredState, u: ArrayLike = (), k: Step = 0) -> CentredState:
-        """Predict with the inner filter, and move the mean."""
+        """Predict with the inner filter of x - E[x], and propagate E[x]."""
         return CentredState(self.inner.predict(state.inner, u, k), _predict_mean(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
-        """Correct the inner filter with all monomials of z up to `degree`, less the mean where one is subtracted."""
+        """Correct the inner filter with all monomials up to `degree` of z, or of z - E[z] if a mean is subtracted."""
         z = _subtract_mean(self.centre, z, state.mean, k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
         after, innovation = self.inner.correct(state.inner, monomials, k)
@@ -105,25 +111,26 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: CentredState) -> Estimate:
-        """Return the estimate of the inner filter, plus the mean."""
+        """Return the estimate of x: that of x - E[x] by the inner filter, plus E[x]."""
         return _add_mean(self.inner.estimate(state.inner), state.mean)
 
     def after_step(self, state: CentredState, k: Step) -> Estimate:
-        """Return the estimate of the inner filter after step k, plus the mean."""
+        """Return the estimate of x after step k: that of x - E[x] by the inner filter, plus E[x]."""
         return _add_mean(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the lifted system, about the mean.
+        """Return the smoother step of the inner filter, whose state are monomials of x - E[x], with E[x] as shift.
 
-        The lifted state holds all monomials, and the estimate is a part of it. `shift` adds the subtracted mean again.
+        The inner filter measures the monomials of z - E[z], so they replace z in the trace of its step. The smoother
+        step's projection picks x - E[x] among the monomials, and `shift` adds E[x].
         """
         z = _subtract_mean(self.centre, step.z, step.prior.mean, step.k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
-        inner = step.map_states(lambda state: state.inner)._replace(z=monomials)
-        return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
+        inner_step = step.map_states(lambda state: state.inner)._replace(z=monomials)
+        return replace(self.inner.smoother_step(inner_step), shift=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Return the same filter with all of the inner one precomputed that no data change."""
+        """Return the same filter with the gains and covariances of the inner filter precomputed."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
     def with_past(self, steps: SmootherStep) -> AbstractFilter:
@@ -151,7 +158,10 @@ def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Arr
 
 
 def _subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
-    """Return z - G C E[x]."""
+    """Return z - E[z] = z - G C E[x] (m,), with E[x] = `mean` and the known gain G; z itself if `centre` is None.
+
+    `centre.received` is G C at each step.
+    """
     return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
 
@@ -252,7 +262,7 @@ def scheduled_polynomial_filter(
 
 
 class MemoryState(NamedTuple):
-    """States of the linear filter and of the filter of products, and the mean (n,) of x that is subtracted before."""
+    """States of a linear filter and of a quadratic one (`products`), both of x - E[x], and the mean E[x] (n,)."""
 
     linear: ScheduleState
     products: ScheduleState
@@ -262,8 +272,10 @@ class MemoryState(NamedTuple):
 class MemoryFilter(AbstractSizedFilter):
     """Quadratic filter with memory: its measurement is z, its squares, and the products of z and the linear estimate.
 
-    With saved gains, for complete data; see `ScheduledFilter` for the effect of gaps, `PolynomialFilter` for the
-    innovation and for `centre`.
+    A linear filter runs beside it. The products with its estimate, which sums up all earlier z, are the memory. Both
+    filters have saved gains, for complete data: after a gap the covariance is NaN. The innovation is that of z itself,
+    with its exact covariance. `centre` is the recursion of the unconditional mean E[x] if both filters are of x - E[x],
+    else None.
     """
 
     linear: ScheduledFilter
@@ -273,9 +285,13 @@ class MemoryFilter(AbstractSizedFilter):
     def __init__(
         self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: UnconditionalMean | None = None
     ):
-        """Join the linear filter and the filter of its products with z.
+        """Join the two filters.
 
-        `centre` is the unconditional mean that is subtracted, or None if none is.
+        Args:
+            linear: filter of z, which gives the linear estimate xhat.
+            products: filter of the measurement (z, z z', z xhat'), which gives the final estimate.
+            claim: what the covariance is said to be: exact, an upper bound or nominal.
+            centre: recursion of the unconditional mean that is subtracted before both, or None.
         """
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
@@ -283,40 +299,44 @@ class MemoryFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> MemoryState:
-        """Return the initial states of both filters, and the mean that is subtracted before them."""
+        """Return the initial states of both filters, and E[x_0], which is subtracted before them."""
         return MemoryState(self.linear.init(), self.products.init(), _initial_mean(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
-        """Predict with both filters, and move the mean."""
+        """Predict with the linear and the quadratic filter of x - E[x], and propagate E[x]."""
         linear, products = self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k)
         return MemoryState(linear, products, _predict_mean(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
-        """Correct the linear filter with z, and then the filter `products` with (z, z z', z times the linear estimate).
+        """Correct the linear filter with z, then the quadratic one with (z, z z', z xhat'), xhat the linear estimate.
 
-        The returned innovation is that of z alone.
+        If the gain is known, z - E[z] replaces z: moments about the mean lose no digits to a large mean. The returned
+        innovation is that of z alone.
         """
         z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
         monomials = evaluate_monomials(z, degree=2)[:-1]  # z and its squares, without the constant
-        lifted = jnp.concatenate([monomials, jnp.outer(z, linear.mean).reshape(-1)])
-        products, innovation = self.products.correct(state.products, lifted, k)
+        measurement = jnp.concatenate([monomials, jnp.outer(z, linear.mean).reshape(-1)])
+        products, innovation = self.products.correct(state.products, measurement, k)
         return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, degree=2)
 
     @estimates
     def estimate(self, state: MemoryState) -> Estimate:
-        """Return the estimate of the filter of products, plus the mean."""
+        """Return the estimate of x: that of x - E[x] by the quadratic filter, plus E[x]."""
         return _add_mean(self.products.estimate(state.products), state.mean)
 
     def after_step(self, state: MemoryState, k: Step) -> Estimate:
-        """Return the estimate of the filter of products after step k, plus the mean."""
+        """Return the estimate of x after step k: that of x - E[x] by the quadratic filter, plus E[x]."""
         return _add_mean(self.products.after_step(state.products, k), state.mean)
 
 
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
     """Return the quadratic filter whose products reach into the past through the linear filter's estimate.
+
+    Its measurement is z, the products of its components, and their products with the linear estimate, a linear function
+    of all earlier z.
 
     Args:
         plant: a linear plant without inputs, n states.
@@ -334,11 +354,18 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
     claim = polynomial_claim(plant, sensor, channel, degree=2)
     centre, system = _lift_about_mean(plant, sensor, channel, degree=1, horizon=horizon)
-    linear = lmmse(system, claim)  # its gains give the moments of its products with z
+    # The linear filter's gains decide the moments of the products of its estimate with z.
+    linear = lmmse(system, claim)
     centred_plant = plant if centre is None else centre_plant(plant)
     products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
     names = first(plant).states
-    filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
+    filter = MemoryFilter(
+        linear=ScheduledFilter(linear, names),
+        products=ScheduledFilter(products, names),
+        claim=products.claim,
+        centre=centre,
+    )
+    # Covariances of products of two numbers are moments of order 4.
     return with_premise(filter, Premise(plant, sensor, channel, order=4))
 
 

@@ -1,4 +1,4 @@
-"""Linear filters whose gains and covariances are computed for each step before any data; only the mean is left."""
+"""Linear filters whose gains and covariances are computed for each step before any data; a run only moves the mean."""
 
 from dataclasses import replace
 from typing import NamedTuple, cast
@@ -58,15 +58,16 @@ class PlannedMean(NamedTuple):
 
 
 class PlannedFilter(AbstractSizedFilter):
-    """A filter whose gains and covariances are known for each step; only the mean is left to compute.
+    """A filter whose gains and covariances are known for each step; a run only computes the mean.
 
     Valid for the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built
     by `planned` of a filter whose gains do not depend on data.
 
-    `past`: the smoother steps without their data; None if the filter is not smoothed.
+    `past`: the smoother steps of each step, whose covariances and gains hold for all data; None if the filter is not
+    smoothed.
 
-    Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); projection (n, N), with
-    xhat = projection m.
+    Shapes: covariances (2 horizon + 1, n, n), at the start, then before and after each correction; start (N,), the
+    first mean; projection (n, N), with xhat = projection m, or None if m is the estimate.
     """
 
     steps: OverTime
@@ -77,7 +78,10 @@ class PlannedFilter(AbstractSizedFilter):
 
     @property
     def is_linear(self) -> bool:
-        """True unless the plant's state is a projection of its mean."""
+        """True if the mean m that it carries is the estimate itself, not a larger state of which that is a projection.
+
+        A linear filter's estimate is its state's mean; code that replaces means in a state relies on that.
+        """
         return self.projection is None
 
     @in_float64
@@ -87,7 +91,7 @@ class PlannedFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
-        """Return F m + f; the input is in f."""
+        """Return F m + f. The filter was planned for its inputs, which f includes, so u is not used."""
         step: LinearStep = at(self.steps, k)
         return PlannedMean(step.predict(state.mean), _convert_stage(state, 2 * k + 1))
 
@@ -113,9 +117,9 @@ class PlannedFilter(AbstractSizedFilter):
         return self._estimate(state.mean, 2 * k + 2)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the planned smoother step with the means of these data.
+        """Return the smoother step: gains and covariances planned in `self.past`, and the means of this run.
 
-        `self.past` holds the planned smoother steps, or is None if none were planned.
+        Without planned smoother steps (None) the filter cannot be smoothed, and the base class raises an error.
         """
         if self.past is None:
             return super().smoother_step(step)
@@ -124,17 +128,20 @@ class PlannedFilter(AbstractSizedFilter):
         return planned.with_data(before, prior, after)
 
     def with_past(self, steps: SmootherStep) -> AbstractFilter:
-        """Return the filter with smoother steps, which are the same for all data."""
+        """Return the filter with smoother `steps`, whose gains and covariances are the same for all data."""
         return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
-        """Return the estimate of the plant's state, with the covariance of this stage."""
+        """Return the estimate of the plant's state, projection m, with the planned covariance of a stage.
+
+        `stage` is the index of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after correction k.
+        """
         x = mean if self.projection is None else self.projection @ mean
         return Estimate(x, jnp.asarray(self.covariances)[stage], self.claim)
 
 
 def _convert_stage(state: PlannedMean, stage: Step) -> jax.Array:
-    """Return a stage in the integer type that the state has."""
+    """Return a stage, the index of a covariance, in the integer type that the state has: loops need one type."""
     return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
 
 
@@ -157,7 +164,7 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
     """Return the filter with its gains and covariances of every step, recorded while it runs over data of zeros.
 
     Args:
-        filter: one of which only the mean depends on data.
+        filter: a filter in which only the mean depends on data.
         inputs: of each step (steps, inputs).
         projection: (n, N), maps the filter's mean and covariance to those of the plant's state; None where they are
             these already.
@@ -200,9 +207,9 @@ def record_step_matrices(
     """Return the matrices of step k, the state after its prediction, and that after its correction.
 
     Args:
-        filter: one of which only the mean depends on data, and affinely.
-        state: before the step; the matrices are the same whatever its mean, and the states returned are from mean 0.
-        z: measurement (m,), which says by NaN what did not arrive.
+        filter: a filter in which only the mean depends on data, by an affine function.
+        state: before the step. Its mean does not matter for the matrices; the returned states have started from mean 0.
+        z: measurement (m,), NaN where a component did not arrive.
         u: input.
         k: number of the step.
     """
@@ -215,17 +222,17 @@ def record_step_matrices(
         return jnp.asarray(gaussian_of(prior).mean), prior
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(zero_mean)
-    # K: derivative of the posterior mean by z; -C: derivative of the innovation by the prior mean; -c: its value at 0.
-    (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, zero_mean, z, k)
+    # K = dm+/dz. The innovation is e = z - C m- - c: C = -de/dm-, and c = -e at m- = 0 and z = 0.
+    slopes = _differentiate_correction(filter, prior, zero_mean, z, k)
     step = LinearStep(
         transition=transition,
         drift=jnp.asarray(gaussian_of(prior).mean),
-        gain=gain,
-        output=-output,
-        offset=-jnp.asarray(innovation.value),
-        innovation=jnp.asarray(innovation.covariance),
+        gain=slopes.mean_by_z,
+        output=-slopes.innovation_by_mean,
+        offset=-jnp.asarray(slopes.innovation.value),
+        innovation=jnp.asarray(slopes.innovation.covariance),
     )
-    return step, prior, after
+    return step, prior, slopes.after
 
 
 def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
@@ -233,21 +240,32 @@ def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
     return with_gaussian(state, gaussian_of(state)._replace(mean=mean))
 
 
-def _correction_slopes(
-    filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
-) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
-    """Return the derivatives of the corrected mean and of the innovation, and the corrected state and the innovation.
+class CorrectionSlopes(NamedTuple):
+    """Derivatives of a correction: of the corrected mean by z (N, m), and of the innovation by the prior mean (m, N).
 
-    Each derivative is a pair: by the prior mean, and by z.
+    `after` and `innovation` are the corrected state and the innovation themselves.
     """
+
+    mean_by_z: jax.Array
+    innovation_by_mean: jax.Array
+    after: PyTree
+    innovation: Innovation
+
+
+def _differentiate_correction(
+    filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
+) -> CorrectionSlopes:
+    """Differentiate the filter's correction of the state `prior`, with the mean `mean` (N,), by z (m,) at step k."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
         """Return corrected mean and innovation, and the objects that hold them."""
         after, innovation = filter.correct(_with_mean(prior, mean), z, k)
         return (jnp.asarray(gaussian_of(after).mean), jnp.asarray(innovation.value)), (after, innovation)
 
-    (mean_slopes, innovation_slopes), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
-    return mean_slopes, innovation_slopes, after, received
+    # Each derivative is a pair: by the prior mean, and by z.
+    slopes, (after, innovation) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
+    (_, mean_by_z), (innovation_by_mean, _) = slopes
+    return CorrectionSlopes(mean_by_z, innovation_by_mean, after, innovation)
 
 
 def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearStep:
@@ -281,24 +299,23 @@ class LinearisedStep(NamedTuple):
 
 
 def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearisedStep:
-    """Linearise a filter's correction at its prediction, with its covariance held.
+    """Linearise a filter's correction at its predicted mean m-, with the predicted covariance P fixed.
 
-    The filter's state is a Gaussian, or holds one. S = Cov(innovation) - C P C', for its predicted P.
-
-    C: derivative of what is expected of z. Rows and columns of what did not arrive are zero.
+    The filter's state is a Gaussian, or holds one. The innovation e = z - zhat(m-) gives C = dzhat/dm- = -de/dm-, the
+    gain is K = dm+/dz, and the rest of z has the covariance S = Cov(e) - C P C'. Rows and columns of components that
+    did not arrive are zero.
     """
     prior = filter.predict(state, u, k)
     x = gaussian_of(prior)
-    (_, gain), (output, _), _, innovation = _correction_slopes(filter, prior, jnp.asarray(x.mean), z, k)
+    slopes = _differentiate_correction(filter, prior, jnp.asarray(x.mean), z, k)
     present = ~jnp.isnan(z)
-    # The innovation falls by what is expected of z: its derivative has the other sign.
-    output = jnp.where(present[:, None], -output, 0.0)
-    total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
+    output = jnp.where(present[:, None], -slopes.innovation_by_mean, 0.0)
+    innovation_covariance = jnp.where(present[:, None] & present, slopes.innovation.covariance, 0.0)
     return LinearisedStep(
         predicted=x.mean,
-        gain=jnp.where(present, gain, 0.0),
+        gain=jnp.where(present, slopes.mean_by_z, 0.0),
         output=output,
-        noise=total - output @ x.covariance @ output.T,
+        noise=innovation_covariance - output @ x.covariance @ output.T,
     )
 
 

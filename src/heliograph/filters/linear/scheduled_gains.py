@@ -30,9 +30,10 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
 class ScheduleState(NamedTuple):
-    """Schedule's state (N,), the estimate's mean (q,), the expected measurement (m,), and whether all has arrived.
+    """State s of the recursion with saved gains (N,), the estimate's mean (q,) and the expected measurement (m,).
 
-    `stage` is the index of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
+    `complete`: whether every number that a gain uses has arrived so far. `stage` is the index of the covariance: 0 at
+    the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
     """
 
     value: Float[jax.Array, " N"]
@@ -65,13 +66,17 @@ class ScheduledFilter(AbstractSizedFilter):
     start: np.ndarray
 
     def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
-        """Keep the gains of each step, the covariances after each, and which received numbers no gain uses."""
+        """Keep the schedule's gains and covariances.
+
+        Without data a step runs as if z equalled its expected value, so the gains of predictions have that put in.
+        """
         instance("schedule", schedule, Schedule, "a Schedule")
         gains = schedule.gains
         self.gains = OverTime(_gains_for_expected_measurement(gains))
         self.unused = np.all(gains.gain == 0, axis=1) & np.all(gains.direct == 0, axis=1)
-        # NaN before the first step, where no covariance is claimed; then those before and after each correction.
-        covariances = np.stack([gains.predicted, gains.covariance], axis=1).reshape(-1, *gains.covariance.shape[1:])
+        # Covariances by stage: NaN at the start, where none is claimed; then those before correction 0, after it, ...
+        before_and_after = np.stack([gains.predicted, gains.covariance], axis=1)  # (horizon, 2, q, q)
+        covariances = before_and_after.reshape(-1, *gains.covariance.shape[1:])
         self.covariances = np.concatenate([np.full_like(covariances[:1], np.nan), covariances])
         self.start, self.claim = schedule.start, schedule.claim
         self.states, self.inputs = names("state names", states, gains.direct.shape[1], "x"), ()
@@ -81,8 +86,8 @@ class ScheduledFilter(AbstractSizedFilter):
     def init(self) -> ScheduleState:
         """Return the schedule's initial state.
 
-        Estimate and expected measurement are NaN before the first step. `complete` says that no number was missing so
-        far. `stage` counts the predictions and corrections made.
+        Estimate and expected measurement are NaN before the first step. No number was missing so far (`complete`), and
+        the covariance has the index (`stage`) 0.
         """
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
         return ScheduleState(
@@ -95,10 +100,9 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
-        """Predict as if the expected measurement arrived.
+        """Predict over step k as if its expected measurement e = G s + g arrived; a correction adds K (z - e).
 
-        `state.value` is the state s of the recursion with the saved gains. `complete` says that no number was missing
-        so far. `stage` counts the predictions and corrections made.
+        With e put in, the saved recursion is s+ = F s + c with the estimate L s + d: these are the `gains` here.
         """
         gains: Gains = at(self.gains, k)
         s = state.value
@@ -112,10 +116,10 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
-        """Add the innovation times the gains of step k.
+        """Add the innovation e = z - E z, times the gains of step k: K e to the state, J e to the estimate.
 
-        `unused`: numbers that no gain uses, which may be missing. Once another was, the saved covariances hold no more:
-        NaN.
+        Once a number is missing that a gain uses, the saved covariances do not hold any more, and NaN is reported.
+        `unused` marks the numbers that no gain uses.
         """
         gains: Gains = at(self.gains, k)
         z = jnp.asarray(z)
@@ -133,7 +137,7 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ScheduleState) -> Estimate:
-        """Return the mean of the estimate, with the schedule's covariance while all has arrived."""
+        """Return the estimate's mean, with the saved covariance, or NaN once a number that a gain uses was missing."""
         return self._estimate(state, state.stage)
 
     def after_step(self, state: ScheduleState, k: Step) -> Estimate:
@@ -141,7 +145,7 @@ class ScheduledFilter(AbstractSizedFilter):
         return self._estimate(state, 2 * k + 2)
 
     def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
-        """Return the mean, with the covariance of this stage while all has arrived."""
+        """Return the mean, with the saved covariance of index `stage`, or NaN once a needed number was missing."""
         claimed = jnp.where(state.complete, jnp.asarray(self.covariances)[stage], jnp.nan)
         return Estimate(state.mean, claimed, self.claim)
 
@@ -189,7 +193,7 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> Gaussian:
-        """Return the system's initial belief."""
+        """Return the law of the system's state before the first step."""
         return from_covariance(self.mean, self.covariance)
 
     @predicts
@@ -217,9 +221,13 @@ class LinearSystemFilter(AbstractSizedFilter):
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of the system's state before the step given its prediction."""
-        moved = at(self.steps, step.k).transition @ step.before.root, at(self.noises, step.k).process
-        return smoother_step_of(step, moved, self.claim, projection=self.projection)
+        """Return the smoother step: the regression of the state y before the step on the predicted state.
+
+        With y = m + L xi the prediction is A m + a + A L xi + w: slopes A L in xi, and the noise w.
+        """
+        slopes = at(self.steps, step.k).transition @ step.before.root
+        noise = at(self.noises, step.k).process
+        return smoother_step_of(step, (slopes, noise), self.claim, projection=self.projection)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
@@ -235,7 +243,7 @@ class SystemNoises(NamedTuple):
 
 @in_float64
 def _factor_noises(system: LinearSystem) -> SystemNoises:
-    """Return the factors of both noises at each step, with the rounding of the state and of what is received.
+    """Return the factors of both noises at each step, with the rounding of the state and of the measurement.
 
     Measurements may repeat each other, and their difference is then only rounding. Without the rounding as a noise,
     this difference would seem to measure the state without noise.
@@ -269,25 +277,27 @@ def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, roundin
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds of the second moments at each step, of the next state (time, N) and of what is received (time, m).
+    """Return bounds of second moments at each step, of the next state (time, N) and of the measurement (time, m).
 
-    For x+ = A x + a they are (|A| root E[x_i^2] + |a|)^2, the squared size of what is summed, which its rounding
-    depends on. By the moments before any data, limited to numbers whose squares are finite: of parts of a system that
-    start at zero the moments grow.
+    The rounding of a sum A x + a is proportional to the size of its terms. So the bound for x+ = A x + a + w is (|A|
+    root + |a|)^2, with root_i = sqrt(E[x_i^2]) before any data, and alike for z = C x+ + c + v. An unstable system's
+    moments grow without limit; they are kept so small that their squares are finite.
     """
     steps, mean, covariance = system.steps, system.mean, system.covariance
-    largest = float(np.finfo(float).max) ** 0.5  # of a second moment; of a mean its root
+    largest_moment = float(np.finfo(float).max) ** 0.5  # its square is finite
+    largest_mean = largest_moment**0.5
+
+    def bound(matrix: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return (|A| root + |a|)^2 for the present moments of x."""
+        root = np.sqrt(mean**2 + np.diagonal(covariance))
+        squared: np.ndarray = np.minimum(np.abs(matrix) @ root + np.abs(offset), largest_mean) ** 2
+        return squared
+
     state_moments, received_moments = [], []
     for k in range(len(steps.transition)):
-        root_power = np.sqrt(mean**2 + np.diagonal(covariance))
-        state_moments.append(
-            np.minimum(np.abs(steps.transition[k]) @ root_power + np.abs(steps.drift[k]), largest**0.5) ** 2
-        )
-        mean = np.clip(steps.transition[k] @ mean + steps.drift[k], -(largest**0.5), largest**0.5)
-        covariance = steps.transition[k] @ covariance @ steps.transition[k].T + steps.process[k]
-        covariance = np.clip(covariance, -largest, largest)
-        root_power = np.sqrt(mean**2 + np.diagonal(covariance))
-        received_moments.append(
-            np.minimum(np.abs(steps.output[k]) @ root_power + np.abs(steps.offset[k]), largest**0.5) ** 2
-        )
+        A, a = steps.transition[k], steps.drift[k]
+        state_moments.append(bound(A, a))
+        mean = np.clip(A @ mean + a, -largest_mean, largest_mean)
+        covariance = np.clip(A @ covariance @ A.T + steps.process[k], -largest_moment, largest_moment)
+        received_moments.append(bound(steps.output[k], steps.offset[k]))
     return np.stack(state_moments), np.stack(received_moments)

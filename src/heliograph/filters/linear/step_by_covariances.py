@@ -1,20 +1,20 @@
-"""A step of a linear filter, of the values of its factors and the derivatives of its covariances.
+"""A step of a linear filter: values by the factors of its covariances, derivatives by the covariances themselves.
 
-Of the factors L diag(d) L' a derivative costs two passes of their orthogonal rows, with every zero of the model filled;
-of the matrix P itself it is a linear recursion that keeps these zeros and subtracts nothing large. So a step is written
-by covariances, and each of its numbers gets the value that the filter has by factors. With C = P- H', S = H C + R,
-K = C S^-1, w = S^-1 e and a dash for the derivative in one number,
+Derivatives are by free parameters of the model. That of the factors L diag(d) L' costs two passes of their orthogonal
+rows, with every zero of the model filled; that of the matrix P is a linear recursion that keeps these zeros and
+subtracts nothing large. So a step is written in covariances, and each of its numbers gets the value that the filter
+computed by factors. With C = P- H', S = H C + R, K = C S^-1, w = S^-1 e, a dash for the transpose and d for the
+derivative by one parameter,
 
-    m-' = F m' + F' m + b',   P-' = F P' F' + (F' P F' and its transpose) + Q',
-    e'  = z' - (H m-' + H' m- + c'),   C' = P-' H' + P- (H')',   S' = H C' + H' C + R',
-    m'  = m-' + K e' + (C' - K S') w,   P' = P-' - C' K' - K C'' + K S' K'.
+    dm- = F dm + dF m + db,   dP- = F dP F' + dF P F' + F P dF' + dQ, de = dz - (H dm- + dH m- + dc),   dC = dP- H' + P-
+    dH',   dS = H dC + dH C + dR, dm = dm- + K de + (dC - K dS) w,   dP = dP- - dC K' - K dC' + K dS K'.
 
-The last is that of P = P- - C S^-1 C'. The log-density has the derivative -w' e' - tr((S^-1 - w w') S') / 2. JAX writes
-all but the last three, and the adjoint of all: 82 of its operations for a row of four states and two outputs behind a
-random gain, where that of the factors has 1,224.
+The last is that of P = P- - C S^-1 C'. The log-density has the derivative -w' de - tr((S^-1 - w w') dS) / 2. The
+derivatives of m, P and the log-density are written out below; JAX derives the others, and the adjoint of all. A row of
+four states and two outputs behind a random gain takes 82 operations, where factors take 1,224.
 
-A random gain G is one more noise, (G - M) y: R holds E[(G - M) E[y y'] (G - M)'], by the state's moments before data,
-whose derivatives are carried beside, a linear recursion as well.
+A random gain G is one more noise, (G - M) y: R holds E[(G - M) E[y y'] (G - M)'], with the state's moments before any
+data. Their derivatives follow a linear recursion too.
 
 Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974); behind a random gain the
 recursion of De Koning, Optimal estimation of linear discrete-time systems with stochastic parameters (1984).
@@ -51,27 +51,28 @@ class ModelMatrices(NamedTuple):
 def find_model_matrices(
     filter: Any, moments: MomentsBeforeData | None, u: Array, k: Array
 ) -> tuple[ModelMatrices, MomentsBeforeData | None]:
-    """Return F, b, Q, H, c and R of step k of a linear filter, under the input u, and the moments before data after it.
+    """Return the matrices of step k of a linear filter, and the state's moments before any data after the step.
 
-    They are x+ = F x + b + w of covariance Q, and z = H x + c + v of covariance R, as received behind the channel. Q
-    and R are by the noises' covariances, and not by the factors that a noise holds beside: these have no derivative
-    where a covariance is zero.
+    x+ = F x + b + w with Cov w = Q, and z = H x + c + v with Cov v = R, as received behind the channel. Q and R are
+    computed from covariance matrices, not from the factors that noises also store: factors have no derivative where a
+    covariance is zero.
 
     Args:
-        filter: the filter.
-        moments: those before data of the state before the step; None behind a known gain, where none are returned.
+        filter: a linear filter, with a plant, a sensor and a channel z = G y + n.
+        moments: E x and Cov x before any data, before the step; None behind a known gain, where they are not needed.
         u: the input.
         k: the step's number.
     """
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
     F, b, Q = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-    # Of the channel's noise that is what its spread holds beside the gain's.
-    of_channel = jnp.asarray(channel.nominal.center[..., -1, -1] - channel.gain_spread[..., -1, -1])
-    R = gain @ jnp.asarray(law.covariance) @ gain.T + of_channel
+    # `nominal` has the covariances of the entries of (G, n), that of n_i and n_j at [i, j, -1, -1]. `gain_spread` has
+    # those of G alone, or of (G, n) if G and n are correlated; then n is counted below, with G.
+    uncorrelated_noise = jnp.asarray(channel.nominal.center[..., -1, -1] - channel.gain_spread[..., -1, -1])
+    R = gain @ jnp.asarray(law.covariance) @ gain.T + uncorrelated_noise  # M Cov(v) M' + Cov n
     if moments is not None:
         moments = moments.predict(F, b, Q)
-        # A random gain adds its spread times E[(y, 1)(y, 1)'] to the noise.
+        # A random gain adds the noise (G - M) y: R_ij += sum_ab Cov(G_ia, G_jb) E[(y, 1)_a (y, 1)_b].
         y = moments.measure(sensor)
         R = R + contract(channel.gain_spread, augmented_second_moment(y.second, y.mean, 1.0))
     H, c = gain @ jnp.asarray(sensor.matrix), gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset)
@@ -114,49 +115,57 @@ class StepMoments(NamedTuple):
 def step_by_covariances(
     matrices: ModelMatrices, before: StateMoments, z: jax.Array, factored: FactoredStep
 ) -> StepMoments:
-    """Return what a step makes of the state's moments: the values of `factored`, and derivatives by covariances.
+    """Return the state's moments after a step of the filter, with the values of `factored`.
+
+    Derivatives are those of the Kalman filter's formulas in covariances. So each number is
+    `take_derivatives_of(formula, value)`: the value by factors, the derivative by the formula.
 
     Args:
         matrices: of the step.
-        before: the state's moments before it.
+        before: mean and covariance of the state before the step.
         z: measurement (m,), NaN for what did not arrive.
-        factored: the same step, whose numbers are taken as known: nothing is differentiated by them.
+        factored: results of the same step by factors; they count as constants, without derivatives.
     """
     F, b, Q, H, c, R = matrices
-    # Prediction.
+    # Prediction: m- = F m + b, P- = F P F' + Q.
     mean = take_derivatives_of(F @ before.mean + b, factored.prior.mean)
     P = take_derivatives_of(symmetric(F @ before.covariance @ F.T + Q), factored.prior.covariance)
-    # Innovation, and its covariance with the state; zero of what did not arrive.
+    # Innovation e = z - H m- - c, C = P- H' and S = H C + R; zero where nothing arrived.
     present = ~jnp.isnan(z)
     e = jnp.where(present, take_derivatives_of(z - H @ mean - c, factored.e), 0.0)
     H = jnp.where(present[:, None], H, 0.0)
     C = P @ H.T
     S = take_derivatives_of(symmetric(H @ C + R), factored.S)
     S = jnp.where(present[:, None] & present, S, 0.0)
-    # Correction.
+    # Correction: m = m- + C S^-1 e, P = P- - C S^-1 C'.
     after = StateMoments(factored.after.mean, factored.after.covariance)
     return StepMoments(_take_derivatives_of_correction(StateMoments(mean, P), (C, e, S), after), e, S)
 
 
 def _carry_derivatives(expression: PyTree, value: PyTree) -> PyTree:
-    """Return `value` plus the expression less itself, held constant.
+    """Return v + (x - constant x) for each expression x and value v: the value v, with the derivative of x.
 
-    Beside a rule of derivatives this is for what differentiates a loop that was differentiated backwards: JAX forgets
-    the rules in it, and differentiates what stands beside them.
+    The functions below also have derivative rules of their own (`custom_jvp`). JAX forgets these where it
+    differentiates a loop that was already differentiated backwards (for second derivatives), and differentiates the
+    function's body instead: with this body the derivative is right there too.
     """
     return jax.tree.map(lambda x, v: v + (x - jax.lax.stop_gradient(x)), expression, value)
 
 
 @jax.custom_jvp
 def take_derivatives_of(expression: jax.Array, value: jax.Array) -> Any:
-    """Return `value` with the derivatives of an expression that is another way to compute it."""
+    """Return `value`, with the derivatives of `expression`, a formula of the same number that has faster ones."""
     return _carry_derivatives(expression, value)
 
 
 @take_derivatives_of.defjvp
 def _differentiate_expression(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the value and the derivative of the expression."""
-    return take_derivatives_of(*primals), tangents[0]
+    """Rule of derivatives of `take_derivatives_of(expression, value)`: the value, and the tangent of the expression.
+
+    `tangents` are those of (expression, value); that of the value is not used.
+    """
+    expression_tangent, _ = tangents
+    return take_derivatives_of(*primals), expression_tangent
 
 
 @jax.custom_jvp
@@ -183,22 +192,24 @@ def _differentiate_correction(primals: Any, tangents: Any) -> tuple[StateMoments
     With w = S^-1 e and the gain K = C S^-1 they are dm = dm- + K de + (dC - K dS) w for the mean, and
     dP = dP- - dC K' - K dC' + K dS K' for the covariance.
     """
-    (C, e, S), (prior, (dC, de, dS), _) = primals[1], tangents
+    _, (C, e, S), _ = primals  # (m-, P-), (C, e, S) and the corrected moments
+    d_prior, (dC, de, dS), _ = tangents
     solved = psd_solve(S, jnp.concatenate([e[:, None], C.T], axis=1))
     w, K = solved[:, 0], solved[:, 1:].T
+    K_dS = K @ dS
+    mean = d_prior.mean + K @ de + (dC - K_dS) @ w
     # dC K' + K dC' - K dS K' is (dC - K dS / 2) K' plus its transpose.
-    KS = K @ dS
-    turned = (dC - KS / 2) @ K.T
-    mean = prior.mean + K @ de + (dC - KS) @ w
-    derivative = StateMoments(mean, symmetric(prior.covariance - (turned + turned.T)))
+    half = (dC - K_dS / 2) @ K.T
+    derivative = StateMoments(mean, symmetric(d_prior.covariance - (half + half.T)))
     return _take_derivatives_of_correction(*primals), derivative
 
 
 @jax.custom_jvp
 def take_derivatives_of_log_density(e: jax.Array, S: jax.Array, value: jax.Array) -> Any:
-    """Return `value`, log N(e; 0, S), with the derivatives of this density of the components that are not determined.
+    """Return `value`, a log-density log N(e; 0, S) computed by factors, with the derivatives by e (m,) and S (m, m).
 
-    Of what did not arrive, e (m,) and S (m, m) are zero.
+    Components that did not arrive have zeros in e and S. These, and components that those before them determine, do not
+    count in the derivatives.
     """
     return _carry_derivatives(log_density(e, S, jnp.zeros_like(e)), value)
 

@@ -52,8 +52,8 @@ def true_error(
 ) -> TrueError:
     """Return E[(x - xhat)(x - xhat)'] of a linear filter in a world that may differ from its model, exactly.
 
-    With r = (x, 1, s), s the filter's state, N_j = E[r r' 1{mode j}] is propagated through plant, channel and gains.
-    Nothing is assumed about the origin of the gains.
+    With r = (x, 1, s), where s is the filter's state, N_j = E[r r' 1{mode j}] is propagated through plant, channel and
+    gains for each mode j of the channel. The gains may be any, not only optimal ones.
 
     Args:
         filter: a filter whose gains do not depend on data.
@@ -82,7 +82,8 @@ def true_error(
         plant, sensor, channel = with_past(plant, sensor, channel)
     enlarged = first(plant)
     total = len(enlarged.states)  # n, and the past signals
-    initial, world = channels_by_mode(channel)  # P(j) at the start, and the channel in each mode j, at each step
+    # P(j) at the start, and for each step the moments of the true channel in each mode j.
+    initial, channel_by_mode = channels_by_mode(channel)
     projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
     # N_j at the start, with r = (x, 1, s): P(j) E[r r'], where only x has a covariance; s is the planned start.
     mean = np.concatenate([enlarged.initial_mean, [1.0], planned.start])
@@ -92,9 +93,9 @@ def true_error(
     # Error x - xhat = D r; one prediction and one correction per step. The modes move from the second step on.
     difference = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
-        transition = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
+        transition = np.eye(len(moments)) if k == 0 else np.asarray(at(channel_by_mode, k).transition)
         moments = _predict_joint_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
-        moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
+        moments = _correct_moments(moments, at(sensor, k), at(channel_by_mode, k), at(planned.steps, k))
         true.append(difference @ moments.sum(axis=0) @ difference.T)
     # Claimed covariances lie as start, then before and after correction of each step: every second one from the third.
     claimed = np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2]
@@ -141,30 +142,37 @@ def _predict_joint_moments(
     return np.asarray(propagate_by_mode(matrix, before, before[:, n, n, None, None] * noise))
 
 
-def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ChannelByMode, step: LinearStep) -> np.ndarray:
-    """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after s = s- + K (z - C s- - c).
+def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: ChannelByMode, step: LinearStep) -> np.ndarray:
+    """Return E[r r' 1{mode}] (M, size, size) after a correction, for r = (x, 1, s) and each of M modes of the channel.
 
-    z = (G, n) y~, G and n by the mode; y~ = (y, 1) = C~ (x, 1) + (v, 0).
+    The filter's state s becomes s + K (z - C s - c). The true sensor sends y = C_x x + v, and z = G y + n arrives, with
+    a random G and n whose law depends on the mode. With (y, 1) = D (x, 1) + (v, 0), D = [C_x, E v; 0, 1],
+
+        s+ = (I - K C) s - K c + K E[(G, n)] D (x, 1)                  mean given x, s and the mode
+             + K [(G, n) - E(G, n)] (y, 1) + K E[G] (v - E v)          zero-mean terms, uncorrelated with x and s
 
     Args:
         moments: E[r r' 1{mode}] after the prediction.
         sensor: the true sensor.
-        world: mean and spread of (G, n) in each mode.
+        channel: E[(G, n)] (M, m, p + 1) and the covariances of its rows, `spread` (M, m, m, p + 1, p + 1), by mode.
         step: the filter's K, C and c.
     """
     p, n = sensor.matrix.shape
-    gain, mean, law = np.asarray(step.gain), np.asarray(world.mean), moments[:, n, n, None, None]
-    measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
-    measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
+    gain, mean = np.asarray(step.gain), np.asarray(channel.mean)
+    probability = moments[:, n, n, None, None]  # E[1 1{mode}]
+    D, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
+    D[:p, :n], D[:p, n], D[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
-    # Mean map of r given the mode: s <- s - K (C s + c) + K E[(G, n)] C~ (x, 1).
-    use = np.zeros_like(moments) + np.eye(moments.shape[-1])
-    use[:, n + 1 :, : n + 1] += gain @ mean @ measure
-    use[:, n + 1 :, n + 1 :] -= gain @ step.output
-    use[:, n + 1 :, n] -= gain @ step.offset
-    # E[y~ y~' 1{mode}], and what the spread of (G, n) and the sensor's noise add to s.
-    second = propagate_by_mode(measure, moments[:, : n + 1, : n + 1], law * noise)
-    added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * propagate_by_mode(mean, noise, 0.0)
-    after: np.ndarray = propagate_by_mode(use, moments, 0.0)
-    after[:, n + 1 :, n + 1 :] += propagate_by_mode(gain, added, 0.0)
+    # r+ = A_j r + zero-mean terms in s, with x and 1 unchanged.
+    A = np.zeros_like(moments) + np.eye(moments.shape[-1])
+    A[:, n + 1 :, : n + 1] += gain @ mean @ D
+    A[:, n + 1 :, n + 1 :] -= gain @ step.output
+    A[:, n + 1 :, n] -= gain @ step.offset
+    # Second moment of the zero-mean terms without K, an m x m matrix for each mode j: entry (i, l) of the first is
+    # sum_ab Cov[(G, n)_ia, (G, n)_lb] E[(y, 1)_a (y, 1)_b 1{mode j}].
+    signal_moments = propagate_by_mode(D, moments[:, : n + 1, : n + 1], probability * noise)
+    by_channel = np.einsum("jilab,jab->jil", np.asarray(channel.spread), signal_moments)
+    by_sensor = probability * propagate_by_mode(mean, noise, 0.0)
+    after: np.ndarray = propagate_by_mode(A, moments, 0.0)
+    after[:, n + 1 :, n + 1 :] += propagate_by_mode(gain, by_channel + by_sensor, 0.0)
     return after

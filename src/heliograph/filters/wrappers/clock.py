@@ -35,8 +35,8 @@ from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 Observe = Callable[[jax.Array], jax.Array]
-SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of zero gives no information on time
-SHARE = 1e-3  # of the outputs' derivatives by an offset: if other states leave less unexplained, it is unobservable
+SIGNIFICANT = 9.0  # squared deviations: a speed within three deviations of zero gives no information on time
+SHARE = 1e-3  # an offset is unobservable if other states explain all but this share of the outputs' derivatives by it
 RANK = 1e-12  # share of the largest eigenvalue: directions of smaller eigenvalues are unobservable
 
 
@@ -80,16 +80,12 @@ class ClockFilter(AbstractWrapper):
     offsets: tuple[int, ...] = eqx.field(static=True)
 
     def within(self, state: ClockBelief) -> Gaussian:
-        """Return the belief of plant and clocks."""
+        """Return the Gaussian of plant and clocks, without the counters of this filter."""
         return state.gaussian
 
     @compile_on_call
     def init(self) -> ClockBelief:
-        """Return the belief before any data.
-
-        `silence` counts the steps since each component arrived. `observed` says whether each clock's offset has been
-        observable.
-        """
+        """Return the law of plant and clocks before any data, in which no clock is observable yet."""
         start = self.base.init()
         # After n steps of silence a component does not count: so it is for all components before they arrive.
         silence = jnp.full(self.received, len(self.states))
@@ -98,10 +94,7 @@ class ClockFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
-        """Predict plant and clocks over step k.
-
-        `silence` counts the steps since each component arrived, one more after this step. `observed` does not change.
-        """
+        """Predict plant and clocks over step k; each component's steps since it last arrived (`silence`) grow by 1."""
         predicted = self.base.predict(state.gaussian, u, k)
         return ClockBelief(
             gaussian=predicted, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
@@ -121,13 +114,15 @@ class ClockFilter(AbstractWrapper):
         z = wrap_near(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.
         present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
-        # Observability of each clock through the components that arrived recently.
+        # Observability is tested over n steps, as many as there are states: components that have not arrived for n
+        # steps would not have been in these data, and do not count.
         silence = jnp.where(present, 0, state.silence)
-        recent_gain = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
+        is_recent = silence < len(self.states)
+        recent_gain = jnp.where(is_recent[:, None], jnp.asarray(channel.mean_gain), 0.0)
         observed = self._test_observable(state, lambda x: recent_gain @ sensor.measure(x), k) & jnp.any(present)
-        # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
-        gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
-        gain = gain * self._mask_estimated(observed)[:, None]
+        # The Kalman gain, with zero rows for offset and drift of a clock that is not observable (Schmidt's filter).
+        kalman_gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
+        gain = kalman_gain * self._mask_estimated(observed)[:, None]
         slopes, noise = jnp.asarray(channel.mean_gain) @ signal.slopes, make_received_noise(signal, channel)
         after = correct_by_gain(prior, slopes, noise, gain, jnp.where(present, z - expected, 0.0))
         belief = ClockBelief(gaussian=after, inputs=state.inputs, silence=silence, observed=observed)
@@ -164,20 +159,22 @@ class ClockFilter(AbstractWrapper):
         return jnp.stack(observable)
 
     def _independent_shares(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Return the share of the outputs' derivatives by each offset that is independent of those by other states.
+        """Return for each clock the share of its column in the observability matrix O that other states do not explain.
 
-        The derivatives are those of the outputs at the next n steps by the present state, along the motion without
-        noise: the rows of the observability matrix O, of which O'O is summed up.
+        The rows of O = (C; C F; C F F; ...) are the derivatives of the outputs at the next n steps by the present
+        state, along the motion without noise: C is that of the outputs and F that of a step. Column o belongs to the
+        offset o. The share is 1 - r^2, with r^2 the squared length of its projection on the other columns over that of
+        the column; if it is 0, other states can imitate the offset. `observe` returns the outputs of a state.
         """
         plant, n = at(self.base.plant, k), len(self.states)
 
         def move_and_give_gramian_part(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            """Move one step on, and return the step's term of O'O with the observability matrix O = (C; C F; ...).
+            """Move one step on, and return the term of the present step in O'O = sum (C F^i)' (C F^i).
 
-            `carry` holds the state at a later step, and its derivatives by the present state. `observe` returns the
-            outputs of a state. The inputs are assumed to stay at `state.inputs`.
+            `carry` holds the state at a later step, and its derivatives by the present state, F^i. The inputs are
+            assumed to stay at `state.inputs`.
             """
             x, slopes_by_present = carry
             rows = jax.jacfwd(observe)(x) @ slopes_by_present
@@ -189,10 +186,10 @@ class ClockFilter(AbstractWrapper):
 
 
 def _compute_unexplained_share(gramian: jax.Array, column: int) -> jax.Array:
-    """Return 1 - r' R^+ r, the share of one column of O that the others leave unexplained; 0 for a column of zeros.
+    """Return 1 - r' R^+ r, the squared share of a column of O that the other columns do not explain.
 
-    O is a matrix of outputs' derivatives, and `gramian` is O'O. R are the correlations (cosines) of the other columns,
-    and r those of this column with them. Eigenvalues of R below the share RANK, 1e-12, of the largest count as zero.
+    `gramian` is O'O. R are the cosines between the other columns of O, and r those of this column with them.
+    Eigenvalues of R below the share RANK, 1e-12, of the largest count as zero. For a column of zeros the result is 0.
     """
     lengths = jnp.sqrt(jnp.diagonal(gramian))
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)

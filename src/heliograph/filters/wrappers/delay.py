@@ -1,4 +1,7 @@
-"""Filters behind delayed links, and parts of filters of larger systems, whose states are past signals too."""
+"""Filters behind delayed links, whose states are past signals too, and filters of a part of a larger system's states.
+
+A delay line holds the signals of the last steps, which may still be under way: y_k, y_k-1, ..., y_k-D.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,14 +15,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns
-from heliograph.filters.base import (
-    AbstractFilter,
-    Step,
-    corrects,
-    estimates,
-    make_sizes,
-    predicts,
-)
+from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.signal_moments import factor_link_noise
 from heliograph.filters.linear.linear_filter_state import LinearBelief, PlantMotion, predict_belief
 from heliograph.filters.linear.precomputed_filter import PlannedFilter, plan_filter
@@ -86,22 +82,28 @@ def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
 
 
 class RelayLine(NamedTuple):
-    """What a relay receives and where: `length` states from `start` on, and the first state of its received signal."""
+    """Indices in the state of what one relay receives.
+
+    start: first state of the delay line that it receives from: the sensor's, or that of the relay before it.
+    length: number of states of that line.
+    received: first state of its own line, which takes the signal that it receives in this step.
+    """
 
     start: int
     length: int
-    place: int
+    received: int
 
 
 class RelayLinesFilter(AbstractWrapper):
     """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
 
-    Each line of past signals is as long as its values may still be received. At each step relay i receives r = G l + n
-    of the line l of the stage before, whatever is forwarded later: its mean is M l + b, and Cov(r | l) is taken at the
-    unconditional moments of l.
+    The sensor and each relay have a delay line of the signals that may still be received from them. At each step relay
+    i receives r = G l + n, where l is the line of the sensor or relay before it: the mean of r given l is M l + b, with
+    M = E G and b = E n, and E Cov(r given l) uses the moments of l before any data.
 
-    base: the filter of these states, whose plant shifts all lines by one and leaves their first places empty.
-    links: the relays' links. lines: for each relay the line that it receives and the place of its received signal.
+    base: the filter of these states, whose plant shifts all lines by one signal and leaves their first entries free.
+    links: moments of G and n for each relay. lines: for each relay the line that it receives from, and the index of its
+    received signal.
     """
 
     base: AbstractFilter
@@ -110,9 +112,9 @@ class RelayLinesFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Move the plant, send the sensor's signal, and receive it at one relay after another.
+        """Predict plant and delay lines over step k, then add what each relay receives, in the order of the relays.
 
-        A relay's line holds what it received in the last steps. `self.lines` says where it lies in the state.
+        `self.lines` says where each relay's lines are in the state.
         """
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
@@ -124,57 +126,60 @@ class RelayLinesFilter(AbstractWrapper):
         return plan_filter(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _receive_into_line(state: LinearBelief, link: SecondOrder, received_line: RelayLine) -> LinearBelief:
-    """Receive r = G l + n at a relay, and put it at its place of the state.
+def _receive_into_line(state: LinearBelief, link: SecondOrder, relay: RelayLine) -> LinearBelief:
+    """Set the first entry of a relay's delay line in the filter's state to what the relay receives, r = G l + n.
 
-    l is the part of the state that has the signals under way to this link, at the relay before it or at the sensor; M
-    and b are the mean of G and n.
+    l is the delay line, a part of the state, of the sensor or relay that sends. `link` has the moments of G and n, with
+    M = E G and b = E n, and `relay` the indices of l and of r in the state.
     """
-    start, length, position = received_line
-    # x+ = matrix x + shift: the received signal, of mean M l + b, replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.gaussian.mean), len(offset)
-    line, place = slice(start, start + length), slice(position, position + m)
-    matrix = jnp.eye(total).at[place, :].set(0.0).at[place, line].set(gain)
-    shift = jnp.zeros(total).at[place].set(offset)
-    # E Cov(r | l), by the moments of l before any data: what a random gain adds as noise is in proportion to l itself.
+    line, received = slice(relay.start, relay.start + relay.length), slice(relay.received, relay.received + m)
+    # The state becomes `matrix` x + `shift` + noise, with M l + b in the entries `received` and all others unchanged.
+    matrix = jnp.eye(total).at[received, :].set(0.0).at[received, line].set(gain)
+    shift = jnp.zeros(total).at[received].set(offset)
+    # E Cov(r given l), by E[l l'] before any data: a random gain multiplies l itself.
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
-    received = factor_link_noise(link, covariance + jnp.outer(mean, mean), mean)
-    noise = WeightedColumns(
-        jnp.zeros((total, received.matrix.shape[1])).at[place].set(received.matrix), received.weights
-    )
+    link_noise = factor_link_noise(link, covariance + jnp.outer(mean, mean), mean)
+    noise_columns = jnp.zeros((total, link_noise.matrix.shape[1])).at[received].set(link_noise.matrix)
+    noise = WeightedColumns(noise_columns, link_noise.weights)
     return predict_belief(state, PlantMotion(matrix=matrix, shift=shift, covariance=noise.covariance, noise=noise))
 
 
 def enlarge_by_relays(
     plant: AnyPlant, sensor: AnySensor, channel: RelayedLinks
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[RelayLine, ...]]:
-    """Enlarge the plant by all lines of past signals, the sensor's first and then each relay's.
+    """Enlarge the plant's state x by the delay lines of past signals: the sensor's, then one of each relay.
+
+    `channel.stages` are the links: from the sensor to relay 0, from relay 0 to relay 1, ..., to the receiver. Stage i +
+    1 sends from the line of relay i, which so holds as many signals as that stage's delay may need (`past`).
 
     Returns:
-        The larger plant, the sensor of the last relay's line, the link behind that, and of each relay the line that it
-        receives and the place of its received signal, as `RelayLinesFilter` has them.
+        The larger plant, a sensor that outputs the last relay's line, the link from there to the receiver, and for each
+        relay the indices of its lines in the state.
     """
     for stage in channel.stages:
         check_forgets("link of a relay that is late by chance", stage)
     # The sensor's line, then one line per relay behind it.
     larger, _, _ = with_past(plant, sensor, channel.stages[0])
-    start, lines = len(first(plant).states), []
+    line_start, lines = len(first(plant).states), []
     total = len(first(larger).states)
-    for i, (stage, later) in enumerate(zip(channel.stages, channel.stages[1:], strict=False)):
-        lines.append(RelayLine(start=start, length=stage.inputs, place=total))
-        start = total
-        total += later.inputs
-        larger = at_each_step(partial(_append_relay_line, relay=i, size=stage.outputs, steps=later.past), larger)
-    # The receiver sees the line of the last relay.
-    last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(larger).states[start:])
-    return larger, last, place_on_delay_line(channel.stages[-1]), tuple(lines)
+    for i, (stage_to_relay, stage_from_relay) in enumerate(zip(channel.stages, channel.stages[1:], strict=False)):
+        lines.append(RelayLine(start=line_start, length=stage_to_relay.inputs, received=total))
+        line_start = total
+        total += stage_from_relay.inputs
+        append_line = partial(_append_relay_line, relay=i, size=stage_to_relay.outputs, steps=stage_from_relay.past)
+        larger = at_each_step(append_line, larger)
+    # The receiver measures the line of the last relay, without noise of its own.
+    matrix, no_noise = np.eye(total)[line_start:], np.zeros((total - line_start, total - line_start))
+    last_line_sensor = LinearSensor(matrix, no_noise, first(larger).states[line_start:])
+    return larger, last_line_sensor, place_on_delay_line(channel.stages[-1]), tuple(lines)
 
 
 def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
     """Enlarge the plant by a relay's line: the `size` numbers that it received 0, 1, ..., `steps` steps ago.
 
-    At each step the numbers move to the next place, without noise. The first place becomes free for what is received.
+    At each step the numbers move one entry on, without noise, and the newest entry becomes free for the next one.
     """
     length = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
@@ -184,11 +189,13 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
 
 
 def relayed_filter(plant: AnyPlant, channel: RelayedLinks, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
-    """Build the filter behind relays from `base`, the filter of all lines.
+    """Build the filter behind relays from `base`, a filter of the plant and the delay lines of all relays.
 
-    A line holds what a relay received in the last steps. `lines` says where each lies in the state of `base`.
+    A delay line holds what a relay received in the last steps. `lines` has one `RelayLine` for each relay: the indices
+    of the line that it receives from and of its own.
     """
-    # `links` lead from stage to stage; the last link is in `base` itself. Only with known probabilities is it optimal.
+    # One link to each relay; the last link, to the receiver, is in `base` itself. The filter is optimal only with known
+    # probabilities.
     links = tuple(second_order(place_on_delay_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
@@ -305,8 +312,8 @@ class KnownDelayFilter(AbstractWrapper):
     It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint
     noise R 11' + N I. Given all delays it is the best linear estimate.
 
-    base: a filter of (x, y_k, ..., y_{k-D}) whose `channel` may be replaced. channels: its channel at each delay, with
-    a leading axis of the delays 0, ..., D.
+    base: a filter of (x, y_k, ..., y_{k-D}) whose field `channel` can be replaced. channels: the moments of its channel
+    for each delay, with a leading axis of the delays 0, ..., D.
     """
 
     base: AbstractFilter
@@ -351,11 +358,15 @@ def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, ma
 
 
 def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> RelayLinesFilter:
-    """Build the filter behind relays that store what they received."""
+    """Build the filter behind relays that store what they received, and forward it later.
+
+    The plant's state is enlarged by each relay's delay line, of what it received in the last steps. `make` builds the
+    filter of this plant, with a sensor that outputs the last relay's line, behind the last link.
+    """
     if not isinstance(channel, RelayedLinks):
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
-    enlarged_plant, last_sensor, link, lines = enlarge_by_relays(plant, sensor, channel)
-    return relayed_filter(plant, channel, make(enlarged_plant, last_sensor, link), lines)
+    enlarged_plant, last_line_sensor, last_link, lines = enlarge_by_relays(plant, sensor, channel)
+    return relayed_filter(plant, channel, make(enlarged_plant, last_line_sensor, last_link), lines)
 
 
 def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
@@ -363,9 +374,9 @@ def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Chann
     if not isinstance(channel, DelayedLink):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
-    enlarged_plant, past_signals, _ = with_past(plant, sensor, channel)
+    enlarged_plant, line_sensor, _ = with_past(plant, sensor, channel)  # a sensor that outputs all past signals
     links = [channel.given(d) for d in range(channel.past + 1)]  # one for each delay
-    base, start = make(enlarged_plant, past_signals, links[0]), first(plant)
+    base, start = make(enlarged_plant, line_sensor, links[0]), first(plant)
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(link) for link in links]),
@@ -374,13 +385,13 @@ def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Chann
 
 
 def deliver_line_as_current(channel: Channel) -> Channel:
-    """Return the channel for a filter that takes late signals as current: all signals of its delay line are y_k."""
+    """Return the channel for a filter that takes late signals for current ones: its delay line holds y_k everywhere."""
     current: Channel = at_each_step(_deliver_at_once, channel)
     return current
 
 
 def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel as if nothing were late: the present signal is in every place of its delay line."""
+    """Return the channel as if nothing were late: every entry of its delay line is the present signal."""
     check_maps("channel", [channel])
     if isinstance(channel, RelayedLinks):
         # Each stage has a delay line of its own.

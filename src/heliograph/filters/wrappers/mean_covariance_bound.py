@@ -1,6 +1,7 @@
-"""Bound on the mean covariance of a filter over the numbers that its links may tell it, before any are drawn.
+"""Bound on the mean covariance of a filter over the numbers that its links may report, before any are drawn.
 
-Told numbers come with a message and say what the link did to it, such as its gain or a reading of that.
+Such numbers ("told numbers", channel side information) are reported with each message, and say what the link did to it:
+its gain, a reading of the gain, or its noise variance.
 """
 
 from typing import NamedTuple
@@ -33,10 +34,10 @@ Carry = tuple[LinearBelief, jax.Array, jax.Array]
 
 
 class ToldNumbersByMode(NamedTuple):
-    """Numbers that may be told at a step, by mode of the chain that tells them; one mode where they are fresh.
+    """Numbers that a message may report at a step, by mode of a Markov chain; one mode if they are drawn anew.
 
-    Shapes: numbers (modes, nodes, told), weights (modes, nodes) that sum to 1 in each mode, initial (modes,),
-    transition (modes, modes).
+    In each mode there are quadrature nodes: `numbers` (modes, nodes, told) are their values, and `weights` (modes,
+    nodes), which sum to 1 in each mode, their probabilities. Shapes: initial (modes,), transition (modes, modes).
     """
 
     numbers: Float[np.ndarray, "modes nodes told"]
@@ -48,16 +49,17 @@ class ToldNumbersByMode(NamedTuple):
 def mean_error_bound(
     filter: AbstractFilter, steps: int, inputs: "Float[ArrayLike, 'steps inputs'] | None" = None
 ) -> Float[np.ndarray, "steps n n"]:
-    """Bound the mean of a filter's covariance over all numbers that messages may tell, at each step, before any data.
+    """Bound the mean of a filter's covariance over all numbers that messages may report, at each step, before any data.
 
-    A message with the numbers a leaves f(P, a) of a covariance P, which is concave and increasing in P. If the numbers
-    are drawn anew each step, V+ = E f(V, a) is at least E P+, and at most what a filter claims that knows only their
-    law. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, with b_ij = P(i before | j now).
-    Means over gains with a density are sums over Gauss's nodes. A message is assumed to arrive at each step.
+    After a message that reports the numbers a, a covariance P becomes f(P, a), which is concave and increasing in P. If
+    the numbers are drawn anew each step, V+ = E f(V, a) is at least E P+, and at most the covariance that a filter
+    claims which knows only their law. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, with
+    b_ij = P(i before | j now). Means over gains with a density are sums over Gauss's nodes. A message is assumed to
+    arrive at each step.
 
     Args:
-        filter: a `linear_filter` behind a link that tells gains, readings of gains, or numbers of finitely many values
-            or of one gain's law.
+        filter: a `linear_filter` behind a link that reports gains, readings of gains, or numbers that have finitely
+            many values or the law of one gain.
         steps: number of steps.
         inputs: rows (steps, inputs); by default there are none, as for a filter without inputs.
 
@@ -80,12 +82,13 @@ def mean_error_bound(
 def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array) -> jax.Array:
     """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`.
 
-    In mode j of the chain that tells numbers, V+_j = sum_a P(a | j) f(sum_i b_ij V_i, a): f(P, a) is what is left of a
-    covariance P after a step with the message a, b_ij = P(i before | j now). The output is sum_j P(j) V+_j.
+    In mode j of the chain, V+_j = sum_a P(a | j) f(sum_i b_ij V_i, a), where f(P, a) is the covariance after a step
+    from the covariance P with a message that reports the numbers a, and b_ij = P(i before | j now). The output is sum_j
+    P(j) V+_j.
 
     Args:
-        filter: of a linear filter, told numbers with each message.
-        told: the numbers that each mode may tell, and the chain.
+        filter: a linear filter behind a link that reports numbers with each message.
+        told: the numbers that may be reported in each mode, and the chain.
         u: inputs (steps, inputs).
     """
     start = filter.init()
@@ -124,18 +127,22 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
 
 
 def _correct_covariance(filter: ToldFilter, prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
-    """Return f(P, a), the covariance of `prior` after a message with the numbers a; measured values do not matter."""
-    z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
+    """Return f(P, a), the covariance (n, n) after a message that reports the numbers a; P is that of `prior`.
+
+    The covariance of a linear filter does not depend on the measured values, so zeros stand for them.
+    """
+    indices_in_message = np.array(filter.numbers)  # rows of z that hold reported numbers
+    z = jnp.zeros(filter.received).at[indices_in_message].set(numbers)
     after, _ = filter.correct(prior, z, k)
     covariance: jax.Array = after.gaussian.covariance
     return covariance
 
 
 def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
-    """Return the numbers that a message may tell, with their probabilities, by mode of the chain that tells them.
+    """Return the numbers that a message may report, with their probabilities, by mode of the chain that decides them.
 
-    A chain tells its mode, one number in each. Numbers that are drawn anew at each step have one mode, in which all
-    combinations over the maps that tell some may come.
+    A Markov chain reports its mode, a single number in each mode. Numbers that are drawn anew at each step have one
+    mode, with all combinations of the numbers of all links that report some.
     """
     memories = [affine.memory for affine in list_told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
@@ -167,7 +174,8 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
 def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
     """Return values (nodes, told) of numbers that are drawn anew at each step, with their probabilities (nodes,).
 
-    Each message tells a reading of a gain, one gain itself, or one of finitely many values.
+    Each message reports a reading of a gain, one gain itself, or one of finitely many values. Laws with a density are
+    replaced by the nodes and weights of Gauss's quadrature.
     """
     if isinstance(memory, FreshReading):
         return reading_quadrature(memory.law, float(memory.variance))

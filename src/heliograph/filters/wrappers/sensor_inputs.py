@@ -33,16 +33,17 @@ P = ParamSpec("P")
 
 
 class StateUnderInputs(NamedTuple):
-    """State of the filter within, and the inputs of the step that led to it (inputs,)."""
+    """State of the base filter, and the inputs of the step that led to it (inputs,)."""
 
     base: PyTree
     u: jax.Array | np.ndarray
 
 
 class FilterOfInputs(AbstractWrapper):
-    """A filter whose sensor is at each step the one that the inputs give.
+    """A filter whose sensor depends on the inputs of each step.
 
-    Given the inputs the sensor varies in a known way, as one over time does: the claim is that of the filter within.
+    Given the inputs the sensor varies in a known way, like one that varies over time, so that the covariance is what
+    the base filter claims.
 
     Args:
         base: the filter of the sensor under inputs of 1, which predicts; with another sensor in its place it corrects.
@@ -55,7 +56,7 @@ class FilterOfInputs(AbstractWrapper):
     sensor: AnySensor
 
     def within(self, state: StateUnderInputs) -> PyTree:
-        """Return the state of the filter within."""
+        """Return the state of the base filter."""
         return state.base
 
     @in_float64
@@ -65,9 +66,9 @@ class FilterOfInputs(AbstractWrapper):
 
     @predicts
     def predict(self, state: StateUnderInputs, u: ArrayLike = (), k: Step = 0) -> StateUnderInputs:
-        """Predict as any filter of the plant, and keep the inputs for the measurement that follows."""
-        given = jnp.asarray(u)
-        return StateUnderInputs(self.base.predict(state.base, given, k), given)
+        """Predict as the base filter does, and keep the inputs u for the measurement that follows."""
+        inputs = jnp.asarray(u)
+        return StateUnderInputs(self.base.predict(state.base, inputs, k), inputs)
 
     @corrects
     def correct(self, state: StateUnderInputs, z: ArrayLike, k: Step = 0) -> tuple[StateUnderInputs, Innovation]:
@@ -76,13 +77,13 @@ class FilterOfInputs(AbstractWrapper):
         return state._replace(base=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter of the sensor under the inputs of this step."""
+        """Return the smoother step of the base filter, with the sensor that the inputs u of this step give."""
         filter = self.make_filter_under(jnp.asarray(step.u), step.k)
         return filter.smoother_step(step.map_states(self.within))
 
     @property
     def attitude(self) -> Angles:
-        """Return the places of attitudes among the states of the filter within."""
+        """Indices of attitudes among the states, those of the base filter."""
         return self.base.attitude
 
     def make_filter_under(self, u: Array, k: Step) -> AbstractFilter:
@@ -105,7 +106,7 @@ def build_filter_of_inputs(
             another step; a filter that keeps more of the sensor than itself.
     """
     start = first(plant)
-    # What is no plant gets the sensor's own names here, so that `make` is what refuses it.
+    # A wrong plant gets the sensor's own input names here, so that `make` refuses it with its own error.
     names = start.inputs if isinstance(start, AbstractPlant) else first(sensor).inputs
     typical = at_each_step(lambda single: single.typical(names), sensor)
     link = first(channel)

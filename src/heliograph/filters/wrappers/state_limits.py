@@ -1,10 +1,10 @@
 """Filters of plants whose states have limits: what a filter says of the state, given that it lies within them.
 
-The filter within goes on as if there were none. Its Gaussian conditioned on the limits is the law of x_k given the data
-and that x_k lies within them: exact for a linear plant, however often it is asked, since what is conditioned is not
-filtered again. (A filter that went on from the truncated moments would count the same limits anew at each step: a
-state that hardly moves would be pushed away from them, and ever surer of it.) What is not used is that the states
-before lay within them too. Where a mean leaves the limits, the filter goes on from the most likely point within.
+The base filter runs as if there were no limits. Its Gaussian conditioned on the limits is the law of x_k given the data
+and that x_k lies within them: exact for a linear plant, at every step, since the conditioned law is only reported, not
+filtered further. (A filter that went on from the truncated moments would count the same limits anew at each step: it
+would push a state that hardly moves away from them, with ever smaller variance.) That earlier states lay within the
+limits too is not used. If a mean leaves the limits, the filter goes on from the most likely point within them.
 """
 
 from copy import copy
@@ -43,14 +43,14 @@ P = ParamSpec("P")
 
 
 class LimitedFilter(AbstractSizedFilter):
-    """A filter that conditions what it says on the limits of its plant's states.
+    """A filter that conditions its estimates on the limits of its plant's states.
 
-    Its state is that of the filter within; the likelihood is that of a measurement given that the state keeps them:
-    p(z) P(within | z) / P(within).
+    Its state is that of the base filter, which knows no limits. The likelihood of a measurement is that given that the
+    plant's state lies within the limits: p(z) P(within | z) / P(within).
 
     Args:
         base: the filter of the plant without limits.
-        limits: place, lowest and highest value of each limited state.
+        limits: index, lowest and highest value of each limited state.
     """
 
     takes_limits: ClassVar[bool] = True
@@ -64,7 +64,10 @@ class LimitedFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict from the most likely point within the limits; of particles, from those within."""
+        """Predict from a Gaussian whose mean is moved to the most likely point within the limits.
+
+        A particle filter predicts from the particles within the limits.
+        """
         return self.base.predict(self._state_before_prediction(state), u, k)
 
     @corrects
@@ -88,7 +91,7 @@ class LimitedFilter(AbstractSizedFilter):
         return self._with_own_claim(self.base.after_step(self.condition_on_limits(state), k))
 
     def hold(self, state: PyTree) -> PyTree:
-        """Return the state from which the filter within corrects: the mean of a Gaussian held within the limits."""
+        """Return the state from which the base filter corrects: a Gaussian's mean is moved into the limits."""
         return state if _holds_particles(state) else self._hold_means(state)
 
     def condition_on_limits(self, state: PyTree, without: int | None = None) -> PyTree:
@@ -100,26 +103,30 @@ class LimitedFilter(AbstractSizedFilter):
         return others._condition_with_log_probability(state)[1]
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter within, whose estimates are then conditioned on the limits."""
+        """Return the smoother step of the base filter, whose smoothed estimates are then conditioned on the limits.
+
+        Predictions and corrections began from means moved into the limits, so the states of the step have these too.
+        The smoothed covariance is nominal, since that earlier and later states keep the limits is not used.
+        """
         inner = self.base.smoother_step(step.map_states(self._hold_means))
         return replace(inner, limits=self.limits, claim=weakest([inner.claim, "nominal"]))
 
     def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within."""
+        """Return the angles of the base filter."""
         return self.base.angles_used()
 
     @property
     def remarks(self) -> bool:
-        """True if the filter within may remark anything."""
+        """True if the base filter may remark anything."""
         return self.base.remarks
 
     def remark(self, state: PyTree) -> Remark:
-        """Return the remark of the filter within."""
+        """Return the remark of the base filter."""
         return self.base.remark(state)
 
     @property
     def of_atoms(self) -> bool:
-        """True if the filter within is a mixture over atoms."""
+        """True if the base filter is a mixture (particles, modes) that excludes z only by a likelihood of 0."""
         return self.base.of_atoms
 
     def _with_own_claim(self, estimate: Estimate) -> Estimate:
@@ -131,10 +138,10 @@ class LimitedFilter(AbstractSizedFilter):
         return self.condition_on_limits(state) if _holds_particles(state) else self._hold_means(state)
 
     def _hold_means(self, state: PyTree) -> PyTree:
-        """Return a filter's state with the means of its Gaussians held within the limits.
+        """Return a filter's state with the means of its Gaussians moved into the limits.
 
-        In the state of a wrapper the inner states are held. Particles do not change here: they are conditioned on the
-        limits elsewhere.
+        If a wrapper's state holds other states, those are changed. Particles do not change here: they are conditioned
+        on the limits elsewhere.
         """
         if isinstance(state, StateUnderInputs):
             return state._replace(base=self._hold_means(state.base))
@@ -147,11 +154,11 @@ class LimitedFilter(AbstractSizedFilter):
         return with_gaussian(state, hold(x))
 
     def _hold_mean(self, x: Gaussian) -> Gaussian:
-        """Return one Gaussian with its mean held within the limits."""
+        """Return one Gaussian with its mean at its most likely point within the limits."""
         return hold_mean_within_limits(x, self.limits)
 
     def _log_probability_within(self, state: PyTree) -> jax.Array:
-        """Return the log probability that the plant's state lies within the limits, of a filter in this state."""
+        """Return log P(the plant's state lies within the limits), by the law that the filter's state describes."""
         return self._condition_with_log_probability(state)[0]
 
     def _condition_with_log_probability(self, state: PyTree) -> tuple[jax.Array, PyTree]:
@@ -172,12 +179,12 @@ class LimitedFilter(AbstractSizedFilter):
         if x.mean.ndim == 1:
             log_mass, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)
             return log_mass[0], with_gaussian(held, jax.tree.map(lambda leaf: leaf[0], inside))
-        # Of a mixture each Gaussian by itself, and its weight times the probability that it is within; where no
-        # Gaussian is, to rounding, the weights stay.
+        # A mixture: each Gaussian a is truncated, and its weight becomes w_a P_a(within) over their sum. If all
+        # P_a(within) are 0 to rounding, the weights stay.
         log_masses, inside = truncate_to_limits(x, self.limits)
         weight = jnp.asarray(held.weight)
-        beside_weight = (-1, *[1] * (weight.ndim - 1))  # one number for each Gaussian, along the first axis
-        weight_within = weight * jnp.exp(log_masses).reshape(beside_weight)
+        per_gaussian = (-1, *[1] * (weight.ndim - 1))  # one number for each Gaussian, along the first axis
+        weight_within = weight * jnp.exp(log_masses).reshape(per_gaussian)
         mass = jnp.sum(weight_within)
         is_possible = mass > 0
         weight = jnp.where(is_possible, weight_within / jnp.where(is_possible, mass, 1.0), weight)
@@ -185,29 +192,31 @@ class LimitedFilter(AbstractSizedFilter):
         return log_mass, held._replace(gaussian=inside, weight=weight)
 
     def _condition_particles(self, state: "particles.StateParticles") -> tuple[jax.Array, "particles.StateParticles"]:
-        """Leave out the particles that are not within; mirror all at the limits that they are beyond if hardly any is.
+        """Return log P(within the limits), and the particles given that: those outside get the weight 0.
 
-        Up to n particles of n states have no covariance: those beyond a limit stand then for states as far within it.
+        n or fewer particles of n states span no covariance (n, n). If no more than n lie within, all keep their
+        weights, and each one outside is mirrored at the limit that it exceeds: a value x > high becomes 2 high - x.
         """
         position = jnp.asarray(state.position)
         inside, mirrored = jnp.ones(len(state.log_weight), bool), position
-        for place, low, high in self.limits:
-            value = position[:, place]
+        for index, low, high in self.limits:
+            value = position[:, index]
             inside = inside & (low <= value) & (value <= high)
             reflected = jnp.where(value < low, 2 * low - value, jnp.where(value > high, 2 * high - value, value))
-            mirrored = mirrored.at[:, place].set(jnp.clip(reflected, low, high))
-        weight_within = jnp.where(inside, state.log_weight, -jnp.inf)
-        log_mass = jax.nn.logsumexp(weight_within) - jax.nn.logsumexp(state.log_weight)
-        enough_within = jnp.sum(jnp.isfinite(weight_within)) > position.shape[1]
-        largest = jnp.where(enough_within, jnp.max(weight_within), 0.0)
+            mirrored = mirrored.at[:, index].set(jnp.clip(reflected, low, high))
+        log_weight_within = jnp.where(inside, state.log_weight, -jnp.inf)
+        log_mass = jax.nn.logsumexp(log_weight_within) - jax.nn.logsumexp(state.log_weight)
+        enough_within = jnp.sum(jnp.isfinite(log_weight_within)) > position.shape[1]
+        # Log weights relative to the largest one.
+        largest = jnp.where(enough_within, jnp.max(log_weight_within), 0.0)
         return log_mass, state._replace(
-            log_weight=jnp.where(enough_within, weight_within - largest, state.log_weight),
+            log_weight=jnp.where(enough_within, log_weight_within - largest, state.log_weight),
             position=jnp.where(enough_within, position, mirrored),
         )
 
 
 def _holds_particles(state: PyTree) -> bool:
-    """Return whether a filter's state, or that of the filter within one of sensor inputs, is of particles."""
+    """Return whether a filter's state, or the inner state of a filter of sensor inputs, holds particles."""
     return isinstance(getattr(state, "base", state), particles.StateParticles)
 
 

@@ -1,6 +1,8 @@
-"""Filters of links whose law is told with each message: for each the filter of the law that its numbers give.
+"""Filters of links whose law is reported with each message: each message is used by the filter of the reported law.
 
-Told numbers come with a message and say what the link did to it, such as its gain; a law is that of gain and noise.
+The law of a link is that of its gain G and noise n in z = G y + n. Numbers that a message reports beside its values,
+such as its gain, a reading of the gain or the noise variance, decide it: channel side information, "told numbers" in
+names. A typical number is the value assumed for a number that was not reported.
 """
 
 from collections.abc import Callable
@@ -55,24 +57,25 @@ class FilterMaker(Module):
     arguments: dict[str, object]
 
     def __call__(self, plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
-        """Make the filter of these three."""
+        """Make the filter of this plant, sensor and channel."""
         return self.function(plant=plant, sensor=sensor, channel=channel, **self.arguments)
 
 
 class ToldFilter(AbstractWrapper):
-    """The filter that `make` builds, for each message behind the link whose law its numbers give.
+    """A filter that corrects with each message as if the link had the law that the message reports.
 
-    Between messages all such filters are one: how a state moves depends on the plant, not on the link. A value is not
-    used where a number is missing that tells of its own link, but for a pilot: without a reading the gain has its law.
+    For each message, `make` builds the filter of that law, which corrects the common state. Predictions do not depend
+    on the link, and are those of `base`. A value is not used if a reported number that its own link needs is missing. A
+    pilot's reading is not needed: without it the gain has its unconditional law.
 
     Args:
-        base: the filter for typical numbers, which predicts.
+        base: the filter for typical numbers, assumed where none were reported; it predicts.
         plant: the plant.
         sensor: its sensor.
-        link: the channel without what is told.
-        make: builds a filter of plant, sensor and a link.
-        values: rows of z in which the link's values stand.
-        numbers: rows in which what is told stands.
+        link: the channel z = G y + n whose law depends on the reported numbers, without these numbers themselves.
+        make: builds a filter from a plant, a sensor and a link of known law.
+        values: indices of the measured values in a message z.
+        numbers: indices of the reported numbers in a message z.
     """
 
     base: AbstractFilter
@@ -85,46 +88,48 @@ class ToldFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct by the filter of the law that the numbers of the message give.
+        """Correct by the filter of the law that the message z reports.
 
-        A message z has `values` that were measured, and `numbers` that tell of the link, such as its gain.
+        z has measured `values`, and reported `numbers` such as the link's gain.
         """
         values, numbers = self._split_message(jnp.asarray(z))
-        filter, is_law = self._make_filter_given(numbers, k)
+        filter, is_valid_law = self._make_filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
-        # Numbers that give no law make the state NaN, by which the caller knows that it must refuse the message.
+        # Numbers that give no law (a negative variance) make the state NaN, so that the caller refuses the message.
         is_message = ~jnp.all(jnp.isnan(values))
-        after = _spoil_state(after, ~is_law & is_message)
+        after = _spoil_state(after, ~is_valid_law & is_message)
         return after, self._place_innovation(innovation)
 
     def expect(self, state: PyTree, k: Step = 0) -> Innovation:
-        """Return minus the values that are expected at step k, with their covariance, before a message tells anything.
+        """Return the innovation -E z of a measurement of zeros at step k, and its covariance, before any message.
 
-        The link is described by the law of its numbers, or by typical numbers if that law is unknown
-        (`knows_law_of_numbers`).
+        No numbers are reported yet. If their law is known (`knows_law_of_numbers`), gain and noise of the link have
+        their moments under that law; else the typical numbers are assumed.
         """
-        # A measurement of zeros has the innovation 0 - E z.
         filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
         _, innovation = filter.correct(state, jnp.zeros(len(self.values)), k)
         return self._place_innovation(innovation)
 
     def draw_numbers(self, key: jax.Array, k: Step = 0) -> jax.Array:
-        """Draw the numbers that a message tells at step k by their laws; raise ValueError where one has none."""
+        """Draw the numbers that a message reports at step k, by their laws; raise ValueError if one has no law."""
         return draw_told(at(self.link, k), key)
 
     def with_numbers(self, z: jax.Array, numbers: jax.Array) -> jax.Array:
-        """Return a message with these numbers in the place of its own."""
+        """Return the message z with its reported numbers replaced by these."""
         return z.at[np.array(self.numbers)].set(numbers)
 
     @property
     def knows_law_of_numbers(self) -> bool:
-        """True if `expect` is by the law of the numbers, not by typical ones."""
+        """True if the law of the numbers that messages report (gains, noise variances) is known.
+
+        Then `expect` averages over that law; else it assumes a typical value for each number.
+        """
         return has_untold_law(first(self.link))
 
     def _place_innovation(self, innovation: Innovation) -> Innovation:
-        """Return the innovation of the values at their rows of z.
+        """Return the innovation of a whole message z, from that of its measured values.
 
-        Told numbers are not measured. They have the innovation NaN, like missing values, so that no test uses them.
+        Reported numbers are not measured. They have the innovation NaN, like missing values, so that no test uses them.
         """
         received, rows = len(self.values) + len(self.numbers), np.array(self.values)
         value = jnp.full(received, jnp.nan).at[rows].set(innovation.value)
@@ -136,9 +141,9 @@ class ToldFilter(AbstractWrapper):
         return Innovation(value, covariance, innovation.log_likelihood, weight)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter that the told numbers give.
+        """Return the smoother step of the filter of the law that this step's message reports.
 
-        A message has values that were measured, and numbers that tell the link's law.
+        A message has measured values, and numbers that give the law of the link's gain and noise.
         """
         values, numbers = self._split_message(jnp.asarray(step.z))
         filter, _ = self._make_filter_given(numbers, step.k)
@@ -146,33 +151,35 @@ class ToldFilter(AbstractWrapper):
 
     @property
     def attitude(self) -> Angles:
-        """Return the places of attitudes among the states of the filter within."""
+        """Indices of attitudes among the states, those of the base filter."""
         return self.base.attitude
 
     def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within, at their rows; what is told is none."""
+        """Return the angles of the base filter, with their indices in a message; reported numbers are no angles."""
         angles = self.base.angles_used()
         return angles and angles._replace(received=tuple(self.values[i] for i in angles.received))
 
     @property
     def knows_gain(self) -> bool:
-        """True if no gain is random given what is told, so that innovations of a Gaussian world are independent.
+        """True if the reported numbers leave no gain random; then the innovations of Gaussian models are independent.
 
-        It is decided with typical numbers. A spread up to the share ROUNDING, 1e-12, of squared gains is rounding.
+        It is tested with typical numbers, at the first step: all Cov(G_ij, G_kl) must be 0. Up to the share ROUNDING,
+        1e-12, of the largest squared gain counts as rounding. A link with memory never has known gains.
         """
         link = believe_typical(first(self.link))
         if link.remembers:
             return False
         moments = second_order(link)
         largest_gain = np.max(np.abs(np.asarray(moments.mean_gain)), initial=0.0)
-        return bool(np.all(np.abs(np.asarray(moments.gain_spread)) <= ROUNDING * largest_gain**2))
+        gain_covariances = np.abs(np.asarray(moments.gain_spread))
+        return bool(np.all(gain_covariances <= ROUNDING * largest_gain**2))
 
     def with_models(self, plant: AnyPlant, sensor: AnySensor, link: Channel) -> "ToldFilter":
-        """Return the filter of another plant, sensor and link, told the same numbers; of the same claim.
+        """Return the same kind of filter for another plant, sensor and link, with the same claim.
 
-        `values`, `numbers`: rows of z with what is measured, and with what is told of the link.
+        Its messages have the same form: measured values and reported numbers at the same indices of z.
         """
-        # The filter of a typical law: a message replaces it by its own.
+        # The base filter, for the law of typical numbers; each message is used by the filter of its own law.
         base = self.make(plant, sensor, at_each_step(believe_typical, link))
         sizes = make_sizes(self.claim, base, self.received)
         return ToldFilter(
@@ -187,37 +194,46 @@ class ToldFilter(AbstractWrapper):
         )
 
     def _split_message(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the values and the numbers of a message; a value is NaN if a number that it needs is missing.
+        """Return the measured values and the reported numbers of a message z.
 
-        Numbers tell the link's law. `list_told_numbers_of_outputs` (values, numbers) says on which numbers each value
-        depends. `self._may_be_missing` is True for the numbers that are not needed.
+        A value is NaN if a number that it needs is missing.
         """
         numbers = z[np.array(self.numbers)]
         is_known = ~jnp.isnan(numbers) | self._may_be_missing
-        is_usable = jnp.all(is_known | ~list_told_numbers_of_outputs(first(self.link)), axis=1)
+        depends = list_told_numbers_of_outputs(first(self.link))  # (values, numbers): which value needs which number
+        is_usable = jnp.all(is_known | ~depends, axis=1)
         return jnp.where(is_usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
     def _may_be_missing(self) -> jax.Array:
-        """True for the numbers that may be missing, of all that are told (numbers,)."""
-        return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in list_told_maps(first(self.link))])
+        """Flags (numbers,): True for a reported number without which a message can still be used.
+
+        Such a number is a pilot's reading of the gain: without it the gain has its unconditional law.
+        """
+        maps = list_told_maps(first(self.link))  # parts of the link whose law depends on reported numbers
+        # `memory.announced` is how many numbers are reported for a part.
+        return jnp.concatenate([jnp.full(part.memory.announced, part.optional) for part in maps])
 
     def _make_filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
-        """Build the filter of the link whose law these numbers give, and say whether they give one.
+        """Build the filter of the law that the reported numbers (numbers,) give to the link, and check that law.
 
-        A needed number that is missing is replaced by a typical one, so that the filter can be built.
+        A number that is needed but missing is replaced by its typical value, so that the filter can be built; the
+        values that need it are not used anyway.
+
+        Returns the filter, and whether the numbers give a law: a negative variance, for example, gives none.
         """
         link = at(self.link, k)
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in list_told_maps(link)])
-        complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
-        filter = self.make(self.plant, at(self.sensor, k), condition_on_told_numbers(link, complete))
-        return filter, numbers_give_law(link, complete)
+        complete_numbers = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
+        link_of_law = condition_on_told_numbers(link, complete_numbers)
+        filter = self.make(self.plant, at(self.sensor, k), link_of_law)
+        return filter, numbers_give_law(link, complete_numbers)
 
 
 def _spoil_state(state: PyTree, is_refused: jax.Array) -> PyTree:
     """Return the state, with NaN for all its real numbers if it `is_refused`.
 
-    A state of NaN says that the message gave no law of the link.
+    So the caller sees that the message's numbers give no law of the link.
     """
 
     def spoil(leaf: jax.Array) -> jax.Array:
@@ -229,16 +245,17 @@ def _spoil_state(state: PyTree, is_refused: jax.Array) -> PyTree:
 
 
 def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: FilterMaker) -> ToldFilter:
-    """Return the filter behind a channel that delivers with z the numbers that give its link's law (told numbers).
+    """Return the filter behind a channel that delivers, beside z, numbers that give the law of its gain and noise.
 
     Args:
         plant: the plant.
         sensor: its sensor.
         channel: a channel that delivers numbers after z; it may vary over time.
-        make: builds a filter of plant, sensor and a link of known law.
+        make: builds a filter from a plant, a sensor and a link of known law.
 
-    Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
-    what is not drawn anew with each message.
+    Claim (what the covariance is): that of the filter for typical numbers; "nominal" if the numbers depend on the
+    state,
+    or if they leave something random that is not drawn anew with each message.
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.
@@ -247,7 +264,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     claim = base.claim
     if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):
         claim = weakest([claim, "nominal"])
-    # Rows of z in which the link's values and the told numbers stand.
+    # Indices of the measured values and of the reported numbers in a message z.
     _, values, numbers = separate_told_numbers(first(channel))
     filter = ToldFilter(
         base=base,
@@ -265,6 +282,10 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
 
 @in_float64
 def believe_typical(link: PyTree) -> PyTree:
-    """Return a link as it is for typical numbers."""
-    typical = [affine.typical for affine in list_told_maps(link)]
+    """Return a link with the law that it has if its messages report the typical numbers.
+
+    Each part of the link whose law depends on reported numbers, such as its gain, holds a typical value for each: the
+    value that is assumed where none was reported.
+    """
+    typical = [part.typical for part in list_told_maps(link)]
     return condition_on_told_numbers(link, library(typical).concatenate(typical))

@@ -1,4 +1,4 @@
-"""What filters around another filter have in common: whatever they do not change, the filter within does."""
+"""What filters around another filter (`base`) have in common: whatever they do not change, the base filter does."""
 
 from dataclasses import replace
 
@@ -20,11 +20,11 @@ from heliograph.numerics.types import ArrayLike, PyTree
 
 
 class AbstractWrapper(AbstractSizedFilter):
-    """A filter around another, `base`, of whose states it estimates the first ones: mostly all of them.
+    """A filter around another one, `base`, that estimates all of its states or the first ones.
 
-    A final class defines what it does otherwise, and says itself whether it turns attitudes. One that keeps more than
-    the state of `base` says where that is, in `within`, and defines `init`, `predict` and `correct`. Smoothing is not
-    handed on: whoever changes a step says how the way back changes.
+    A final class overrides what it does otherwise, and says itself whether its states have attitudes. If its state
+    holds more than that of `base`, `within` returns the latter, and the class defines `init`, `predict` and `correct`.
+    Smoothing is not passed on to `base`: a class that changes a step must say how the backward pass changes.
     """
 
     base: eqx.AbstractVar[AbstractFilter]
@@ -35,17 +35,17 @@ class AbstractWrapper(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """Return the initial state of the filter within."""
+        """Return the initial state of the base filter."""
         return self.base.init()
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict with the filter within."""
+        """Predict with the base filter."""
         return self.base.predict(state, u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the filter within."""
+        """Correct with the base filter."""
         return self.base.correct(state, z, k)
 
     @estimates
@@ -58,27 +58,27 @@ class AbstractWrapper(AbstractSizedFilter):
         return self._restrict_to_first_states(self.base.after_step(self.within(state), k))
 
     def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within, of its states those that are estimated."""
+        """Return the angles of the base filter, among the states that this filter estimates."""
         angles = self.base.angles_used()
         return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
 
     @property
     def remarks(self) -> bool:
-        """True if the remark of the filter within may say anything."""
+        """True if the base filter may have something to remark."""
         return self.base.remarks
 
     def remark(self, state: PyTree) -> Remark:
-        """Say what the filter within says."""
+        """Return the remark of the base filter: what happened to the state that its user should know."""
         return self.base.remark(self.within(state))
 
     @property
     def of_atoms(self) -> bool:
-        """True for a filter within that is a mixture over atoms."""
+        """True if the base filter is a mixture (particles, modes) that excludes z only by a likelihood of 0."""
         return self.base.of_atoms
 
     @property
     def silence_tells(self) -> bool:
-        """True if a step at which nothing arrives changes the state of the filter within."""
+        """True if silence is data to the base filter: its sender stays silent by a rule."""
         return self.base.silence_tells
 
     def _restrict_to_first_states(self, whole: Estimate) -> Estimate:

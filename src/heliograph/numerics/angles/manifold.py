@@ -1,8 +1,8 @@
-"""States that are no numbers on a line: angles, and attitudes as rotation vectors, among others that are.
+"""States that are not all vectors: some components are angles, or rotation vectors of attitudes.
 
-A state x has n numbers, and so has a small change d of it: x plus d is x + d, but for angles, where full turns are
-taken off, and attitudes, which turn by d in their own axes. `difference` is the inverse; covariances are of such
-changes.
+A state x has n numbers, and so has a small change d of it. "x plus d" is x + d, except that an angle is wrapped to
+between -pi and pi, and an attitude is rotated by d in its body axes. "x difference y" is the d with y plus d = x;
+covariances are those of such changes d.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Rotations = Angles  # places of rotation vectors, three after three
 
 
 class Manifold(NamedTuple):
-    """Which states are angles, and which, three by three, are the rotation vectors of attitudes; all others are lines.
+    """Which states are angles, and which, three by three, are rotation vectors of attitudes; all others are real.
 
     Args:
         angles: places of angles.
@@ -32,7 +32,7 @@ class Manifold(NamedTuple):
     rotations: Rotations = ()
 
     def plus(self, x: Array, d: Array) -> Any:
-        """Return x changed by d, (..., n) both: angles between -pi and pi, attitudes turned in their own axes."""
+        """Return x changed by d (..., n): angles are wrapped to between -pi and pi, attitudes rotated in body axes."""
         total: Any = x + d
         return self._replace_rotations(wrap_angles(total, self.angles), turn, x, d)
 
@@ -41,24 +41,25 @@ class Manifold(NamedTuple):
         change: Any = x - other
         return self._replace_rotations(wrap_angles(change, self.angles), turn_between, x, other)
 
-    def _replace_rotations(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
-        """Return `whole` (..., n) with each of its rotation vectors replaced by make(that of x, that of y).
+    def _replace_rotations(self, state: Array, combine: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
+        """Return `state` (..., n) with each rotation vector replaced by combine(a, b), a and b those of x and y.
 
-        `self.rotations`: the places of their components, three for each vector.
+        `combine` maps two rotation vectors (..., 3) to one, such as the rotation a followed by b. `self.rotations`
+        holds the indices of the vectors' components, three for each vector.
         """
         for i in range(0, len(self.rotations), 3):
             columns = np.array(self.rotations[i : i + 3])  # of one rotation vector
-            x, y = (v if np.shape(v) == np.shape(whole) else v + np.zeros(np.shape(whole)) for v in (x, y))
-            vector = make(x[..., columns], y[..., columns])
-            if isinstance(whole, jax.Array) or isinstance(vector, jax.Array):
-                whole = jnp.asarray(whole).at[..., columns].set(vector)
+            x, y = (v if np.shape(v) == np.shape(state) else v + np.zeros(np.shape(state)) for v in (x, y))
+            vector = combine(x[..., columns], y[..., columns])
+            if isinstance(state, jax.Array) or isinstance(vector, jax.Array):
+                state = jnp.asarray(state).at[..., columns].set(vector)
             else:
-                whole = whole.copy()
-                whole[..., columns] = vector
-        return whole
+                state = state.copy()
+                state[..., columns] = vector
+        return state
 
     def near(self, x: A, reference: Array) -> A:
-        """Return the same state, its angles within half a turn of those of `reference` (..., n)."""
+        """Return x with full turns added to its angles, so that each is within half a turn of `reference` (..., n)."""
         return wrap_near(x, reference, self.angles)
 
     def chart(self, function: Callable[[jax.Array], jax.Array], center: jax.Array) -> Callable[[jax.Array], jax.Array]:
@@ -73,20 +74,25 @@ class Manifold(NamedTuple):
     def chart_move(
         self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None
     ) -> Any:
-        """Return the motion f of states near `center` as a function of vectors, for which moments can be computed.
+        """Return the motion f near `center` as a map of vectors to vectors, whose moments the usual transforms compute.
 
-        It is x -> m + (f(center plus (x - center)) difference m), with m the `middle`, by default f(center). `plus` and
-        `difference` turn attitudes; + and - are those of vectors. Angles are continued over full turns.
+        Attitudes are replaced by rotation vectors: x - center is the rotation from `center` before the motion, and the
+        result is m plus the rotation vector from m after it. With m = `middle`, by default f(center), the map is
+        x -> m + (f(center plus (x - center)) difference m), where + and - are those of vectors. An angle does not jump
+        by a full turn: it is continued from its value at `center`.
         """
-        continued = continue_angles(function, center, self.angles, self.angles)
+        continuous = continue_angles(function, center, self.angles, self.angles)
         if not self.rotations:
-            return continued
-        in_chart = self.chart(continued, center)
+            return continuous
+        function_of_vectors = self.chart(continuous, center)
         m = function(center) if middle is None else middle
-        return lambda x: self.unsettle(m, in_chart(x))
+        return lambda x: self.unsettle(m, function_of_vectors(x))
 
     def settle(self, center: Array, x: Array) -> Any:
-        """Return the state whose change from `center` is x - center, (..., n); angles stay as they are."""
+        """Return center plus (x - center), (..., n): x with vectors of rotation from `center` replaced by attitudes.
+
+        Angles stay as they are.
+        """
         return self._replace_rotations(x, turn, center, x - center) if self.rotations else x
 
     def unsettle(self, center: Array, x: Array) -> Any:

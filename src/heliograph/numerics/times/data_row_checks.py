@@ -13,9 +13,20 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 def check_rows(
     name: str, value: ArrayLike | None, steps: int | None, length: int | None, missing: bool, names: Sequence[str] = ()
 ) -> Float[Array, "steps n"]:
-    """Return an array of `length` numbers a step, one axis standing for one number; NaN where `missing` is allowed.
+    """Return rows of data as a checked float64 array (steps, length).
 
-    It is the caller's own where that has the form: only read. Columns of a table that have `names` have their order.
+    Args:
+        name: what the rows are, for errors.
+        value: the rows; an array of one axis if each row is one number.
+        steps: number of rows, or None for any.
+        length: numbers in a row, or None for any.
+        missing: whether NaN is allowed, for a number that did not arrive.
+        names: names of the columns; a table with just these names must have them in this order.
+
+    The result may be the caller's own array, so it must not be changed.
+
+    Raises:
+        ValueError: None, other sizes, columns in another order, numbers that are not finite.
     """
     if isinstance(value, jax.core.Tracer):
         return value

@@ -1,4 +1,4 @@
-"""Order of times: those that fall out of it, and those of a clock that was not set."""
+"""Order of times: which of them are out of order, and which are of a clock that was not set."""
 
 from bisect import bisect_right
 
@@ -12,9 +12,10 @@ CENTURY = 946_684_800 * SECOND  # 2000-01-01
 
 
 def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
-    """Return the mask of the fewest rows without which times do not go backwards; of equally few, the later ones.
+    """Return the mask of the rows that are out of order: the fewest rows without which times do not go backwards.
 
-    The others are a longest subsequence that does not fall, found by patience sorting.
+    If there are several such sets of rows, the later rows are marked. The rows that remain are a longest subsequence
+    that does not decrease, found by patience sorting.
     """
     if np.all(time[1:] >= time[:-1]):
         return np.zeros(len(time), dtype=bool)
@@ -28,7 +29,7 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     for row, value in enumerate(reversed_times):
         length = bisect_right(least_ends, value)  # of the longest subsequence that this row continues
         previous.append(end_rows[length - 1] if length else -1)
-        # It is the new end at place `length`: in the place of a larger one, or, of the longest so far, appended.
+        # It is the new end at index `length`: it replaces a larger one there, or makes the longest one longer.
         least_ends[length : length + 1], end_rows[length : length + 1] = [value], [row]
     # All rows are out of order but those of the longest subsequence, from its end back.
     out_of_order = np.ones(len(time), dtype=bool)
@@ -42,28 +43,32 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
 def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
     """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
 
-    They are more than a year outside of all others, and one of two. In the middle: a stretch of fewer messages than the
-    stretches before and after it have together, between which is less than a year. At the start: stamps of the first
-    year since 1970, where clocks begin to count, while all others are of this century.
+    Messages are cut into stretches where the stamp jumps by more than a year. A stretch is of an unset clock in two
+    cases, if all its stamps are more than a year outside of all others:
+
+    - it lies between two stretches that are less than a year apart and together have more messages;
+    - it is the first one, its stamps are of the first year since 1970, where clocks begin to count, and all others are
+    of
+      this century.
 
     Args:
         time: the stamps.
         year: a year in their unit (default nanoseconds).
     """
-    # Stretches of messages, as arrays of their places, between which the stamp jumps by more than a year.
+    # Stretches of messages, as arrays of their indices, between which the stamp jumps by more than a year.
     stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > year) + 1)
-    astray = np.zeros(len(time), dtype=bool)
+    is_candidate = np.zeros(len(time), dtype=bool)
     for before, stretch, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
         jumps_back = abs(int(time[after[0]]) - int(time[before[-1]])) <= year
         is_minority = len(stretch) < len(before) + len(after)
-        astray[stretch] = jumps_back and is_minority
-    # The first stretch: in the year from which clocks count, where all sound stamps after it are of this century.
+        is_candidate[stretch] = jumps_back and is_minority
+    # The first stretch: in the year from which clocks count, while all other stamps are of this century.
     first = stretches[0]
-    later = time[len(first) :][~astray[len(first) :]]
+    later = time[len(first) :][~is_candidate[len(first) :]]
     in_first_year = bool(np.all((time[first] >= 0) & (time[first] < year)))
-    astray[first] = in_first_year and len(later) > 0 and bool(later.min() >= CENTURY / YEAR * year)
-    if not astray.any():
-        return astray
-    # Of the candidates those are unset that lie more than a year outside of all others.
-    others = time[~astray]
-    return np.asarray(astray & ((time < others.min() - year) | (time > others.max() + year)))
+    is_candidate[first] = in_first_year and len(later) > 0 and bool(later.min() >= CENTURY / YEAR * year)
+    if not is_candidate.any():
+        return is_candidate
+    # Candidates are unset if they lie more than a year outside of all others.
+    others = time[~is_candidate]
+    return np.asarray(is_candidate & ((time < others.min() - year) | (time > others.max() + year)))
