@@ -166,7 +166,9 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
         # The last part is filled with its last row, which does not count again.
         indices = np.minimum(np.arange(start, start + size), len(u) - 1)
         k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
-        drawn |= {name: (drawn[name], mesh.compute_weights_ahead(drawn[name])) for name, mesh in filters.meshes.items()}
+        drawn |= {
+            name: (drawn[name], mesh.compute_weights_of_steps(drawn[name])) for name, mesh in filters.meshes.items()
+        }
         is_counted = np.arange(start, start + size) < len(u)
         states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, is_counted)
         parts.append(to_numpy(results))
