@@ -49,13 +49,13 @@ class PastReports(NamedTuple):
 class ReportsBelief(NamedTuple):
     """Estimate of the centre, of zeta = (x, e_1, ..., e_nodes, reports sent one step ago, two steps ago, ...).
 
-    `gaussian` has N = (1 + nodes + nodes delays) n components; `spill` bounds the square of the part of the error that
-    comes from quantizers: the error of the mean is one of this covariance plus one within that bound.
+    `gaussian` has N = (1 + nodes + nodes delays) n components. The error of its mean is u + v: Cov u is the covariance
+    of `gaussian`, v comes from the quantizers, and v v' <= `quantizer_bound` (None without quantizers).
     """
 
     gaussian: Gaussian
     past: PastReports
-    spill: Float[jax.Array, "N N"] | None
+    quantizer_bound: Float[jax.Array, "N N"] | None
 
 
 class AllReports(AbstractInformedFusion):
@@ -84,28 +84,41 @@ class AllReports(AbstractInformedFusion):
         return make_initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
 
     def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
-        """Return the next state, and the fused mean and covariance, by predicting all errors and using the reports.
+        """Return the next state, and the fused mean and covariance, after one step of the Kalman filter of all errors.
 
-        `means` (nodes, n): the estimates that the nodes sent, NaN for one that did not arrive.
+        `state`: estimate of the plant's state, of all nodes' errors and of past reports. `happened`: motion of the
+        plant and recursion of the nodes' errors in this step. `means` (nodes, n): the estimates that the nodes sent,
+        NaN for one that did not arrive.
         """
         nodes, n = means.shape
-        prior = propagate_errors(state, happened, make_lossless_links(nodes, n))
-        # The means are the reports, all of age 0.
-        after, _ = correct_with_reports(prior, jnp.asarray(means)[None])
-        return after, estimate_state(after, n)
+        predicted = propagate_errors(state, happened, make_lossless_links(nodes, n))
+        # Measurements of the correction are the means. Links without delay deliver reports of age 0 alone.
+        reports_by_age = jnp.asarray(means)[None]
+        corrected, _ = correct_with_reports(predicted, reports_by_age)
+        return corrected, estimate_state(corrected, n)
 
 
 def make_lossless_links(nodes: int, n: int) -> ReportModel:
-    """Return the model of links that deliver what is sent, unchanged and at once."""
-    zero = np.zeros((nodes, n))
-    return ReportModel(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
+    """Return the model of links that deliver each node's estimate of n numbers unchanged and at once: z_i = m_i."""
+    return ReportModel(
+        gain=np.tile(np.eye(n), (nodes, 1, 1)),
+        offset=np.zeros((nodes, n)),
+        spread=np.zeros((nodes, n, n, n + 1, n + 1)),
+        error=np.zeros((nodes, n)),
+    )
 
 
 def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """Return the state before the first report, for `delays` past reports and `received` numbers in each report.
+    """Return the centre's state (x, e_1, ..., e_nodes, past reports) before the first report.
 
-    The state is (x, errors of the nodes, past reports). Every error is that of x_0 up to a constant, and nothing has
-    been sent. `spill`: a bound on the squared error by quantizers, or None without them.
+    Filters start at known means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does. Nothing has
+    been sent: past reports are zeros.
+
+    Args:
+        errors: mean and covariance of (x, e_1, ..., e_nodes) at the start.
+        delays: largest delay of a report in steps, which is the number of past reports of each node in the state.
+        received: numbers in each report that arrives.
+        quantized: whether quantizers add errors, which a bound then follows; it starts at zero.
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
@@ -113,10 +126,15 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     root_of_x_and_errors = jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1))
     root = jnp.pad(root_of_x_and_errors, (padding, (0, 0)))
     mean = jnp.pad(errors.mean.reshape(-1), padding)
-    shapes = (received, n), (received,), (received, received), (n,)
-    past = PastReports(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
-    spill = jnp.zeros((len(mean), len(mean))) if quantized else None
-    return ReportsBelief(from_columns(mean, WeightedColumns(root, start.weights)), past, spill)
+    ages_and_nodes = (delays + 1, nodes)
+    past = PastReports(
+        gain=jnp.zeros((*ages_and_nodes, received, n)),
+        offset=jnp.zeros((*ages_and_nodes, received)),
+        noise=jnp.zeros((*ages_and_nodes, received, received)),
+        error=jnp.zeros((*ages_and_nodes, n)),
+    )
+    quantizer_bound = jnp.zeros((len(mean), len(mean))) if quantized else None
+    return ReportsBelief(from_columns(mean, WeightedColumns(root, start.weights)), past, quantizer_bound)
 
 
 class ReportMap(NamedTuple):
@@ -143,24 +161,32 @@ class ReportMap(NamedTuple):
         return jnp.concatenate([zeta_after, newest_reports, past_reports[: -nodes * n]])
 
 
-def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportModel) -> ReportsBelief:
-    """Predict zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i."""
-    step, errors = happened
+def propagate_errors(state: ReportsBelief, centre_step: CentreStep, links: ReportModel) -> ReportsBelief:
+    """Predict zeta = (x, e_1, ..., e_nodes) over a step, zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i.
+
+    F, f and B are `step.transition`, `step.shift` and `step.noise_input`. w is the process noise, nu the noise of what
+    the nodes receive, and K has their gains on its diagonal. `links`: model of the reports that are sent at this step.
+    """
+    step, errors = centre_step
     nodes, n, _ = step.gain.shape
-    length, size = len(state.gaussian.mean), len(step.shift)  # of the state with past reports, and of zeta
-    # Noise: w is common to all, nu enters by each node's gain; estimates are known to the rounding of x.
-    noise = join_columns(
-        columns_of(step.process).through(step.of_noise),
-        _factor_measurement_noise(step.gain, step.received).through(np.eye(size, nodes * n, -n)),
+    state_size, zeta_size = len(state.gaussian.mean), len(step.shift)  # the state is zeta and past reports
+    # B w is common to x and all errors. K nu reaches the errors, which are in zeta behind x. Estimates are known up to
+    # the rounding of x.
+    behind_x = np.eye(zeta_size, nodes * n, -n)
+    zeta_noise = join_columns(
+        columns_of(step.process).through(step.noise_input),
+        _factor_measurement_noise(step.gain, step.received).through(behind_x),
         rounding_of(jnp.tile(_find_second_moments_of_state(errors), 1 + nodes)),
     )
-    # Past reports move on by one place, without a noise.
-    line = ReportMap(step.transition)
-    shift, noise = jnp.pad(step.shift, (0, length - size)), noise.through(np.eye(length, size))
-    spill = None if state.spill is None else symmetric(propagate_by_mode(line, state.spill, 0.0))
-    return ReportsBelief(
-        predict_affine(state.gaussian, line, shift, noise), _prepend_present_reports(state.past, errors, links), spill
-    )
+    # Past reports become one step older, without shift or noise.
+    report_map = ReportMap(step.transition)
+    shift = jnp.pad(step.shift, (0, state_size - zeta_size))
+    noise = zeta_noise.through(np.eye(state_size, zeta_size))
+    predicted = predict_affine(state.gaussian, report_map, shift, noise)
+    quantizer_bound = None
+    if state.quantizer_bound is not None:
+        quantizer_bound = symmetric(propagate_by_mode(report_map, state.quantizer_bound, 0.0))
+    return ReportsBelief(predicted, _prepend_present_reports(state.past, errors, links), quantizer_bound)
 
 
 def _find_second_moments_of_state(errors: ErrorMoments) -> Float[jax.Array, " n"]:
@@ -178,30 +204,30 @@ class PredictedReports(NamedTuple):
 def correct_with_reports(
     state: ReportsBelief, reports: Float[jax.Array, "age node m"]
 ) -> tuple[ReportsBelief, PredictedReports]:
-    """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
+    """Correct with the reports z = C s + c + n that arrived, by their age in steps; NaN for those that did not arrive.
 
-    With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
-    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`; O maps the state to
-    the reports, n is their noise. A report that earlier ones determine is measured again, with slopes O root that are
-    rounding: K takes an eps of its variance for noise, so that K times these slopes is an eps too.
+    s is the centre's state and n the noise of the reports. Quantizers add G mu to the reports, with the links' gains G
+    and |mu| <= `past.error`.
 
     Returns:
-        The state after, and the law of the reports before they arrived.
+        The corrected state, and the mean and covariance of the reports before they arrived.
     """
     x, past, values = state.gaussian, state.past, jnp.ravel(reports)
-    output, offset = _make_output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
-    expected, present, noise = output @ x.mean + offset, ~jnp.isnan(values), _factor_each(past.noise)
-    gain, unexpected = _compute_gain(x, output, past, present), jnp.where(present, values - expected, 0.0)
+    output = _make_output_matrix(past, len(x.mean))
+    expected, is_present = output @ x.mean + jnp.ravel(past.offset), ~jnp.isnan(values)
+    noise, gain = _factor_each(past.noise), _compute_gain(x, output, past, is_present)
+    # Innovation z - (C s + c), and the error after the correction without quantizers, (I - K C) e - K n.
+    innovation = jnp.where(is_present, values - expected, 0.0)
     slopes = jnp.asarray(output @ x.root)
-    after = correct_by_gain(x, slopes, noise, gain, unexpected)
-    # The errors mu themselves enter the bound (Young, Cauchy).
-    spill = None
-    if state.spill is not None:
-        keep = jnp.eye(len(x.mean)) - gain @ output
-        push = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
-        spill = symmetric(_bound_by_young(propagate_by_mode(keep, state.spill, 0.0), push))
-    law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
-    return ReportsBelief(after, past, spill), law
+    corrected = correct_by_gain(x, slopes, noise, gain, innovation)
+    # Quantizers' part v of the error: v+ = (I - K C) v - K G mu. Both terms are bounded, and then their sum.
+    quantizer_bound = None
+    if state.quantizer_bound is not None:
+        remaining = propagate_by_mode(jnp.eye(len(x.mean)) - gain @ output, state.quantizer_bound, 0.0)
+        added = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
+        quantizer_bound = symmetric(_bound_by_young(remaining, added))
+    report_law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
+    return ReportsBelief(corrected, past, quantizer_bound), report_law
 
 
 def _compute_gain(
@@ -213,6 +239,8 @@ def _compute_gain(
     reports by age and node. `present`: which numbers arrived.
     """
     identity, shape = np.eye(past.noise.shape[-1]), past.offset.shape
+    # A report that earlier ones determine is measured again, with slopes that are rounding errors. A noise of the size
+    # of these errors keeps the gain from dividing them by themselves.
     sizes_of_terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
     # The error of a quantizer is taken as uniform within +-error, with the variance error^2 / 3.
     quantizer_noise = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
@@ -225,33 +253,38 @@ def _compute_gain(
 
 
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
-    """Return the estimate of x, with the covariance of its error or, with quantizers, a bound on it.
+    """Return the estimate of x, the first n numbers of the centre's state, with the covariance of its error.
 
-    `state.spill`: a bound on the squared error by quantizers, or None without them.
+    With quantizers it is a bound: the error is u + v, Cov u in `state.gaussian`, v v' <= `state.quantizer_bound`, and
+    the bound on E[(u + v)(u + v)'] holds whatever the correlation of u and v.
     """
     x = take_leading(state.gaussian, n)
     mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
-    if state.spill is None:
+    if state.quantizer_bound is None:
         return mean, covariance
-    return mean, _bound_by_young(covariance, state.spill[:n, :n])
+    return mean, _bound_by_young(covariance, state.quantizer_bound[:n, :n])
 
 
 def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
-    """Put the present reports before those of earlier steps, and drop the oldest."""
-    mean = errors.state_mean - errors.bias
-    blocks = jnp.einsum("iaib->iab", errors.joint)
-    # E m m' of each node's estimate m = x - e, by the covariances of x and e and of both.
+    """Put the model of the reports that are sent now before those of earlier steps, and drop the oldest.
+
+    The noise of a report, Cov(z_i | m_i) of z_i = G_i m_i + n_i, is the covariance of the link's random gains
+    (`links.spread`) applied to E[(m_i, 1)(m_i, 1)'], the second moment of what node i sends, before any data.
+    """
+    mean = errors.state_mean - errors.bias  # E m_i of each node's estimate m_i = x - e_i
+    # E m_i m_i' = Cov x - Cov(e_i, x) - Cov(x, e_i) + Cov e_i + E m_i E m_i'.
+    error_covariances = jnp.einsum("iaib->iab", errors.joint)
     cross = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
-    second = errors.state_covariance - cross + blocks + mean[:, :, None] * mean[:, None]
-    # Second moments of what is sent, of (m_i, 1), with the quantizers' error.
+    second = errors.state_covariance - cross + error_covariances + mean[:, :, None] * mean[:, None]
+    # Second moments of (m_i, 1), with the quantizers' error.
     error = jnp.asarray(links.error)
     sent = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
     sent = jax.vmap(widen_by_quantization)(sent, jnp.pad(error, ((0, 0), (0, 1))))
-    # Noise of the reports: the spread of the links on what is sent. A link without spread adds none, whatever is sent,
-    # also where the moments of that are unknown: along the estimates of one run.
-    has_spread = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
-    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(has_spread[:, None, None], sent, 0.0))
-    present = PastReports(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
+    # A link whose gains are not random adds no noise, also where the moments of what is sent are unknown (NaN), as they
+    # are along the estimates of one run.
+    has_random_gains = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
+    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(has_random_gains[:, None, None], sent, 0.0))
+    present = PastReports(gain=jnp.asarray(links.gain), offset=jnp.asarray(links.offset), noise=noise, error=error)
     return PastReports(*(jnp.concatenate([new[None], old[:-1]]) for new, old in zip(present, past, strict=True)))
 
 
@@ -305,10 +338,13 @@ def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Ar
     return block_diagonal.reshape(count * rows, count * columns)
 
 
-def _bound_by_cauchy(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
-    """Return B s diag(D) B', which bounds (B mu)(B mu)' for |mu| <= D; s = sum D over what B uses (Cauchy)."""
-    used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
-    return jnp.sum(used) * (into * used) @ into.T
+def _bound_by_cauchy(matrix: Float[jax.Array, "N S"], largest: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
+    """Return s B diag(D) B' with s = sum D, which bounds (B mu)(B mu)' for every mu with |mu| <= D (Cauchy).
+
+    B is `matrix`, and D the `largest` size of each component of mu. Components whose column of B is zero do not count.
+    """
+    used = jnp.where(jnp.any(matrix != 0, axis=0), largest, 0.0)
+    return jnp.sum(used) * (matrix * used) @ matrix.T
 
 
 def _bound_by_young(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -69,13 +69,13 @@ class ErrorMap(NamedTuple):
 class ErrorStep(NamedTuple):
     """One step of the plant and of the nodes' errors, zeta+ = F zeta + f + B w - K nu, w and nu uncorrelated.
 
-    Shapes: transition F, shift f (N,), of_noise B (N, n), process Q = Cov w (n, n), gain K (node, n, m), received
+    Shapes: transition F, shift f (N,), noise_input B (N, n), process Q = Cov w (n, n), gain K (node, n, m), received
     E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes share nothing.
     """
 
     transition: ErrorMap
     shift: Float[jax.Array, " N"]
-    of_noise: Float[jax.Array, "N n"]
+    noise_input: Float[jax.Array, "N n"]
     process: Float[Array, "n n"]
     gain: Float[jax.Array, "node n m"]
     received: Array
@@ -83,8 +83,8 @@ class ErrorStep(NamedTuple):
     def noise(self) -> Float[jax.Array, "N N"]:
         """Return B Q B' + K E[nu nu'] K', the covariance of what the step adds to (x, e_1, ..., e_nodes).
 
-        Q: process noise. nu: noise in what nodes receive. K: the nodes' gains. `self.received` is E[nu nu'], with a
-        block for each node if they share nothing.
+        Q: process noise, which enters by B = `self.noise_input`. nu: noise in what nodes receive. K: the nodes' gains.
+        `self.received` is E[nu nu'], with a block for each node if they share nothing.
         """
         nodes, n, _ = self.gain.shape
         if self.received.ndim == 4:
@@ -93,7 +93,7 @@ class ErrorStep(NamedTuple):
             numbers, blocks = jnp.arange(nodes), symmetrize(propagate_by_mode(self.gain, self.received, 0.0))
             by_received = jnp.zeros((nodes, n, nodes, n)).at[numbers, :, numbers, :].set(blocks)
         padded = jnp.pad(by_received.reshape(nodes * n, nodes * n), ((n, 0), (n, 0)))  # it does not reach x
-        return jnp.asarray(propagate_by_mode(self.of_noise, self.process, padded))
+        return jnp.asarray(propagate_by_mode(self.noise_input, self.process, padded))
 
 
 class ErrorMoments(NamedTuple):
@@ -148,20 +148,27 @@ def make_initial_errors(
 
 
 def make_error_step(filters: LinearStep, motion: Motion, observation: JointObservation) -> ErrorStep:
-    """Return the step of the errors of linear filters; `filters` has a leading axis of nodes."""
-    # K, U = I - K C and L = K (M - C) of each node, with the letters of the first lines of this file.
-    gain, keep, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.shift)
+    """Return the step of the errors e = x - m of linear filters, whose models may be wrong.
+
+    x+ = A x + b + w is the true `motion`, and z = M x+ + o + nu what a node receives (`observation`). Its filter
+    predicts by F m + f and corrects by K (z - C m - c); `filters` has a leading axis of nodes. With U = I - K C and
+    L = K (M - C):
+
+      e+ = U F e + [U (A - F) - L A] x + [U (b - f) - L b - K (o - c)] + (U - L) w - K nu.
+    """
+    # K, U and L, where M - C is the error of the filter's model of the measurement.
+    gain, u, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.shift)
     wrong_gain = gain @ _subtract_without_rounding(observation.gain, filters.output)
-    # A - F, and U (b - f) - L b - K (o - c).
+    # A - F and b - f, then U (b - f) - L b - K (o - c).
     matrices = _subtract_without_rounding(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
     drifts = _subtract_without_rounding(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
-    shift = _multiply_by_node(keep, drifts) - wrong_gain @ jnp.asarray(motion.shift)
+    shift = _multiply_by_node(u, drifts) - wrong_gain @ jnp.asarray(motion.shift)
     shift = shift - _multiply_by_node(gain, _subtract_without_rounding(observation.offset, filters.offset))
-    of_state = keep @ matrices - wrong_gain @ motion.matrix
+    of_state = u @ matrices - wrong_gain @ motion.matrix  # U (A - F) - L A
     return ErrorStep(
-        transition=ErrorMap(motion.matrix, of_state, keep @ filters.transition),
+        transition=ErrorMap(plant=motion.matrix, of_state=of_state, errors=u @ filters.transition),
         shift=jnp.concatenate([jnp.asarray(motion.shift), shift.reshape(-1)]),
-        of_noise=jnp.concatenate([jnp.eye(n), (keep - wrong_gain).reshape(-1, n)]),
+        noise_input=jnp.concatenate([jnp.eye(n), (u - wrong_gain).reshape(-1, n)]),
         process=motion.noise,
         gain=gain,
         received=observation.noise,
@@ -238,41 +245,57 @@ class SourceFactors(NamedTuple):
 
     @property
     def state(self) -> Float[Array, "n sources"]:
-        """Deviation of x from its mean, by the sources that cause it."""
+        """Root R of the plant's state x = E x + R s (n, sources), so that Cov x = R R'.
+
+        The sources s are independent numbers of variance 1: those of x_0 and of the noise of each step. R is the first
+        n rows of `self.roots`.
+        """
         return self.roots[: self.mean.shape[1]]
 
     @property
     def errors(self) -> ErrorSources:
-        """Errors by their sources, without their means."""
+        """The nodes' errors without their means: e_i = R_i s and an independent part, with R_i from `self.roots`.
+
+        The sources s are independent numbers of variance 1. The first n rows of `self.roots` are those of the plant.
+        """
         n = self.mean.shape[1]
         return ErrorSources(self.roots[n:].reshape(-1, n, self.roots.shape[1]), self.independent)
 
 
 def make_initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
-    """Return the factors before the first step, with room for `sources` more; the only sources are those of x_0.
+    """Return zeta = (x, e_1, ..., e_nodes) before the first step as its mean plus roots times independent sources.
 
-    zeta = (x, errors of nodes) is its mean plus roots times the sources, which are independent numbers of variance 1.
+    Sources are independent numbers of variance 1. At the start they are the n of x_0, and each error deviates from its
+    mean as x_0 does. The roots have `sources` further columns, zero until steps fill them with their noises.
     """
     nodes, n = errors.bias.shape
-    state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
-    return SourceFactors(errors.mean, jnp.tile(state, (1 + nodes, 1)), jnp.zeros((nodes, n, n)))
+    state_root = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
+    return SourceFactors(
+        mean=errors.mean, roots=jnp.tile(state_root, (1 + nodes, 1)), independent=jnp.zeros((nodes, n, n))
+    )
 
 
 def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> SourceFactors:
-    """Propagate factors over step k: s gets the process noise, and the measurement noise where nodes share it."""
+    """Propagate zeta = (x, e_1, ..., e_nodes) over step k, zeta+ = F zeta + f + B w - K nu, as roots times sources.
+
+    Sources are independent numbers of variance 1 that errors share. Step k adds those of the process noise w, and those
+    of the measurement noise nu where nodes share it (`step.received` of 4 axes). Otherwise K_i nu_i adds to the
+    independent part of node i's error.
+    """
     nodes, n, m = step.gain.shape
-    new_roots, added = step.of_noise @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
-    # Shared measurement noise is a source, independent noise stays the node's.
+    new_roots, independent_noise = step.noise_input @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
     if step.received.ndim == 4:
+        # Factors of -K nu, whose rows stand below those of x.
         root = cholesky(jnp.asarray(step.received).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
-        measured = (-step.gain @ root).reshape(nodes * n, -1)
-        new_roots = jnp.concatenate([new_roots, jnp.pad(measured, ((n, 0), (0, 0)))], axis=1)
+        measurement_roots = (-step.gain @ root).reshape(nodes * n, -1)
+        new_roots = jnp.concatenate([new_roots, jnp.pad(measurement_roots, ((n, 0), (0, 0)))], axis=1)
     else:
-        added = propagate_by_mode(step.gain, step.received, 0.0)
-    # The new sources of step k go to columns of their own, behind those of x_0 and of the steps before.
+        independent_noise = propagate_by_mode(step.gain, step.received, 0.0)
     mean = step.transition @ factors.mean.reshape(-1) + step.shift
-    roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new_roots, (0, n + new_roots.shape[1] * k))
-    independent = symmetrize(propagate_by_mode(step.transition.errors, factors.independent, added))
+    # Columns of the roots: n for x_0, then those of step 0, of step 1, ...
+    first_new_column = n + new_roots.shape[1] * k
+    roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new_roots, (0, first_new_column))
+    independent = symmetrize(propagate_by_mode(step.transition.errors, factors.independent, independent_noise))
     return SourceFactors(mean.reshape(factors.mean.shape), roots, independent)
 
 

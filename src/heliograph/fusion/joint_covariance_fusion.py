@@ -97,30 +97,34 @@ class AbstractJointWeights(AbstractInformedFusion):
         raise unwritten(self, "arrived")
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Return the weights of the neighbours' estimates that arrived, solved for these alone, and W P W'.
+        """Return the best weights W_j of the neighbours' estimates that arrived, and the fused covariance W P W'.
 
-        P: the joint covariance of the estimates' errors, W the weights. They are held as a front factor, here I, times
-        one part for each.
+        P = `believed.joint` is the joint covariance of the estimates' errors. Estimates that did not arrive have zero
+        weights.
         """
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
         weights = self.weights_of_arrived(believed.joint, believed.present)
+        # A weight is a factor that all share, here I, times one of each neighbour, here W_j.
         return NeighbourWeights(
-            jnp.eye(len(weights)), jnp.swapaxes(weights, 0, 1), weigh_covariance(weights, believed.joint)
+            common_factor=jnp.eye(len(weights)),
+            neighbour_factors=jnp.swapaxes(weights, 0, 1),
+            covariance=weigh_covariance(weights, believed.joint),
         )
 
     def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
         """Return the present estimates fused with the best weights for their joint covariance.
 
-        `happened.errors`: bias and joint covariance of the nodes' errors. If `self.with_mean`, the plant's mean before
-        any data is one more estimate.
+        `happened.errors`: means E e_i and joint covariance of the nodes' errors e_i = x - m_i. If `self.with_mean`, the
+        plant's mean before any data is one more estimate, with the error x - E x.
         """
         errors = happened.errors
+        # E x = E m_i + E e_i: adding the mean error makes an estimate unbiased.
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
-            # Move x - E x, the error of the plant's mean, behind those of the nodes, so that its n rows come last.
             unbiased = jnp.concatenate([unbiased, errors.state_mean[None]])
             count, n = unbiased.shape
+            # `errors.covariance` is that of (x, e_1, ..., e_nodes); rolled by n it is that of (e_1, ..., e_nodes, x).
             joint = jnp.roll(errors.covariance, (-n, -n), (0, 1)).reshape(count, n, count, n)
         weights = self.weights(joint)
         # W sums to I, so that it can weigh differences of the means. Rounding of W then only affects these.
@@ -174,16 +178,18 @@ class DiagonalWeights(AbstractJointWeights):
         return solve_regularised_weights_by_component(joint, present)
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Return weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices.
+        """Return the weights of the neighbours' estimates that arrived, by component where neighbours are few.
 
-        WRITTEN: most neighbours for which the solution is written out; weights are held as a front factor, here I,
-        times parts.
+        WRITTEN is the largest number of neighbours for which the solution is written out, without matrix products.
         """
         if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
             return super().neighbour_weights(believed)
         diagonals = component_weights(believed.joint, believed.present)
-        identity = jnp.eye(diagonals.shape[1])
-        return NeighbourWeights(identity, diagonals, weigh_covariance_by_component(diagonals, believed.joint))
+        return NeighbourWeights(
+            common_factor=jnp.eye(diagonals.shape[1]),
+            neighbour_factors=diagonals,
+            covariance=weigh_covariance_by_component(diagonals, believed.joint),
+        )
 
 
 class ScalarWeights(AbstractJointWeights):

@@ -108,7 +108,10 @@ class Fusion(Module):
 
     @property
     def by_report(self) -> bool:
-        """True where the reports that arrive may differ from those that were sent."""
+        """True where the fusion centre models each report's way: the link that it takes, or the error of its quantizer.
+
+        A report is the estimate that a node sends. Other rules fuse the estimates themselves as they arrive.
+        """
         return self.uplink is not None or (self.rule.uses_reports and self.quantizer is not None)
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
@@ -120,7 +123,7 @@ class Fusion(Module):
         return [quantizer for quantizer in self._quantizers(nodes) if isinstance(quantizer, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
-        """Return the quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
+        """Return the quantizers on the nodes' uplinks, stacked along a leading axis; None without quantizers.
 
         Raises:
             ValueError: quantizers of different kinds.
@@ -128,16 +131,17 @@ class Fusion(Module):
         return None if self.quantizer is None else stack(self._quantizers(nodes))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Return the claim of the fused covariance, from the claims of the filters.
+        """Return what the fused covariance is said to be ("exact", "upper" bound, or "nominal").
 
-        `self.quantizer`: None, or one quantizer for all nodes, or {node: quantizer}.
+        `claims` says it of the filters' covariances. A quantizer may weaken them before the rule fuses.
         """
         if self.quantizer is None:
             return self.rule.claim(claims)
-        # All quantizers are of one kind, and only the kind decides the claim.
+        # `check` allows quantizers of one class only, and the class decides the claim: any one of them will do.
         any_quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
         quantizer = stack_over_time(any_quantizer)
-        return self.rule.claim([quantizer.claim(claim) for claim in claims])
+        quantized_claims = [quantizer.claim(claim) for claim in claims]
+        return self.rule.claim(quantized_claims)
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
         """List the quantizers of all nodes, one for each."""

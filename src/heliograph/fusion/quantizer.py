@@ -47,12 +47,12 @@ class AbstractQuantizer(Module):
 
     @property
     def silent(self) -> bool:
-        """True if a value may not arrive."""
+        """True if there may be steps at which nothing arrives (NaN), as with sending on events; False by default."""
         return False
 
     @property
     def holds(self) -> bool:
-        """True if nothing may be sent, and the receiver takes what was sent last for the value."""
+        """True if nothing may be sent at a step, where the receiver holds the last value; False by default."""
         return False
 
     def init(self, n: int) -> PyTree:
@@ -242,7 +242,7 @@ class UplinkState(NamedTuple):
 
     @property
     def synchronised(self) -> Bool[Array, "*n"]:
-        """True where the end knows the amplitude."""
+        """True where this end knows the amplitude; a receiver that missed a value has a negative `number`."""
         return self.number >= 0
 
 
@@ -314,21 +314,27 @@ class EscapeQuantizer(AbstractQuantizer):
 
     @in_float64
     def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> UplinkSymbols:
-        """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
+        """Encode a value x (n,) as m escape symbols, each of which doubles the amplitude d, and the segment of x.
+
+        With m = ceil(log2(|x| / d)), from 0, x lies in [-d 2^m, d 2^m]. d is the amplitude that both ends know, or the
+        first one if `restart`. The segment is NOTHING for NaN; ABOVE or BELOW where d 2^m is no number.
+        """
         x = jnp.asarray(fill_masked(value), dtype=float)
         restarts = jnp.broadcast_to(self._is_restart(state.number) | restart, x.shape)
         amplitude = self._present_amplitude(state, restarts)
-        # m = ceil(log2(|x| / d)) by exponents, without rounding.
+        # m by exponents, without rounding: x = x_fraction 2^x_power and d = fraction 2^power.
         (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
-        most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
-        is_value, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
-        escapes = jnp.where(x != 0, jnp.clip(jnp.where(beyond, most, doublings), 0), 0)
+        most_doublings = np.finfo(x.dtype).maxexp - power  # the largest m for which d 2^m is a finite number
+        is_value, is_beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most_doublings)
+        escapes = jnp.where(x != 0, jnp.clip(jnp.where(is_beyond, most_doublings, doublings), 0), 0)
         segment = find_segment(x, jnp.ldexp(amplitude, escapes), self.levels)
-        segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(is_value, segment, NOTHING))
-        numbers = jnp.broadcast_to(state.number, x.shape)
+        segment = jnp.where(is_beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(is_value, segment, NOTHING))
         return UplinkSymbols(
-            jnp.where(is_value, escapes, 0).astype(int), segment.astype(int), numbers, restarts & is_value
+            escapes=jnp.where(is_value, escapes, 0).astype(int),
+            segment=segment.astype(int),
+            number=jnp.broadcast_to(state.number, x.shape),
+            restart=restarts & is_value,
         )
 
     @in_float64

@@ -62,7 +62,10 @@ class EventSending(AbstractQuantizer):
 
     @property
     def holds(self) -> bool:
-        """True where silence is understood: then the receiver has to know the value that was sent last."""
+        """True if the receiver holds the value that was sent last for as long as nothing is sent.
+
+        It may do so if it knows the thresholds (`announced`): silence then means that x is still near that value.
+        """
         return self.announced
 
     @in_float64
@@ -91,7 +94,11 @@ class EventSending(AbstractQuantizer):
         )
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Return the thresholds as the error bound, where silence is interpreted; zero otherwise."""
+        """Return a bound (n,) on |received - x|: the thresholds if the receiver knows them, and zero otherwise.
+
+        A receiver that knows them takes the last value for x while nothing is sent, which is off by a threshold at
+        most. One that does not know them uses nothing but values that are sent, and these are not rounded.
+        """
         bound = library(self.threshold).broadcast_to(self.threshold, (n,))
         return bound if self.announced else np.zeros(n)
 

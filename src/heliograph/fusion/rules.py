@@ -82,7 +82,11 @@ class AbstractFusion(Module):
         return self
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Return the weights of the neighbours' estimates that arrived, and the covariance of what is fused."""
+        """Return the weights of the neighbours' estimates that arrived, and the fused covariance.
+
+        Raises:
+            ValueError: always here; a rule that can fuse between neighbours defines it.
+        """
         raise fail("fusion between neighbours", "a rule such as CovarianceIntersection() or MatrixWeights()",
                    type(self).__name__)  # fmt: skip
 

@@ -104,10 +104,11 @@ class SplitIntersection(AbstractIntersection):
 
 
 def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
-    """Return the parts P^b_i = P_i - P^a_ii with the rounding error of P_i added, except parts that are 0.
+    """Return the covariances P^b_i of unknown correlation with the rounding error of P_i on their diagonals.
 
-    P_i is the covariance of estimate i, P^a its part of known and P^b that of unknown correlation. A part is later
-    divided by a share that may be small, so that a missing rounding error of P_i would matter.
+    P^b_i = P_i - P^a_ii (`unknown`) is computed from the covariance P_i of estimate i, so that it is wrong by the
+    rounding error of P_i. It is later divided by a share, which may be small; without this addition the result could
+    then be too small. Where P^b_i is zero, all of P_i is known, and nothing is added.
     """
     n = unknown.shape[-1]
     rounding = rounding_of_variances(jnp.einsum("aii->ai", covariances), n)

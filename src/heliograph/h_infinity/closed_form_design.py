@@ -122,17 +122,22 @@ def _compute_best_gain(
 
 
 def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
-    """Return the next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
+    """Return the weight p+ of the next state, P1+ = p+ I, and the multipliers lambda_f and lambda_h of f and h.
 
-    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2, so any weight that is small enough will do.
-    d = SPARE leaves a part of it for the multipliers. a and b are growth constants of f and h: |f(x)| <= a |x|.
-    `state` is the present weight. Where a = 0, f is zero and its multiplier does not matter.
+    No measurement changes x+ = A x + f + B v. f and h are known by |f| <= a |x| and |h| <= b |x|, so that its part of
+    the step's inequality is, for every x, f, h and v, and up to a share of |v|^2,
+
+      p+ |A x + f + B v|^2 + lambda_f (a^2 |x|^2 - |f|^2) + lambda_h (b^2 |x|^2 - |h|^2) < p |x|^2.
+
+    |A x + f + B v|^2 <= (1 + d) |A x + f|^2 + (1 + 1/d) |B|^2 |v|^2 with d = SPARE, and |A x + f| is at most
+    (|A| + a) |x|. A p+ of (1 + d)^-3 p / (|A| + a)^2 or less leaves a part of p for the multipliers. `state` is p.
     """
     norm_of_a = np.linalg.norm(system.transition[k], 2)
     a, b = system.growth.state[k], system.output_growth.state[k]
     next_weight = state / ((1 + SPARE) ** 3 * max(float(norm_of_a + a) ** 2, 1.0))
+    # |A x + f|^2 <= (1 + |A|/a) |f|^2 + (1 + a/|A|) |A x|^2: lambda_f outweighs the first term. If a = 0, f is zero.
     multiplier_f = next_weight * 10 / SPARE
     if a > 0:
         multiplier_f = next_weight * (1 + SPARE) ** 2 * float(1 + norm_of_a / a)
-    multiplier_h = state * SPARE / (4 * (1 + float(b) ** 2))
+    multiplier_h = state * SPARE / (4 * (1 + float(b) ** 2))  # lambda_h b^2 is at most d / 4 of p
     return next_weight, (multiplier_f, multiplier_h)

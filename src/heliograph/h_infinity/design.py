@@ -194,12 +194,20 @@ def _find_first_failing(
 ) -> int | None:
     """Return the number of the first step whose inequality a solution does not satisfy; None if all hold.
 
-    `solved` holds each step's unknowns, `weights` the weight P before each step, in scaled coordinates. `square` is the
-    level squared. An inequality must hold by the share SCREEN of it. `fixed` is its part without unknowns.
+    At a step, E[(x+, e+)'P+ (x+, e+)] + |M e|^2 - gamma^2 |(v, rho)|^2 < (x, e)'P (x, e), whatever the disturbances v
+    and rho are, in scaled coordinates. It must hold by SCREEN gamma^2.
+
+    Args:
+        steps: matrices of all steps.
+        solved: each step's unknowns: P+, gain and multipliers.
+        weights: P before each step.
+        square: the level squared, gamma^2.
     """
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
+        # The part without unknowns. (x, e) are the first entries of eta, the vector of all that the step depends on.
         fixed = step.target - square * step.energy
-        fixed[: len(weights[k]), : len(weights[k])] -= weights[k]
+        size = len(weights[k])
+        fixed[:size, :size] -= weights[k]
         if not _inequality_holds(step, unknowns, fixed, strictness=SCREEN * square):
             return k
     return None
@@ -209,7 +217,15 @@ class _RecursiveDesigner:
     """Recursive design over the horizon: one problem a step, compiled again only where the system's data change."""
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
-        """Keep the system with its steps in scaled coordinates, and a list of the problems compiled so far."""
+        """Store the system with its steps in scaled coordinates, and a list of the problems compiled so far.
+
+        Args:
+            system: plant, sensor and channel; functions f and h in them are known by growth constants alone, each with
+                a multiplier in the step's inequality.
+            objective: which of the feasible weights after a step is taken.
+            solver: "clarabel" or "scs".
+            separate: one multiplier for each growth condition; else those of f share one, and those of h.
+        """
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
         self.steps, self.coordinates = scale_steps(system, list_step_matrices(system, separate))
         self.layout = UnknownsLayout(system.states, system.received, len(self.steps[0].growth))
@@ -283,11 +299,13 @@ def _check_initial_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"
 def _inequality_holds(
     step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float
 ) -> bool:
-    """Decide whether one step is feasible: P1, P2 > 0, and Phi with Z = K'P2 K itself strictly negative.
+    """Decide whether one step is feasible: P1, P2 > 0, and all eigenvalues of Phi below -strictness.
 
-    P1 and P2 are the next weights (`state` and `error` of the unknowns), and K is the gain. Phi is the matrix of the
-    step's inequality in eta, and `fixed` is its part without unknowns, S - diag(P, 0).
+    eta'Phi eta = E[x+'P1 x+ + e+'P2 e+] + growth forms + `fixed`, where eta is the vector of all that the step depends
+    on, and x+ and e+ are the next state and error. `fixed` is the part without unknowns: |M e|^2 - gamma^2 |(v, rho)|^2
+    less the weight of (x, e) before the step.
     """
+    # The solver's unknowns are Y and Z >= K'P2 K with K = P2^-1 Y. Phi is judged with Z = K'P2 K itself.
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)
     are_positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0

@@ -29,20 +29,26 @@ class ScaledCoordinates(NamedTuple):
     nothing_grows: bool
 
     def relative_scales(self, k: int) -> tuple[float, float]:
-        """Return the scales of x and e before step k, each divided by the larger of both.
+        """Return the scales of the state x and the error e before step k, each divided by the larger of both.
 
-        `self.states` (times, 2n, 2n) holds diag(S1, S2). Where f or h is not zero, its growth bound |f(x)| <= a |x|
-        compares norms, so that S1 and S2 are multiples of I by these scales. Where nothing grows, S1 and S2 are full
-        matrices and (1, 1) is returned.
+        Objectives of the design are of weights of x and e, and by these scales they keep the user's units. Scaled
+        coordinates are defined by (x, e) = diag(S1, S2) (scaled x, scaled e); `self.states` holds diag(S1, S2). If the
+        plant or the sensor has a nonlinear function f, known by |f(x)| <= a |x|, S1 and S2 are numbers times I.
+        Otherwise (`self.nothing_grows`) they are full matrices, which have no one scale, and (1, 1) is returned.
         """
         if self.nothing_grows:
             return 1.0, 1.0
-        x, e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
-        return x / max(x, e), e / max(x, e)
+        scale_of_x, scale_of_e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
+        larger = max(scale_of_x, scale_of_e)
+        return scale_of_x / larger, scale_of_e / larger
 
     def unscale_weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
-        """Return the weight P_k in the user's units."""
-        half = np.linalg.solve(self.states[k].T, scaled)
+        """Return the weight P_k in the user's units, unit^2 S'^-1 P S^-1 from P in scaled coordinates.
+
+        S = `self.states`[k] takes scaled (x, e) to those in the user's units. Scaled weights are in units of the level
+        squared, whose unit is `self.unit`^2.
+        """
+        half = np.linalg.solve(self.states[k].T, scaled)  # S'^-1 P
         return self.unit**2 * _symmetrise(np.linalg.solve(self.states[k].T, half.T))
 
     def scale_initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
@@ -145,10 +151,18 @@ def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]
 def _compute_eta_covariance(
     system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray
 ) -> np.ndarray:
-    """Return the covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows.
+    """Return a covariance of eta = (x, e, f, f~, h, h~, v, rho) by which its coordinates are scaled.
 
-    x and e are the covariances of x and e before step k; disturbances v and rho have the variance 1, and functions that
-    are absent no part in eta.
+    The functions f(x) and h(x), and their differences f~ = f(x) - f(xhat) and h~ between the state and its estimate,
+    are known by growth constants alone, |f(x)| <= a |x|: each gets the largest variance that its constant allows. The
+    disturbances v and rho get the variance 1. A function that is zero at all steps is not in eta.
+
+    Args:
+        system: its growth constants.
+        k: the step.
+        step: its matrices, of the size q of eta.
+        x: covariance of the state before the step.
+        e: covariance of the error before the step.
     """
     n, y, q = system.states, system.output.shape[1], len(step.energy)
     covariance, begin = np.zeros((q, q)), 2 * n
@@ -156,10 +170,10 @@ def _compute_eta_covariance(
     for growth, width in ((system.growth, n), (system.output_growth, y)):
         if growth.absent:
             continue
-        # |f(x)|^2 <= a^2 |x|^2, at most a^2 times the largest variance in any direction.
-        for constant, p in ((growth.state[k], x), (growth.error[k], e)):
-            part = slice(begin, begin + width)
-            covariance[part, part] = constant**2 * np.linalg.eigvalsh(p)[-1] * np.eye(width)
+        # Of f or h, then of f~ or h~: a^2 times the largest variance of the argument in any direction.
+        for constant, argument_covariance in ((growth.state[k], x), (growth.error[k], e)):
+            indices = slice(begin, begin + width)
+            covariance[indices, indices] = constant**2 * np.linalg.eigvalsh(argument_covariance)[-1] * np.eye(width)
             begin += width
     covariance[begin:, begin:] = np.eye(q - begin)
     return covariance
@@ -168,22 +182,25 @@ def _compute_eta_covariance(
 def _propagate_covariances(
     step: StepMatrices, eta: np.ndarray, given: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the covariances of x+, of e+ with the given or the best gain and of what is received, and that gain.
+    """Return the covariances of x+, of e+ and of the innovation, and the gain K: the `given` one, or the best.
 
-    eta: the covariance of eta before the step.
+    With the covariance Cov eta = `eta` of all that the step depends on: x+ = X eta, the innovation is (U + W) eta with
+    a random W of mean zero, E[W Q W'] = sum_j U_j Q U_j', and e+ = E eta - K (U + W) eta.
     """
-    by_mean = step.received @ eta @ step.received.T
+    E, U = step.error, step.received
+    # R = Cov (U + W) eta = U Cov eta U' + sum_j U_j Cov eta U_j'.
+    by_mean = U @ eta @ U.T
     received = by_mean + np.einsum("jai,ik,jbk->ab", step.spreads, eta, step.spreads)
-    # The best gain Cov(e+, received) Cov(received)^-1, in units of what is received.
-    cross = step.error @ eta @ step.received.T
+    # The best gain E Cov eta U' R^-1, computed in units of the innovation's deviations.
+    cross = E @ eta @ U.T
     unit = np.sqrt(np.maximum(np.diagonal(received), np.finfo(float).tiny))
     best = cross / unit @ np.linalg.pinv(received / np.outer(unit, unit), rcond=RANK, hermitian=True) / unit
     gain = best if given is None else given
-    # e+ after the correction, and at least SMALLEST of what it was before.
-    before, left = step.error @ eta @ step.error.T, step.error - gain @ step.received
-    after = left @ eta @ left.T + gain @ (received - by_mean) @ gain.T
-    floor = SMALLEST**2 * np.diag(np.diagonal(before))
-    return step.state @ eta @ step.state.T, _symmetrise(after) + floor, received, gain
+    # (E - K U) Cov eta (E - K U)' + K (R - U Cov eta U') K', and of each variance at least SMALLEST^2 of the predicted.
+    predicted, corrected_map = E @ eta @ E.T, E - gain @ U
+    corrected = corrected_map @ eta @ corrected_map.T + gain @ (received - by_mean) @ gain.T
+    floor = SMALLEST**2 * np.diag(np.diagonal(predicted))
+    return step.state @ eta @ step.state.T, _symmetrise(corrected) + floor, received, gain
 
 
 def _keep_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -125,31 +125,38 @@ class StepProblem:
     def _list_constraints(
         self, cp: ModuleType, step: StepMatrices, forms: LinearForms, start: Float[np.ndarray, "w w"] | None
     ) -> "list[Constraint]":
-        """Return the constraints Phi < 0 of each part of eta that is coupled, multipliers >= 0, and positive matrices.
+        """Return the constraints of a step: Phi < 0, multipliers >= 0, and matrices that must be positive definite.
 
-        Phi (q, q) is the matrix of the step's inequality in eta. `forms` are the linear maps from the unknowns to Phi
-        and to the matrices that must be positive definite, such as [[Z, Y'], [Y, P2]] with Y = P2 K and Z >= K'P2 K.
-        A matrix must be definite by MARGIN.
+        eta'Phi eta < 0 is the step's inequality, for every eta, the vector (of length q) of all that the step depends
+        on. Phi is linear in the unknowns (`forms.next`) plus a known part (`self.fixed`). Matrices such as
+        [[Z, Y'], [Y, P2]], with Y = P2 K and Z >= K'P2 K, must be positive (`forms.positive`). A matrix must be
+        definite by MARGIN. `start`: the weight before the step if it couples state and error.
         """
         q, layout = len(step.energy), self.layout
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
+        # The multipliers are the last unknowns.
         constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
-        for coupled in find_independent_parts(step, forms, start):
-            constraints.append(phi[coupled][:, coupled] << -MARGIN * np.eye(len(coupled)))
+        # Phi is block-diagonal after a permutation: a smaller constraint for each block, by its indices of eta.
+        for block in find_independent_parts(step, forms, start):
+            constraints.append(phi[block][:, block] << -MARGIN * np.eye(len(block)))
         for form in forms.positive:
             size = math.isqrt(len(form))
             constraints.append(cp.reshape(form @ self.unknowns, (size, size), order="C") >> MARGIN * np.eye(size))
         return constraints
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
-        """Solve with fixed = S - diag(P, 0) at level 1; return the solver's status, and a solution if there is one."""
+        """Solve the problems of all objectives, one after another; return the solver's status, and a solution if any.
+
+        `fixed` is the part of the step's inequality without unknowns: |M e|^2 - |(v, rho)|^2 less the weight P before
+        the step, as a form of eta, the vector of all that the step depends on, in units of the level squared.
+        """
         self.fixed.value = fixed
         first, *others = self.problems
         status = run_solver(first, self.solver)
         if not status.startswith("optimal") or self.unknowns.value is None:
             return status, None
-        # Later objectives, held near the first one's best value: at the narrowest tie that the solver does not find too
-        # narrow.
+        # A later objective may give up a share of the first one's best value, its tie. The smallest share of TIES for
+        # which the solver finds an optimum is taken.
         values, best = np.asarray(self.unknowns.value), float(first.value)
         for problem in others:
             for tie in TIES:

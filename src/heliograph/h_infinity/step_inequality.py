@@ -52,36 +52,42 @@ class Unknowns(NamedTuple):
 
 
 def list_step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
-    """Return the matrices of every step.
+    """Return the matrices of every step of x+ = A x + f(x) + B v, received G (C x + h(x) + D v) + N rho.
 
-    They act on eta, the vector of all that a step depends on. A function that is zero at all steps, such as the h of a
-    linear sensor, is left out of eta. With `separate`, each of f, f~, h, h~ has a multiplier; else (f, f~) share one,
-    and (h, h~) too. U_j are the matrices of the random part of what is received.
+    They act on eta = (x, e, f, f~, h, h~, v, rho): the state x, the error e = x - xhat, the functions f(x) and h(x),
+    their differences f~ = f(x) - f(xhat) and h~ = h(x) - h(xhat), and the disturbances. A function that is zero at all
+    steps is left out of eta. f and h are known by bounds |f(x)| <= a |x| alone, each of which is a quadratic form
+    eta'N_i eta >= 0 with a multiplier lambda_i >= 0 (S-procedure). With `separate`, each of f, f~, h, h~ has a
+    multiplier; else (f, f~) share one, and (h, h~) too.
     """
-    # All steps need the same number of matrices U_j: a step with fewer gets matrices of zeros.
+    # The random part of (G, N) is a sum of independent matrices. All steps need the same number of these: a step with
+    # fewer gets matrices of zeros.
     spreads = [link.spreads() for link in system.channel]
-    count = max(len(of_step) for of_step in spreads)
+    count = max(len(matrices) for matrices in spreads)
     padded = []
-    for of_step in spreads:
-        zeros = np.zeros((count - len(of_step), *of_step.shape[1:]))
-        padded.append(np.concatenate([of_step, zeros]))
+    for matrices in spreads:
+        zeros = np.zeros((count - len(matrices), *matrices.shape[1:]))
+        padded.append(np.concatenate([matrices, zeros]))
     return [_make_step_matrices(system, k, padded[k], separate) for k in range(system.steps)]
 
 
 def complete_multipliers(
-    system: GrowthSystem, given: Float[np.ndarray, "*steps present"], separate: bool
+    system: GrowthSystem, found: Float[np.ndarray, "*steps present"], separate: bool
 ) -> Float[np.ndarray, "*steps count"]:
-    """Return all multipliers, zeros for functions that were left out: (steps, 4) for f, f~, h, h~, or (steps, 2).
+    """Return the multipliers of all growth conditions, from those `found` for functions f and h that are not zero.
 
-    f~ and h~ are the differences of f and h between the state and its estimate. A function is absent if it is zero at
-    all steps. With `separate` each of the four has a multiplier; else (f, f~) share one, and (h, h~) too.
+    f and h are known by bounds |f(x)| <= a |x|, and so are their differences f~ and h~ between the state and its
+    estimate. In the step's inequality each bound is a quadratic form times a multiplier lambda >= 0 (S-procedure). A
+    function that is zero at all steps has no unknown multiplier; its place is filled with 0.
+
+    With `separate` the result is (steps, 4) for f, f~, h, h~. Otherwise (f, f~) share one, and (h, h~) too: (steps, 2).
     """
     multipliers_by_function = 2 if separate else 1
     is_present = [
         not growth.absent for growth in (system.growth, system.output_growth) for _ in range(multipliers_by_function)
     ]
-    multipliers = np.zeros((*given.shape[:-1], len(is_present)))
-    multipliers[..., is_present] = given
+    multipliers = np.zeros((*found.shape[:-1], len(is_present)))
+    multipliers[..., is_present] = found
     return multipliers
 
 
@@ -143,10 +149,10 @@ class _PartsOfEta(NamedTuple):
 
 
 def _locate_parts_of_eta(system: GrowthSystem, k: int) -> _PartsOfEta:
-    """Return the place of each part of eta at step k.
+    """Return at which indices of eta = (x, e, f, f~, h, h~, v, rho) each of its parts stands, at step k.
 
-    The parts are x, e, f, f~, h, h~, the plant's disturbance and the channel's. A function that is zero at all steps
-    has a place of length 0.
+    x is the state, e its error; f~ = f(x) - f(xhat) (`f_error`) and h~ = h(x) - h(xhat) (`h_error`); v and rho are the
+    disturbances of plant and channel. A function that is zero at all steps has an empty slice.
     """
     n, y = system.states, system.output.shape[1]
     size_of_f = 0 if system.growth.absent else n
@@ -160,11 +166,12 @@ def _locate_parts_of_eta(system: GrowthSystem, k: int) -> _PartsOfEta:
 def _list_growth_forms(
     system: GrowthSystem, k: int, eta: _PartsOfEta, separate: bool
 ) -> Float[np.ndarray, "multipliers q"]:
-    """Return the diagonals of the growth forms of step k, one for each multiplier.
+    """Return the diagonals (multiplier, q) of the growth forms N_i of step k, with eta'N_i eta >= 0, one a multiplier.
 
-    Conditions |value| <= constant |argument| on f and f~, on h and h~; `separate`: each has a multiplier of its own.
-
-    q: length of eta; f~, h~ (`f_error`, `h_error`): differences of f and h.
+    f and h are known by |f(x)| <= a |x| and |f(x) - f(xhat)| <= a~ |x - xhat|, likewise h. Each bound is a form
+    a^2 |x|^2 - |f|^2 >= 0 of eta, the vector (of length q) of all that the step depends on. A multiplier certifies a
+    form (S-procedure): with `separate` it is the form of one bound, otherwise the sum of those of f and f~, or of h and
+    h~. `eta` says where each part of eta stands; f~ is `eta.f_error`, h~ is `eta.h_error`.
     """
     growth, output_growth = system.growth, system.output_growth
     pairs_of_conditions = []
@@ -179,33 +186,36 @@ def _list_growth_forms(
     return np.array([_make_growth_form(q, group) for group in groups]).reshape(-1, q)
 
 
-def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
+def _make_growth_form(q: int, bounds: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
     """Return sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta.
 
-    The form is not negative if every |value_i| <= a_i |argument_i|. Each of `parts` holds the places of value_i and
-    argument_i in eta, and a_i.
+    The form is not negative if every |value_i| <= a_i |argument_i|. Each of `bounds` holds the indices of value_i and
+    of argument_i in eta, and a_i.
     """
     diagonal = np.zeros(q)
-    for value, argument, constant in parts:
+    for value, argument, constant in bounds:
         diagonal[value] -= 1.0
         diagonal[argument] += constant**2
     return diagonal
 
 
 def compute_next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
-    """Return the quadratic form E[next weight of (x+, e+)] + sum_i lambda_i N_i of eta, linear in the unknowns.
+    """Return the matrix of eta's form E[x+'P1 x+ + e+'P2 e+] + sum_i lambda_i eta'N_i eta, linear in the unknowns.
 
-    X, E and U are the maps from eta to x+, e+ and what is received. P1 and P2 are the next weights, Y = P2 K and
-    Z >= K'P2 K. N_i are the growth forms, with multipliers lambda_i. The form is, over the random matrices U_j,
-    X'P1 X + E'P2 E - E'Y U - U'Y'E + U'Z U + sum_j U_j'(K0 + K)'P2 (K0 + K) U_j + sum_i lambda_i N_i.
+    eta is the vector of all that the step depends on: x+ = X eta, e+ = (E - K U) eta - (K0 + K) W eta. K0 (`nominal`)
+    is a fixed gain, K its unknown correction; W is random, E[W'Q W] = sum_j U_j'Q U_j with the matrices `spreads`. P1
+    and P2 are weights, Y = P2 K and Z >= K'P2 K. N_i are the growth forms. So the matrix is, with Z for K'P2 K,
+
+      X'P1 X + (E - K U)'P2 (E - K U) + sum_j U_j'(K0 + K)'P2 (K0 + K) U_j + sum_i lambda_i N_i.
     """
-    X, E, U = step.state, step.error, step.received
+    X, E, U, K0 = step.state, step.error, step.received, step.nominal
     p1, p2, Y, Z, multipliers = unknowns
+    # (E - K U)'P2 (E - K U) = E'P2 E - E'Y U - U'Y'E + U'Z U.
     cross = E.T @ Y @ U
     form = X.T @ p1 @ X + E.T @ p2 @ E - cross - cross.T + U.T @ Z @ U
-    # The random part is corrected by the whole gain K0 + K: (K0 + K)'P2 (K0 + K), with Z in place of K'P2 K.
-    cross_gain = step.nominal.T @ Y
-    whole_gain_weight = Z + cross_gain + cross_gain.T + step.nominal.T @ p2 @ step.nominal
+    # (K0 + K)'P2 (K0 + K) = Z + K0'Y + Y'K0 + K0'P2 K0.
+    cross_gain = K0.T @ Y
+    whole_gain_weight = Z + cross_gain + cross_gain.T + K0.T @ p2 @ K0
     form += np.einsum("jai,ab,jbk->ik", step.spreads, whole_gain_weight, step.spreads)
     return np.asarray(form + np.diag(multipliers @ step.growth))
 
@@ -232,10 +242,11 @@ class UnknownsLayout(NamedTuple):
         return n * (n + 1) + unknowns_of_gain + self.multipliers
 
     def unpack(self, vector: Float[np.ndarray, "size"]) -> Unknowns:
-        """Return the unknowns: triangles of P1 and P2, then Y and a triangle of Z, then the multipliers.
+        """Return the unknowns of a step from their vector: triangles of P1 and P2, Y, a triangle of Z, multipliers.
 
-        P1 and P2 are the next weights of state and error, and K is the gain. If the gain is given, Y = P2 K and
-        Z = K'P2 K are computed from it, and are not in the vector.
+        The weights P1 and P2 of the next state and error, the gain K in Y = P2 K and Z >= K'P2 K, and the multipliers
+        of the growth conditions must make the step's quadratic form negative. If K is given, Y = P2 K and Z = K'P2 K
+        are computed from it, and are not in the vector.
         """
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
@@ -280,10 +291,12 @@ class LinearForms(NamedTuple):
 
 
 def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
-    """Return the linear forms of a step, whose columns are their values at the unit vectors of the unknowns.
+    """Return the matrices of a step's inequality as linear maps of the vector of unknowns, each matrix row by row.
 
-    There are forms for Phi's part with unknowns, for the matrices that must be positive, and for the next weight. Each
-    gives its matrix row by row. `layout.gain` is the given gain, or None if the gain is unknown.
+    The inequality is Phi < 0: Phi = E[x+'P1 x+ + e+'P2 e+] and growth forms (`compute_next_energy`, the map `next`),
+    plus a part without unknowns. It needs P1 > 0, and [[Z, Y'], [Y, P2]] > 0, so that Z > K'P2 K (Schur complement),
+    or P2 > 0 if the gain K is given. `weight` is diag(P1, P2). All are linear: column i of a map is the matrix at unit
+    vector i. `layout`: where each unknown stands in the vector.
     """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     forward = np.array([compute_next_energy(step, unit).ravel() for unit in units]).T

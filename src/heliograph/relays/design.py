@@ -222,8 +222,11 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 
 @compile_in_float64
 def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
-    """Return the covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
-    return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
+    """Return at each step the covariance of state, errors of all F filters before corrections, and R innovations.
+
+    `moments` (d, d): of the state and the errors before the step; the result has size z = d + R.
+    """
+    return jax.vmap(lambda step, covariance: step_moments(step, covariance)[0])(steps, moments)
 
 
 def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
@@ -310,17 +313,13 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
     start_mean, _start_covariance = network.initial()
     mean[:n], covariance[:d, :d] = start_mean, initial_error_covariance(network)[:d, :d]
-    # Gains on what nobody transmits are not used. The receiver comes last, behind all relays.
+    # Gains on what nobody transmits are not used; the receiver comes last.
     ends, receives = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
-    relayed = {
-        name: np.asarray(gains[name]) * receives[:, None, end - size : end]
-        for name, size, end in zip(network.relays, network.received, ends, strict=False)
-    }
+    relayed = {name: np.asarray(gains[name]) * receives[:, None, end - size : end]
+               for name, size, end in zip(network.relays, network.received, ends, strict=False)}  # fmt: skip
     x_of_state = np.eye(n, d + r)
-    return with_premise(
-        LinearSystem(system, mean, covariance, x_of_state),
-        Premise(network.plant, relays=network, gains=relayed),
-    )
+    premise = Premise(network.plant, relays=network, gains=relayed)
+    return with_premise(LinearSystem(system, mean, covariance, x_of_state), premise)
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
@@ -383,14 +382,14 @@ def make_receiver_view(
 def _list_receiver_views(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]
 ) -> ReceiverViewOfRelays:
-    """Return for each step the system that the receiver sees, with x and the relays' errors as its state.
+    """Return for each step the linear system that the receiver observes: its state is x and the relays' errors.
 
-    `start` is the covariance of x and all filters' errors before the first step. `gains` are those of all filters in
-    block matrices (`join_gains`).
+    `start` is the covariance of x and all F filters' errors before the first step. `gains` are those of all filters,
+    one block matrix (F n, R) for each step.
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:
-        """Return the moments of x and all filters' errors after a step, and the system that the receiver sees at it."""
+        """Return the moments of x and all filters' errors after a step, and the system that the receiver observes."""
         step, gain = row
         uncorrected, _ = step_moments(step, moments)
         # Corrected by the gains, without those on numbers that no link brings in this slot.

@@ -61,26 +61,29 @@ class PowerLimitedProblem(NamedTuple):
 
 
 def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
-    """Return the limit on the moments after each step, from one on the power that all relays send at each step.
+    """Return a limit `value` on the power of all relays together at each step as one on Cov(x, e_1 .. e_F) (d, d).
+
+    <form_k, covariance after step k> <= limit_k limits what relays send at step k + 1.
 
     Raises:
         ValueError: a limit below what the mean state takes.
     """
     horizon = len(steps.receives_in_slot)
     limit = repeat_per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
-    # Each relay that transmits sends at least |C E x|^2, since estimates are unbiased: E s = E x.
+    # A relay sends C s: E |C s|^2 = |C E x|^2 + tr Cov(C s), since estimates are unbiased, E s = E x.
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
-    transmitting = steps.transmits_in_slot[:, 1:].sum(axis=1)
+    transmitting = steps.transmits_in_slot[:, 1:].sum(axis=1)  # how many relays do
     fixed = mean_signal * transmitting
     low = np.flatnonzero((limit <= fixed) & (transmitting > 0))
     if len(low):
         step = int(low[0])
         text = f"more than {fixed[step]:.6g} at step {step}, the power of the mean state"
         raise fail("power limit", text, limit[step] / (1 + POWER_TOLERANCE))
-    # What is left for the moments: those after step k are sent at step k + 1; 0 <= 1 where nobody sends.
+    # The limit on sum tr Cov(C s). Where no relay sends, and after the last step, 0 <= 1 limits nothing.
     forms = make_power_matrices(steps, d)
-    left = np.where(transmitting > 0, limit - fixed, 1.0)
-    return PowerLimit(form=np.concatenate([forms[1:], np.zeros((1, d, d))]), limit=np.append(left[1:], 1.0))
+    limit_of_variances = np.where(transmitting > 0, limit - fixed, 1.0)
+    forms_of_next_step = np.concatenate([forms[1:], np.zeros((1, d, d))])
+    return PowerLimit(form=forms_of_next_step, limit=np.append(limit_of_variances[1:], 1.0))
 
 
 def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
@@ -122,13 +125,8 @@ def minimise_within_limit(
         units = np.asarray(_choose_step_units(problem, gains, barrier))
         evaluate = partial(_evaluate_barrier, problem, gains, units, barrier)
         shape = units.shape[:2]
-        x = bfgs(
-            evaluate,
-            start=np.zeros(math.prod(shape)),
-            iterations=-(-iterations // len(BARRIERS)),
-            tolerance=PRECISION,
-            memory=MEMORY,
-        )
+        x0, steps_of_descent = np.zeros(math.prod(shape)), -(-iterations // len(BARRIERS))
+        x = bfgs(evaluate, start=x0, iterations=steps_of_descent, tolerance=PRECISION, memory=MEMORY)
         designs.append(np.asarray(_change_gains(gains, units, x.reshape(shape), problem.steps)))
     # The cheapest that meets all limits, without those at which a descent overflowed.
     judged = [_compute_cost_and_slack(problem, gains) for gains in designs]
@@ -217,9 +215,10 @@ def _evaluate_barrier(
     barrier: float,
     x: Float[np.ndarray, "variables"],
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
-    """Return value and gradient of `_compute_cost_with_barrier`, with the changes of all gains in one vector x.
+    """Return cost - barrier sum log(slack) and its gradient at one vector x, as a descent needs it.
 
-    A search for the minimum needs one vector. Column i of units[k] (r, r) is what variable i of step k changes.
+    slack_k is the free share of the power limit at step k. x has r numbers x_k for each step; they change its r free
+    gains by units_k x_k.
     """
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
@@ -319,12 +318,7 @@ def _sweep_backward(
     """Return the gradient Lam_k of the cost by the moments after each step, found from the last step to the first.
 
     Later steps are taken with the gains that are best for their Lam and for the moments that the given gains lead to.
-
-    Args:
-        steps: of the network.
-        start: moments before the first step.
-        cost: C_k, with the cost sum_k <C_k, moments after step k>.
-        gains: of all filters as one block matrix for each step.
+    `start` are the moments before the first step, and the cost is sum_k <cost_k, moments after step k>.
     """
 
     def predict(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -383,11 +377,15 @@ def _alternate_sweeps(
     local_gains: Float[Array, "time Fn R"],
     count: Int[Array, "sweeps"],
 ) -> Float[Array, "time Fn R"]:
-    """Alternate backward and forward sweeps from the local gains, `count` of them, and return the best gains."""
+    """Return the best gains of `len(count)` backward and forward sweeps that begin with `local_gains`.
+
+    `start` is the covariance of (x, e_1 .. e_F) before the first step, and the cost is sum_k <cost_k, covariance after
+    step k>. Gains of all filters stand in one block matrix (F n, R) for each step.
+    """
 
     def sweep(search: SweepState, _: jax.Array) -> tuple[SweepState, None]:
         """Sweep backward and forward once; keep the best gains so far with their cost, sum_k <cost_k, moments_k>."""
-        gradients = _sweep_backward(steps, start, cost, search.gains)
+        gradients = _sweep_backward(steps, start, cost, search.gains)  # of the cost by the covariance after each step
         gains, moments = _sweep_forward(steps, start, search.gains, gradients)
         new_cost = jnp.sum(cost * moments)
         is_better = new_cost < search.cost

@@ -42,24 +42,28 @@ def initial_error_moments(covariance: Float[np.ndarray, "n n"], filters: int) ->
 
 
 def make_error_step_maps(step: RelaySteps) -> ErrorStepMaps:
-    """Return the matrices of one step, with the means E G in place of random gains."""
+    """Return the matrices of one step as maps of (x, e_1 .. e_F, w, v), with the means E G in place of random gains.
+
+    x is the plant's state, e_f = x - s_f the error of filter f (relays first, the receiver last), w the process noise
+    and v the sensor's. Each filter has some of the R received numbers: `step.owner` is the filter of each.
+    """
     (m, n), filters = step.sensing.shape, len(step.received)
     d = (1 + filters) * n
     # Rows that select x, e_1 .. e_F, and the noises w and v.
     unit = jnp.eye(d + n + m)
     state, w, v = unit[:d].reshape(1 + filters, n, -1), unit[d : d + n], unit[d + n :]
+    # x+ = A x + w, and before corrections e_f+ = A e_f + w.
     moved = jnp.einsum("ab,fbc->fac", step.transition, state) + w
-    # The sensor sends y = C x+ + v, relays C s_f of their estimates before the step, s_f = x - e_f.
+    # The sensor sends y = C x+ + v, each relay C s_f of its estimate s_f = x - e_f before the step.
     estimates = state[0] - state[1:]
     relayed = jnp.einsum("mn,fnc->fmc", step.sensing, estimates[:-1])
     sent = jnp.concatenate([(step.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
-    # What would be sent if the estimate s of a filter were everybody's: C A s by the sensor, C s by each relay. Its
-    # prediction of a received row is a map of the estimate of the filter that owns the row.
-    senders = [step.sensing @ step.transition, *[step.sensing] * (filters - 1)]
-    sent_of_estimate = jnp.stack([jnp.asarray(c) for c in senders]).reshape(-1, n)
-    prediction = jnp.asarray(step.gain) @ sent_of_estimate
-    predicted = jnp.einsum("rn,rnc->rc", prediction, estimates[step.owner])
-    return ErrorStepMaps(moved=moved.reshape(d, -1), innovation=jnp.asarray(step.gain) @ sent - predicted, sent=sent)
+    # A filter predicts what it receives as if all others had its estimate s: the sensor sends C A s, each relay C s.
+    sent_by_estimate = [step.sensing @ step.transition, *[step.sensing] * (filters - 1)]
+    prediction_matrix = jnp.asarray(step.gain) @ jnp.stack([jnp.asarray(c) for c in sent_by_estimate]).reshape(-1, n)
+    predicted = jnp.einsum("rn,rnc->rc", prediction_matrix, estimates[step.owner])
+    innovation = jnp.asarray(step.gain) @ sent - predicted
+    return ErrorStepMaps(moved=moved.reshape(d, -1), innovation=innovation, sent=sent)
 
 
 def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
@@ -74,19 +78,22 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
 
 
 def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], SentMoments]:
-    """Return Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
+    """Return Z = Cov (eta+ before corrections, innovations), and second moments of what is sent, from Cov eta.
 
-    eta = (x, e_1 .. e_F) holds the state and the errors of F filters, which receive R numbers. eta+ is eta after the
-    step. The sizes are d = (1 + F) n and z = d + R.
+    eta = (x, e_1 .. e_F) holds the state x (n,) and the errors of F filters, which receive R numbers; eta+ is eta after
+    the step. `moments` is Cov eta (d, d) with d = (1 + F) n, and Z is (d + R, d + R).
     """
     maps, mean = make_error_step_maps(step), sent_mean(step)
-    # Second moments of what is sent, from the covariance of (x, e_1 .. e_F, w, v).
+    # eta+, innovations and what is sent are linear maps of (x, e_1 .. e_F, w, v), of this covariance.
     sources = jax.scipy.linalg.block_diag(moments, step.process, step.sensor_noise)
+    # E (sent, 1)(sent, 1)' = mean mean' + Cov sent.
     second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate_by_mode(maps.sent, sources, 0.0))
-    # Z: of the known linear maps, and of innovations what the gains' spread makes of what is sent.
+    # Random gains G add (G - E G) sent + n - E n to the innovations: its covariance is that of (G, n), `step.spread`,
+    # contracted with the second moments of (sent, 1).
     linear = jnp.concatenate([maps.moved, maps.innovation])
     d = maps.moved.shape[0]
     z = propagate_by_mode(linear, sources, 0.0).at[d:, d:].add(contract(step.spread, second))
+    # E |signal|^2 of each sender, which sends m numbers.
     m = step.sensing.shape[0]
     power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * step.transmits_in_slot
     return z, SentMoments(second, power)
@@ -106,9 +113,14 @@ def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float
 
 
 def gain_mask(step: RelaySteps) -> Bool[np.ndarray, "Fn R"]:
-    """Return True where a gain may differ from zero: each filter uses what it receives itself."""
+    """Return which entries of the gains of all F filters (F n, R) may differ from zero, as one block matrix.
+
+    Rows f n to (f + 1) n correct filter f, columns are the R received numbers. A filter uses only what it receives
+    itself: `step.owner` is the filter that receives each number.
+    """
     n = step.transition.shape[-1]
-    return np.asarray(np.repeat(np.arange(len(step.received)), n)[:, None] == step.owner)
+    filter_of_row = np.repeat(np.arange(len(step.received)), n)
+    return np.asarray(filter_of_row[:, None] == step.owner)
 
 
 ROUNDING = 64 * float(np.finfo(float).eps)  # of what is sent: an innovation of less says nothing
@@ -117,20 +129,22 @@ ROUNDING = 64 * float(np.finfo(float).eps)  # of what is sent: an innovation of 
 def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "R"]:
     """Return 1 for each innovation whose variance is above the rounding of what is sent, 0 for the others.
 
-    A relay that receives nothing but itself through a known gain has the innovation zero. It is a difference of large
-    numbers, so that only their rounding is left. `predicted` is the covariance of (x, e_1 .. e_F, innovations).
-    ROUNDING is a few units in the last place.
+    A relay that receives nothing but itself through a known gain has the innovation zero. It is computed as a
+    difference of large numbers, of which the rounding remains. `predicted` is the covariance of (x, e_1 .. e_F,
+    innovations), with x and each filter's error of n entries. ROUNDING is a few units in the last place.
     """
     n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
-    # Sizes of what is sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
-    deviations = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # of x, e_1 .. e_F
-    state = deviations[0] + jnp.abs(step.state_mean)
-    sizes = jnp.concatenate([state[None], state + deviations[1 : 1 + relays]]) @ jnp.abs(step.sensing).T
-    sent = jnp.append(sizes.ravel(), 1.0)
-    # Rounding of an innovation by the mean gains, and of its variance by their spread.
-    by_mean = ROUNDING * jnp.abs(step.gain) @ sent[:-1]
-    by_spread = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.spread), sent, sent)
-    return jnp.where(jnp.diagonal(predicted)[d:] > by_mean**2 + by_spread, 1.0, 0.0)
+    # Sizes of the numbers sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
+    deviations = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # rows: x, e_1 .. e_F
+    size_of_state = deviations[0] + jnp.abs(step.state_mean)
+    sizes = jnp.concatenate([size_of_state[None], size_of_state + deviations[1 : 1 + relays]])
+    sent_sizes = jnp.append((sizes @ jnp.abs(step.sensing).T).ravel(), 1.0)  # of (sent, 1)
+    # An innovation is E G sent less its prediction: its rounding is at most eps |E G| |sent|. Its variance has a term
+    # sum_ab Cov(G_ia, G_ib) E[sent_a sent_b], which is computed up to eps |Cov| |sent| |sent|.
+    rounding_of_innovation = ROUNDING * jnp.abs(step.gain) @ sent_sizes[:-1]
+    rounding_of_variance = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.spread), sent_sizes, sent_sizes)
+    smallest_variance = rounding_of_innovation**2 + rounding_of_variance
+    return jnp.where(jnp.diagonal(predicted)[d:] > smallest_variance, 1.0, 0.0)
 
 
 def regression_gain(cross: Float[jax.Array, "n m"], received: Float[jax.Array, "m m"]) -> Float[jax.Array, "n m"]:
@@ -139,21 +153,25 @@ def regression_gain(cross: Float[jax.Array, "n m"], received: Float[jax.Array, "
 
 
 def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "Fn R"]:
-    """Return K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
+    """Return K_f = Cov(e_f, i_f) Cov(i_f)^-1 of each filter f, which minimises its own next tr E e_f e_f'.
+
+    `predicted` is the covariance of (x, e_1 .. e_F, i_1 .. i_F): the state, the filters' errors before corrections (n
+    entries each), and their innovations. The gains stand in one block matrix, filter after filter, zero elsewhere.
 
     Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
     """
     n, received = step.transition.shape[-1], sum(step.received)
-    d = predicted.shape[0] - received
+    d = predicted.shape[0] - received  # the innovations follow from index d
     gain, start = jnp.zeros((d - n, received)), 0
-    informative = step.receives_in_slot * innovations_above_rounding(predicted, step)
+    # 1 for an innovation that arrives in this slot and is more than rounding, else 0.
+    is_informative = step.receives_in_slot * innovations_above_rounding(predicted, step)
     for f, length in enumerate(step.received):
-        rows = slice(start, start + length)
-        used = informative[rows]
-        # An innovation that tells nothing has the covariance 0 with all others and the variance 1: its gain is 0.
-        inner = predicted[d:, d:][rows, rows] * used[:, None] * used + jnp.diag(1.0 - used)
-        cross = predicted[(1 + f) * n : (2 + f) * n, d:][:, rows] * used
-        gain = gain.at[f * n : (f + 1) * n, rows].set(regression_gain(cross, inner))
+        own = slice(start, start + length)  # the filter's innovations i_f
+        used = is_informative[own]
+        # An innovation without information gets the covariance 0 with all others and the variance 1: its gain is 0.
+        covariance = predicted[d:, d:][own, own] * used[:, None] * used + jnp.diag(1.0 - used)
+        cross = predicted[(1 + f) * n : (2 + f) * n, d:][:, own] * used  # Cov(e_f, i_f)
+        gain = gain.at[f * n : (f + 1) * n, own].set(regression_gain(cross, covariance))
         start += length
     return gain
 
@@ -171,23 +189,25 @@ def propagate_error_moments(
 ) -> PropagatedMoments:
     """Propagate the covariance of eta = (x, e_1 ... e_F) over the steps; return it with gains and powers over time.
 
+    x (n,) is the plant's state and e_f the error of filter f; F filters receive R numbers.
+
     Args:
         steps: of the network.
         start: the covariance before the first step.
-        gains: K of all filters as one block matrix for each step, whose entries on rows that receive nothing are not
-            used; those of `local_gain` if None.
+        gains: K of all filters as one block matrix (F n, R) for each step, of which columns of numbers that do not
+            arrive in the step's slot are not used; None for gains that minimise each filter's own next error.
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Return the moments after a step, to go on with; and its gains, these moments and the senders' powers.
+        """Return the covariance of eta after a step, and the triple (gains, this covariance, powers) to collect.
 
         Where `gain` is None, each filter gets the gain that minimises its own error at this step.
         """
         step, gain = row
-        uncorrected, sent = step_moments(step, moments)
-        used = local_gain(uncorrected, step) if gain is None else gain * step.receives_in_slot
-        corrected = correct_moments(uncorrected, used)
-        return corrected, (used if gain is None else gain, corrected, sent.power)
+        uncorrected, sent = step_moments(step, moments)  # uncorrected: of (eta+ before corrections, innovations)
+        used_gain = local_gain(uncorrected, step) if gain is None else gain * step.receives_in_slot
+        corrected = correct_moments(uncorrected, used_gain)
+        return corrected, (used_gain if gain is None else gain, corrected, sent.power)
 
     start = jnp.asarray(start)
     items = (steps, None if gains is None else jnp.asarray(gains))
@@ -201,21 +221,28 @@ DAMPING = 1e-9  # relative, on the change of a gain: decides only what the recei
 def gain_hessian(
     predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], step: RelaySteps, damping: float
 ) -> tuple[Float[jax.Array, "r r"], Float[jax.Array, ""]]:
-    """Return half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and what was added.
+    """Return half the Hessian of the later cost in the free gains, with damping on its diagonal, and that damping.
 
-    Z: `predicted` moments (eta+ before corrections, innovations). Lam: `ahead`, the gradient of the cost of later steps
-    by the moments after this one. Gains on what a filter receives are free. The entry for the gains ab and cd is
-    Lam_ac Z_bd. A gain on a number that does not arrive in this slot has 1 on the diagonal, and 0 elsewhere.
-    `damping` is relative to the mean of the diagonal.
+    The cost is tr(Lam P) with P = [I -(0; K)] Z [I -(0; K)]', the covariance of (x, e_1 .. e_F) after a correction by
+    the gains K. Z = `predicted` is that of (x, e_1 .. e_F before it, innovations), and Lam = `ahead` is the gradient of
+    the cost of later steps by P. An entry of K is free if it multiplies a number that the filter receives itself.
+
+    Args:
+        predicted: Z (d + R, d + R).
+        ahead: Lam (d, d).
+        step: the network's step.
+        damping: relative to the mean of the diagonal.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
     is_free = jnp.asarray(step.receives_in_slot)[columns]
+    # d^2 cost / (2 dK_ab dK_cd) = (Lam_ee)_ac (Z_ii)_bd, e: errors, from index n on, i: innovations, from index d on.
     hessian = jnp.asarray(ahead)[n:, n:][np.ix_(rows, rows)] * predicted[d:, d:][np.ix_(columns, columns)]
+    # A number that does not arrive in this slot has a gain without effect: 1 on the diagonal keeps it as it is.
     hessian = hessian * is_free[:, None] * is_free
     trace = jnp.trace(hessian)
-    added = jnp.where(trace > 0, damping * trace / len(rows), 1.0)  # 1 where nothing hangs on any gain
-    return hessian + jnp.diag(jnp.where(is_free > 0, added, 1.0)), added
+    diagonal_damping = jnp.where(trace > 0, damping * trace / len(rows), 1.0)  # 1 where the cost depends on no gain
+    return hessian + jnp.diag(jnp.where(is_free > 0, diagonal_damping, 1.0)), diagonal_damping
 
 
 def minimise_cost_ahead(
@@ -223,19 +250,34 @@ def minimise_cost_ahead(
 ) -> Float[jax.Array, "Fn R"]:
     """Return the gains K of all filters that minimise the cost of later steps, tr Lam [I -(0; K)] Z [I -(0; K)]'.
 
-    Z and Lam are those of `gain_hessian`. The free entries ab of K solve (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab, where e
-    stands for the errors and i for the innovations. A little damping towards the gains `old` decides entries on which
-    the cost does not depend.
+    A little damping towards the gains `old` decides entries on which the cost does not depend.
+
+    Args:
+        predicted: Z, the covariance of (x, e_1 .. e_F before corrections, innovations); the first d entries are eta's.
+        ahead: Lam (d, d), the gradient of the cost of later steps by the covariance of (x, e_1 .. e_F) after this one.
+        old: the gains (F n, R) that are to be improved.
+        step: the network's step. A gain is free if it multiplies what its filter receives; others are zero.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
     hessian, damping = gain_hessian(predicted, ahead, step, DAMPING)
-    cross = ahead[n:] @ predicted[:d, d:]
-    right_side = (cross[rows, columns] + damping * old[rows, columns]) * step.receives_in_slot[columns]
+    # The free entries ab of K solve (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab: e are the errors (rows of Lam from n on), i
+    # the innovations (columns of Z from d on).
+    gradient = ahead[n:] @ predicted[:d, d:]
+    right_side = (gradient[rows, columns] + damping * old[rows, columns]) * step.receives_in_slot[columns]
     return jnp.zeros_like(old).at[rows, columns].set(jnp.linalg.solve(hessian, right_side))
 
 
 def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
-    """Return the gradient of <Lam, moments after the step> by the moments before it; Lam is `ahead`."""
-    _, pull_back = jax.vjp(lambda m: correct_moments(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
+    """Return the gradient of <Lam, P+> = sum of Lam_ij P+_ij by P: one step back of the cost's gradient.
+
+    P and P+ (d, d) are the covariances of (x, e_1 .. e_F) before and after the step with this `gain`; Lam is `ahead`.
+    P+ is an affine function of P, so that the gradient is the same everywhere, and may be taken at P = 0.
+    """
+
+    def step_covariance(p: jax.Array) -> jax.Array:
+        """Return P+ from P."""
+        return correct_moments(step_moments(step, p)[0], gain)
+
+    _, pull_back = jax.vjp(step_covariance, jnp.zeros_like(ahead))
     return symmetrize(pull_back(ahead)[0])

@@ -224,15 +224,21 @@ def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Fl
 def _iterate_local_design(
     steps: RelaySteps, start: Float[Array, "d d"]
 ) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
-    """Repeat the period of the local design (gains best for each filter's next error) until its moments are steady.
+    """Repeat a period in which each filter minimises its own next error, until it ends with the covariance it began.
 
-    Steady moments change over a period by less than CONVERGED, relative to the largest moment.
-    Returns gains, moments and power over the last period, and the last relative change of the moments.
+    `start` is a covariance of (x, e_1 .. e_F), of the state and the filters' errors. It is steady where it changes over
+    a period by less than CONVERGED, relative to its largest entry.
+
+    Returns:
+        Gains, covariances and the senders' powers over the last period, and the last relative change.
     """
-    moments, change = _repeat_until_steady(
-        lambda m: propagate_error_moments(steps, m).moments[-1], jnp.asarray(start), CONVERGED
-    )
-    return propagate_error_moments(steps, moments), change
+
+    def run_period(covariance: jax.Array) -> jax.Array:
+        """Return the covariance after a period, with the gains that minimise each filter's own next error."""
+        return propagate_error_moments(steps, covariance).moments[-1]
+
+    steady_covariance, change = _repeat_until_steady(run_period, jnp.asarray(start), CONVERGED)
+    return propagate_error_moments(steps, steady_covariance), change
 
 
 def _repeat_until_steady(
@@ -327,28 +333,31 @@ def _tune_gains(
 
 
 def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers.
+    """Return tr P of the receiver in the steady state by slot, whether errors converge to it, and the relays' powers.
 
-    P: the receiver's steady error covariance. Moments are sound if they are positive semidefinite: they then converge.
+    P is the receiver's error covariance after a slot, with the `gains` of relays and receiver. Errors converge if the
+    fixed point of their covariance is positive semidefinite.
     """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
-    # The moments begin with those before the first slot. They are of (x, e_1 .. e_F), the receiver's error last.
+    # Covariances of (x, e_1 .. e_F) before the first slot and after each, of which the last n entries are the
+    # receiver's error.
     receiver = steady.moments[1:, -n:, -n:]
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
     return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), relay_powers
 
 
 def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers.
+    """Return tr P of the best receiver in the steady state by slot, whether errors converge, and the relays' powers.
 
-    P: its steady error covariance. Moments are sound if they are positive semidefinite: they then converge.
+    P is the error covariance of the best linear estimate from what the receiver gets, behind relays with these `gains`.
+    Errors converge if the fixed points of their covariances are positive semidefinite.
     """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     covariance = steady_receiver_covariance(steps, gains)
-    # The receiver's own part of the moments is left out: its gains among `gains` are not used.
-    are_sound = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
+    # The last n entries of each covariance are left out: they are of a receiver with its part of `gains`.
+    do_converge = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
-    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), are_sound, relay_powers
+    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), do_converge, relay_powers
 
 
 _receiver_cost = make_penalised_cost(_trace_receiver_errors)

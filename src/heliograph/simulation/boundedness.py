@@ -100,29 +100,35 @@ def certify_boundedness(network: Network) -> Boundedness:
 
 
 def _judge_links(network: Network, a: np.ndarray, q: np.ndarray, links: JointLinks) -> Boundedness:
-    """Return the verdict for a plant x+ = A x + N(0, Q) that these links show."""
-    # Used are the sums of what arrives whose gain on all of x is known. If that certifies nothing: the sums whose gain
-    # on the modes that do not decay is known, of which there are more.
-    growing = _find_unstable_modes(a)
-    for space in (np.eye(len(a)), growing):
-        known = _find_usable_measurements(a, q, links, space)
-        gains = find_gains(known.system)
-        radius = certify_radius(known.system, gains)
+    """Return the verdict on the filter's mean error covariance for a plant x+ = A x + N(0, Q) behind these links.
+
+    Received numbers z = G x + noise have random gains G, which the filter does not know. It can use sums D z whose gain
+    D G on x is the same in all outcomes of the losses that look alike. The errors stay bounded if some gains on such
+    sums give them a spectral radius below 1. They grow if the losses hide a growing mode of A for too long.
+    """
+    # First sums whose gain is known on all of x. If these certify nothing: sums whose gain is known on the modes that
+    # do not decay, of which there are more.
+    unstable_modes = _find_unstable_modes(a)
+    for basis in (np.eye(len(a)), unstable_modes):
+        usable = _find_usable_measurements(a, q, links, basis)
+        gains = find_gains(usable.system)
+        radius = certify_radius(usable.system, gains)
         if radius < BELOW_ONE:
-            bound = known.system.solve_steady_covariances(gains).sum(axis=0) if known.exact else None
+            bound = usable.system.solve_steady_covariances(gains).sum(axis=0) if usable.exact else None
             return Boundedness(
                 verdict="certified",
                 reason=_describe_certificate(a, radius),
                 radius=radius,
                 growth=0.0,
-                gains=known.map_gains(gains),
+                gains=usable.map_gains(gains),
                 bound=bound,
             )
-    # Not certified. From here on `known` is of the modes that do not decay: do losses hide one of them?
-    unseen = find_fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
-    verdict, reason = _judge_unobserved_modes(network, links, growing, known, unseen, radius)
+    # Not certified. Of what is usable on the modes that do not decay: do losses hide one of them?
+    system = usable.system
+    unseen = find_fastest_unobserved_mode(a, system.chain, [system.outputs[state] for state in system.known])
+    verdict, reason = _judge_unobserved_modes(network, links, unstable_modes, usable, unseen, radius)
     return Boundedness(
-        verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=known.map_gains(gains), bound=None
+        verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=usable.map_gains(gains), bound=None
     )
 
 
@@ -214,20 +220,22 @@ class KnownGainSums(NamedTuple):
     random: bool
 
     def find_noise_of_sums(self, outcome: ArrivalOutcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
-        """Return Cov(D z) for one outcome of the losses at x = 0, about the mean of all outcomes that look the same.
+        """Return D E[(z - m)(z - m)'] D' (r, r), the noise of the sums D z in one outcome of the losses at x = 0.
 
-        D is `self.combine`. What is received is z = G y with y = (v, 1): the sensors' noise v, and 1 for G's offset.
-        M is `self.mean`, the mean of G over the outcomes that look the same. The result is
-        D E[(G y - M E y) (G y - M E y)'] D'.
+        D is `self.combine`. z = G y with y = (v, 1), the sensors' noise v and a 1 for the offset of the random gain G.
+        m = M E y is what the filter expects: it cannot tell this outcome from others in which the same numbers arrive,
+        and M = `self.mean` is the mean of G over all of these.
         """
         mean, gain_moments = second_moments(outcome.map)  # E G, and E[G_ia G_jb] as [i, j, a, b], in this outcome
+        # E y, and E[y y'].
         mean_signal = np.append(links.sensor_mean, 1.0)
-        signal_moments = np.outer(mean_signal, mean_signal)  # E[y y']
+        signal_moments = np.outer(mean_signal, mean_signal)
         signal_moments[:-1, :-1] += links.sensor_noise
-        mean_received, mean_in_outcome = self.mean @ mean_signal, mean @ mean_signal  # M E y, and E[G] E y
-        second = np.einsum("ijab,ab->ij", gain_moments, signal_moments)  # E[G y y' G']
-        cross = np.outer(mean_in_outcome, mean_received)
-        noise = second - cross - cross.T + np.outer(mean_received, mean_received)
+        # E[z z'] - E[z] m' - m E[z]' + m m'.
+        expected, mean_in_outcome = self.mean @ mean_signal, mean @ mean_signal  # m, and E z
+        second = np.einsum("ijab,ab->ij", gain_moments, signal_moments)  # E[z z']
+        cross = np.outer(mean_in_outcome, expected)
+        noise = second - cross - cross.T + np.outer(expected, expected)
         return np.asarray(self.combine @ noise @ self.combine.T)
 
 
@@ -280,26 +288,29 @@ def _describe_certificate(transition: Float[np.ndarray, "n n"], radius: float) -
 def _judge_unobserved_modes(
     network: Network,
     links: JointLinks,
-    growing: np.ndarray,
-    known: UsableMeasurements,
+    unstable_modes: np.ndarray,
+    usable: UsableMeasurements,
     unseen: UnobservedGrowth,
     radius: float,
 ) -> tuple[Verdict, str]:
     """Return verdict and reason: "impossible" if an unobserved mode grows and noise excites it, else "undecided".
 
+    A mode of eigenvalue lambda grows without bound in mean square if |lambda|^2 times the spectral radius of the losses
+    that hide it, `unseen.growth`, is 1 or more.
+
     Args:
         network: the network.
         links: joint model of all links.
-        growing: basis of the plant's modes that do not decay.
-        known: what is measured in each kind of losses.
+        unstable_modes: basis of the plant's modes that do not decay.
+        usable: sums of received numbers of known gain, for each pattern of what arrives.
         unseen: the plant's mode that grows most while the links do not observe it.
-        radius: that the best gains found leave.
+        radius: spectral radius of the error's second moments with the best gains that were found, 1 or more.
     """
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
-    reason = _explain_unbounded_error(links, known.system, unseen)
-    if not _is_mode_excited(network, growing, known, unseen):
+    reason = _explain_unbounded_error(links, usable.system, unseen)
+    if not _is_mode_excited(network, unstable_modes, usable, unseen):
         return "undecided", f"{reason}; but noise does not reach all that grows, so that it may stay zero"
     return "impossible", reason
 
@@ -326,22 +337,30 @@ def _explain_unbounded_error(links: JointLinks, system: KnownLossSystem, unseen:
 
 
 def _is_mode_excited(
-    network: Network, growing: np.ndarray, known: UsableMeasurements, unseen: UnobservedGrowth
+    network: Network, unstable_modes: np.ndarray, usable: UsableMeasurements, unseen: UnobservedGrowth
 ) -> bool:
-    """Return whether the error covariance P stays above eps v v', eps > 0: noise keeps exciting the unseen mode v.
+    """Return whether noise keeps exciting the unseen mode v: whether P >= eps v v', eps > 0, for every filter.
 
-    So it is if noise enters along v at once, or reaches it and every measurement has noise. The noise of random gains
-    grows only where noise reaches all that is unstable, so with such gains all of `growing` must be reached too.
+    x+ = A x + w, Cov w = Q. If v is excited, its part of the error covariance P grows while nothing received shows it.
+    Random gains of the links make noise in proportion to the state: that noise grows, and hides v, only if the state
+    does, so then all unstable modes must be excited too.
+
+    Args:
+        network: its plant has the covariance of x_0.
+        unstable_modes: basis of the modes of A that do not decay.
+        usable: sums of received numbers of known gain; `random` if random gains make others unusable.
+        unseen: the mode, by a basis of its eigenvectors.
     """
-    a, q = known.system.transition, known.system.process
-    directions = np.concatenate([unseen.vectors, growing], axis=1) if known.random else unseen.vectors
-    # In one step, whatever is measured.
+    a, q = usable.system.transition, usable.system.process
+    directions = np.concatenate([unseen.vectors, unstable_modes], axis=1) if usable.random else unseen.vectors
+    # Q itself excites them in each step, whatever is measured.
     if is_excited_by_noise(directions, np.zeros_like(a), q):
         return True
-    # Over several steps: measurements without noise could remove it on the way.
-    if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in known.system.noises):
+    # Q excites them over several steps, through A. Measurements without noise could remove the error on the way.
+    if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in usable.system.noises):
         return False
     if is_excited_by_noise(directions, a, q):
         return True
-    start = q + np.asarray(first(network.plant).initial_covariance)
-    return unseen.growth > 1 and is_excited_by_noise(directions, a, start)
+    # The error of x_0 excites them once, which is enough for a mode that grows by more than 1 a step.
+    initial = q + np.asarray(first(network.plant).initial_covariance)
+    return unseen.growth > 1 and is_excited_by_noise(directions, a, initial)

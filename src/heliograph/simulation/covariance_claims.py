@@ -45,7 +45,10 @@ class MistakenBelief(NamedTuple):
 
     @property
     def another(self) -> str:
-        """What it believes, in words: "another sensor and channel"."""
+        """Which models the filter has that differ from those at its node, such as "another sensor and channel".
+
+        A filter that does not tell for which models it was made has the one part UNSAID, which is text of its own.
+        """
         return UNSAID if self.parts == (UNSAID,) else f"another {' and '.join(self.parts)}"
 
     @property
@@ -67,10 +70,10 @@ def lower_claim(claim: Claim) -> Claim:
 
 
 def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
-    """Return a copy of the filter that claims "nominal" at most, as do the filters inside it.
+    """Return a copy of the filter that claims "nominal" at most for its covariance, as do the filters inside it.
 
-    "nominal" means that the covariance is only what the filter believes. The copy remembers the models that it was made
-    for, and whether its claim was lowered.
+    "nominal" means that the covariance is right only if the filter's models are. In its field `kept` the copy remembers
+    the models for which it was made (its premise), and whether its claim was lowered.
     """
 
     def is_inner(leaf: object) -> bool:
@@ -80,8 +83,9 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
     leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
     inner = [lower_to_nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
     lowered: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
-    object.__setattr__(lowered, "claim", lower_claim(filter.claim))  # fields are frozen
-    was_lowered = filter.claim != lowered.claim or filter.kept.lowered
+    was_lowered = filter.claim != lower_claim(filter.claim) or filter.kept.lowered
+    # Fields are frozen. The copy is no one else's yet, so that they may be set here.
+    object.__setattr__(lowered, "claim", lower_claim(filter.claim))
     object.__setattr__(lowered, "kept", StaticPremise(filter.premise, was_lowered))
     return lowered
 
@@ -123,9 +127,10 @@ def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, No
 
 
 def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
-    """Return the network's fusions; central filters made for other models claim "nominal" at most.
+    """Return the network's fusions and central filters; of the latter those with wrong models claim "nominal" at most.
 
-    A central filter receives all measurements. Its models are the sensors and channels of all nodes together.
+    A central filter receives the measurements of all nodes. Its models are wrong if they are not the plant, and the
+    sensors and channels of all nodes together; its covariance is then neither exact nor a bound.
     """
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
@@ -139,7 +144,7 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
 
 
 def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters that claim "nominal" at most: what the filter believes, and no bound."""
+    """Return the nodes with filters whose covariances claim "nominal" at most: neither to be exact nor a bound."""
     return {
         name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
         for name, node in network.nodes.items()
@@ -169,13 +174,14 @@ def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]
 
 
 def find_premise(network: HasNodes, name: str) -> Premise:
-    """Return the world at a node: plant, sensor, channel and trigger, and its limits where they refuse values.
+    """Return the models at a node, for which a filter there has to be made if its claim is to hold.
 
-    In a network of relays: plant, the relays, and the gains that they run.
+    They are the plant, and the node's sensor, channel and trigger, with its limits if they refuse values. In a network
+    of relays they are the plant, the relays, and the relays' gains.
     """
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
-        # Limits without bounds refuse nothing but codes, which tell nothing of the state.
+        # Limits without bounds refuse only error codes of the sensor, and these depend on the state in no way.
         limits = node.limits if node.limits is not None and node.limits.bounded else None
         return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     if network.common is not None:
@@ -221,17 +227,22 @@ def _yield_mistaken_beliefs(
 ) -> Iterator[MistakenBelief]:
     """Yield the filters of a node that claim a covariance but were made for other models than `own_models`, the node's.
 
-    Each comes with the parts of the models that differ. A filter without a premise does not say which models it was
-    made for. It is passed over, unless its claim was lowered already.
+    Each comes with the parts of the models that differ. A filter may not say for which models it was made: it has no
+    premise then, and is left out. But if its claim was lowered already (`filter.kept.lowered`), it is yielded: somebody
+    knew that its models are not the node's.
     """
     for label, filter in filters.items():
-        is_known = filter.premise is not None or filter.kept.lowered
-        if filter.claim != "none" and is_known and (mistaken_parts := list_mistaken_parts(own_models, filter)):
-            yield MistakenBelief(node, label, mistaken_parts, filter.kept.lowered)
+        was_lowered = filter.kept.lowered
+        can_be_judged = filter.premise is not None or was_lowered
+        if filter.claim != "none" and can_be_judged and (mistaken_parts := list_mistaken_parts(own_models, filter)):
+            yield MistakenBelief(node=node, filter=label, parts=mistaken_parts, lowered=was_lowered)
 
 
 def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
-    """Return the claim of each estimate of a network, by (node, name); those of the centre last, under FUSED."""
+    """Return what each estimate of a network claims of its covariance: "exact", "upper" (a bound), "nominal" or "none".
+
+    Keys are (node, name of the filter or fusion); those of the fusion centre come last, under FUSED in place of a node.
+    """
     claims = {
         (name, filter_name): filter.claim
         for name, node in network.nodes.items()
@@ -240,8 +251,10 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
     for name, mesh in network.meshes.items():
         claim_of_mesh = find_claim_of_mesh(name, mesh, network)
         claims |= {(node, name): claim_of_mesh for node in network.mesh_nodes(name)}
-    # Where data decide what arrives, no fusion can claim more than "nominal"; nor, where words are sent, one that
-    # follows the nodes' errors by their sensors and channels. One of estimates alone claims what their filters do.
+    # If a node sends or uses a message only for some of its values, the errors depend on the data in a way that no
+    # fusion follows: it can claim "nominal" at most, neither an exact covariance nor a bound. Where codewords are sent
+    # this holds for fusions that follow the nodes' errors by their sensors and channels; one of estimates alone claims
+    # what their filters do.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     do_data_decide = any(node.chosen_by_value for node in nodes)
     is_disturbed = any(node.disturbs_what_is_sent for node in nodes)

@@ -18,20 +18,30 @@ NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
     """Raise ValueError unless the flags that these channels deliver are those of the filter's model.
 
-    With others the filter's claim would be wrong.
+    A flag is a number received behind the measurement that tells the mode of a link, in this step or the step before
+    (late). A filter that takes one for the other would claim a wrong covariance.
+
+    Args:
+        name: of the filter, for the error.
+        filter: with all filters inside it.
+        channels: whose outputs it receives, one after another.
 
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
     """
-    # Flags stand after the measurement; each comes from one row of the channels: `rows`, the part that each row is of.
-    rows = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
+    # The channel that makes each received number: a channel may be several in parallel.
+    channel_of_number = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
     for reader in _find_flag_filters(filter):
         if isinstance(reader, ModeObservedFilter):
-            sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
-            wrong = [row for row in rows[sent : reader.received] if not _reveals_mode(row, reader.late)]
+            # All numbers behind the channel's outputs are flags.
+            measured, expected = first(reader.channel).outputs, LATE if reader.late else NOW
+            flags = channel_of_number[measured : reader.received]
+            wrong = [flag for flag in flags if not _reveals_mode(flag, reader.late)]
         else:
+            # The last number is a flag, of this step.
             expected = "hg.model.with_flag(link, flags)"
-            wrong = [row for row in rows[reader.received - 1 : reader.received] if isinstance(row, OneStepLate)]
+            flags = channel_of_number[reader.received - 1 : reader.received]
+            wrong = [flag for flag in flags if isinstance(flag, OneStepLate)]
         if wrong:
             if isinstance(wrong[0], OneStepLate):
                 got = "one of the step before"

@@ -323,14 +323,15 @@ class Network(Module):
 
     @cached_property
     def angles(self) -> dict[str, Angles]:
-        """Places of the angles among the numbers that each node receives, of a common channel its own `rows`."""
+        """Indices of the angles among the numbers that each node receives, by node."""
         if self.common is None:
             return {
                 name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
                 for name, node in self.nodes.items()
             }
-        common = find_received_angles(self.plant, self.common.sensor, self.common.channel)
-        return {name: tuple(i - rows.start for i in common if i in rows) for name, rows in self.rows.items()}
+        # Of one channel for all, each node receives some rows.
+        angles = find_received_angles(self.plant, self.common.sensor, self.common.channel)
+        return {name: tuple(i - rows.start for i in angles if i in rows) for name, rows in self.rows.items()}
 
     def diagram(self) -> str:
         """Return all of the network as lines of text, of which `repr` shows the first."""
@@ -348,7 +349,7 @@ class Network(Module):
         return tuple(yield_mistaken_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
-        """Return the network whose estimates claim "nominal" at most, for where an unknown number of digits is lost."""
+        """Return the network whose covariances claim "nominal" at most, as where rounding may spoil any digit."""
         lowered = copy(self)  # without the constructor, which would check all again
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
         # Fields are frozen.
@@ -377,7 +378,7 @@ class Network(Module):
     def screen_readings(
         self, measurements: dict[str, np.ndarray], inputs: np.ndarray, before: Mapping[str, Repeats]
     ) -> ScreenedRecording:
-        """Return measurements by node without the readings that nodes refuse; `before`: equal ones in earlier rows."""
+        """Return measurements without readings that limits refuse; `before`: equal readings at the end before these."""
         return screen_recording(self.nodes, self.inputs, measurements, inputs, before)
 
     def drop_refused_readings(self, measurements: dict[str, np.ndarray], inputs: np.ndarray) -> dict[str, np.ndarray]:

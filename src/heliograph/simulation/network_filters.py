@@ -85,18 +85,19 @@ class AllFilters(Module):
         judges: bool = False,
         tests: bool = False,
     ):
-        """Stack the filters of a network by kind, and build its fusions.
+        """Stack the filters of a network that differ in numbers alone (a kind), and build its fusions.
 
         Args:
             network: the network.
             smoothed_kinds: numbers of the kinds of filters to be smoothed, with all central filters; None if nothing
                 is.
-            judges: filters judge their data, and skip implausible data on request.
+            judges: whether filters judge if their measurements are plausible, and leave out others on request.
             tests: fused estimates are tested by what arrives at the next step.
         """
         self.smooths, self.judges = smoothed_kinds is not None, judges
         self.alike = stack_by_kind(network, smoothed_kinds or (), judges)
-        # At the centre: filters of all measurements, fusions of estimates, and those that know or receive more.
+        # At the centre: filters of all measurements; fusions by rules that need nothing but the estimates; fusions that
+        # need the joint covariance of the nodes' errors; fusions of reports over uplinks; fusions between neighbours.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
         self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
@@ -106,11 +107,11 @@ class AllFilters(Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """Return the states before the first step, as a tuple.
+        """Return the states before the first step, as a tuple of six entries.
 
-        Its entries: states of the nodes' filters by kind; of central filters by name; of quantizers by stack of
-        fusions; of the informed centres; of fusions by reports and between neighbours by name; and the fused estimates
-        to be tested.
+        They are the states of: the nodes' filters, by kind (a stack of filters of one structure); central filters, by
+        name; quantizers of the nodes' estimates, by stack of fusions; centres that propagate the joint covariance of
+        the nodes' errors; fusions of reports and between neighbours, by name; and fused estimates that are tested.
         """
         central = {name: initial_state(filter) for name, filter in self.central.items()}
         states = tuple(stacked.init() for stacked in self.alike)
@@ -254,10 +255,9 @@ class AllFilters(Module):
         }
 
     def _list_details(self) -> list[tuple[str, str, str]]:
-        """Return which further results of a step are put out: those for smoothing, and judgements of measurements.
+        """Return which results of a step there are beside estimates: for smoothing, and judgements of measurements.
 
-        An entry is (field of `StepOutput`, its name in the outputs of the nodes' filters, its name in those of central
-        ones).
+        An entry is (field of `StepOutput`, name of the output for the nodes' filters, name for central filters).
         """
         judgements = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
         steps = [("steps", "smoother_steps", "central_steps")]
@@ -311,9 +311,11 @@ class AllFilters(Module):
         for name, mesh in sorted(self.meshes.items()):
             # What is drawn: flags of what arrives, or a pair of these and of weights that were computed before.
             arrivals = drawn[name] if name in drawn else mesh.edges.lossless()
-            flags, ahead = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
-            exchanges_after[name], of_mesh = mesh.step(exchange_states[name], z, jnp.asarray(flags), u, k, ahead)
-            between_neighbours.extend(of_mesh)
+            flags, weights = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
+            exchanges_after[name], node_estimates = mesh.step(
+                exchange_states[name], z, jnp.asarray(flags), u, k, precomputed=weights
+            )
+            between_neighbours.extend(node_estimates)
             reports[name] = flags, jnp.zeros(())  # no delays beside the flags, which hold them where there are any
         outputs = FusionOutputs(tuple(between_neighbours), fused, uplinks, reports)
         return (tuple(quantizers_after), tuple(centres_after), exchanges_after), outputs
@@ -328,22 +330,21 @@ class AllFilters(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[PyTree, dict[str, Estimate]]:
-        """Return an informed centre's next state, and its fused estimates by name.
+        """Step a centre: return its next state, and the nodes' estimates fused by the joint covariance of their errors.
 
         Args:
-            centre: the centre.
+            centre: the centre; its `sources` are (kind, number in the kind) of filters, a kind being one stack of them.
             state: its state before the step.
             states: of the nodes' filters by kind before the step, from which the matrices of their steps follow.
             z: measurements (node, received) by group of nodes.
             estimates: of the nodes' filters by kind after the step, (filter, node, ...).
-            u: inputs of the plant over the step.
-            k: number of the step.
+            u, k: inputs of the plant over the step, and its number.
         """
         matrices = []
-        for kind, f in centre.sources:
-            alike = self.alike[kind]
-            matrices.append(alike.compute_by_node(centre.compute_matrices, states[kind], f, z[alike.group], u, k))
-        means = [jnp.asarray(estimates[kind].mean)[f] for kind, f in centre.sources]
+        for kind, number in centre.sources:
+            stack = self.alike[kind]
+            matrices.append(stack.compute_by_node(centre.compute_matrices, states[kind], number, z[stack.group], u, k))
+        means = [jnp.asarray(estimates[kind].mean)[number] for kind, number in centre.sources]
         return centre.step(state, matrices, means, u, k)
 
 
@@ -372,9 +373,9 @@ def initial_states(filters: AllFilters) -> PyTree:
 def centre_filter(network: Network, name: str) -> CentreFilter:
     """Return the filter of the centre that fuses all nodes' reports, for the fusion `name` by `AllReports`.
 
-    Its measurement joins what arrives of this step's reports, node after node in the network's order. If links may be
-    late, what arrives of the previous step's reports follows, and so on. What did not arrive is NaN. A quantizer enters
-    by the bound on its error. The filter's claim is that of the fusion.
+    Each node's filter sends its estimate as a report. The measurement joins the reports of this step, node after node
+    in the network's order; if links may be late, those of the step before follow, and so on. Numbers that did not
+    arrive are NaN. A quantizer enters by the bound on its error. The filter's claim is that of the fusion.
 
     Args:
         network: the network.

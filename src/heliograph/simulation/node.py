@@ -125,7 +125,10 @@ class Node(Module):
 
     @property
     def chosen_by_value(self) -> bool:
-        """Whether what a filter uses depends on what was measured: by a sender's rule, by limits, by `stuck`."""
+        """Whether values decide which measurements a filter uses: by a sender's rule, or by limits of the readings.
+
+        Limits are bounds of plausible readings, or the number of equal readings after which a sensor counts as stuck.
+        """
         return self.trigger is not None or (self.limits is not None and self.limits.bounded)
 
     @property
@@ -157,17 +160,20 @@ class Node(Module):
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement: values, side information, then dithers "dither_OUTPUT".
 
-        A dither is noise that an encoder adds before rounding and the receiver subtracts. FLAG marks a number that
-        carries no output.
+        A dither is noise that an encoder adds before rounding and the receiver subtracts: it is received for each
+        output that the channel carries, but not for a flag, which tells the channel's mode.
         """
         channel = first(self.channel)
         if self.encoder is None or not self.encoder.subtracts:
-            return name_received_values(self.outputs, channel, self.received - channel.outputs)
-        dithers = [f"dither_{self.outputs[place]}" for place in find_carried_components(channel) if place != FLAG]
-        values = name_received_values(self.outputs, channel, self.received - channel.outputs - len(dithers))
-        # Number the dithers of an output that arrives several times, such as over two links.
+            side_information = self.received - channel.outputs
+            return name_received_values(self.outputs, channel, side_information)
+        carried_outputs = [output for output in find_carried_components(channel) if output != FLAG]
+        dithers = [f"dither_{self.outputs[output]}" for output in carried_outputs]
+        side_information = self.received - channel.outputs - len(dithers)
+        values = name_received_values(self.outputs, channel, side_information)
+        # Dithers of an output that arrives several times, such as over two links, are numbered from 1.
         repeated = {name for name in dithers if dithers.count(name) > 1}
-        numbers = [dithers[: i + 1].count(name) for i, name in enumerate(dithers)]  # among those of one name
+        numbers = [dithers[: i + 1].count(name) for i, name in enumerate(dithers)]
         return values + tuple(
             f"{name}_{number}" if name in repeated else name for name, number in zip(dithers, numbers, strict=True)
         )
@@ -283,11 +289,14 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
 
 
 def check_states(name: str, filter: object, network: HasNodes) -> None:
-    """Raise ValueError unless a filter has as many states and inputs as the plant, and its attitudes are the plant's.
+    """Raise ValueError unless a filter has as many states and inputs as the plant, and the plant's attitudes.
 
-    A fusion is asked for its attitudes alone.
+    An attitude is three states that are a rotation. A filter corrects it by a rotation, where it adds to other states.
 
-    `name`: of the filter or fusion, for errors.
+    Args:
+        name: of the filter or fusion, for errors.
+        filter: a filter, or a fusion, which has no states of its own.
+        network: with the plant.
     """
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
@@ -301,7 +310,6 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
                     f"the plant's {len(of_plant_names)} {kind} {list(of_plant_names)}",
                     f"{len(of_filter_names)} {list(of_filter_names)}",
                 )
-    # Attitudes are turned where others are added.
     of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
     if of_plant != of_filter:
         expected, got = ([network.states[i] for i in places] for places in (of_plant, of_filter))

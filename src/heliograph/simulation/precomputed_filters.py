@@ -19,16 +19,18 @@ from heliograph.smoothing.forward_and_backward_pass import plan_with_smoother_st
 def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Return the filters with everything that depends on no data, such as gains, computed ahead for the inputs u.
 
-    This is done only for nodes that always receive all data (`filters.complete`, by group). Central filters receive all
-    nodes, so they need that all groups are complete.
+    Gains do not depend on data only where no measurement is ever missing. Nodes that differ in numbers alone are a
+    group, and `filters.complete` says of each group whether that is so. Central filters need it of all groups, since
+    they receive the measurements of all nodes.
     """
+    # The nodes' filters, of one structure in each stack; then the central filters.
     stacks = [_precompute_stack(stack, u) if filters.complete[stack.group] else stack for stack in filters.alike]
-    central_planned = filters.central if all(filters.complete) else {}
-    central_planned = {
+    central_filters = filters.central if all(filters.complete) else {}
+    precomputed = {
         name: compute_once(_precompute_filter, _precompute_by_xla, (filter, u, filters.smooths))
-        for name, filter in central_planned.items()
+        for name, filter in central_filters.items()
     }
-    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(stacks), filters.central | central_planned))
+    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(stacks), filters.central | precomputed))
     return cast(AllFilters, to_numpy(changed))
 
 
@@ -63,6 +65,10 @@ def _precompute_all_by_xla(filters: AbstractFilter, u: Array, smooths: bool, cou
 
 
 def can_precompute(filters: AllFilters) -> bool:
-    """Return whether some filter has anything to precompute: a `planned` of its own."""
-    every = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
-    return any(type(filter).planned is not AbstractFilter.planned for filter in every)
+    """Return whether some filter has anything to precompute.
+
+    `AbstractFilter.planned` returns the filter itself; a class with gains that depend on no data overrides it, to
+    return the filter with these gains computed.
+    """
+    all_filters = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
+    return any(type(filter).planned is not AbstractFilter.planned for filter in all_filters)

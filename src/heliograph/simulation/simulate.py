@@ -217,18 +217,19 @@ class _SimulationJob(Module):
 
 
 def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, progress: Progress | None) -> ReducedRuns:
-    """Simulate all runs, chunk by chunk: return the sums over them, and what is collected of them."""
+    """Simulate all runs, chunk by chunk, in lanes side by side: return the sums over them, and what is collected."""
     with jax.enable_x64(True):
         lanes = RunLanes(
-            lambda blocks, carry: _simulate_lane((job, blocks), carry),
-            partial(_simulate_all_lanes, job),
-            partial(_make_zero_sums, job),
-            first_run,
-            one_by_one=bool(job.world.filters.meshes),  # weights are solved for many estimates at once
+            alone=lambda blocks, carry: _simulate_lane((job, blocks), carry),
+            together=partial(_simulate_all_lanes, job),
+            start=partial(_make_zero_sums, job),
+            first_run=first_run,
+            one_by_one=bool(job.world.filters.meshes),  # their large matrices would block threads side by side
         )
         chunks = split_into_chunks(lanes.count, lanes.wide, runs, chunk)
-        parts = advance_in_chunks(lanes.advance, chunks, runs, progress)
-    collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding
+        collected_by_chunk = advance_in_chunks(lanes.advance, chunks, runs, progress)
+    # Blocks may go beyond the last run.
+    collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *collected_by_chunk)
     # Sums, and for each whether it is a value that all runs share.
     total = lanes.total()
     sums = jax.tree.map(lambda leaf: leaf.value if is_shared(leaf) else leaf, total, is_leaf=is_shared)
@@ -311,24 +312,25 @@ def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
 
 
 def _estimate_memory(job: _SimulationJob, runs: int, chunk: int) -> NeededMemory:
-    """Return the memory of a simulation by XLA on a processor, from its shapes.
+    """Return the bytes that a simulation by XLA on a processor needs, from the shapes of its arrays.
 
-    Sums stand once in each lane; a lane that is computed also has those after its block, and rows of batches from which
-    they are made. Of trajectories the program has those that its reducer reads. `chunk`: runs that are begun together.
+    Runs are simulated in blocks of BLOCK runs. Each of LANES lanes sums over its blocks, one after another. `chunk`:
+    runs that are begun together.
     """
     with jax.enable_x64(True):
         block = np.arange(BLOCK)
         sums, collected = eqx.filter_eval_shape(_simulate_block, job, block)
         outputs = eqx.filter_eval_shape(_simulate_outputs, job, block)
-        read = list_used_leaves(partial(_reduce, job.reducer, job.later), outputs)
+        used_outputs = list_used_leaves(partial(_reduce, job.reducer, job.later), outputs)
     blocks, blocks_of_chunk = -(-runs // BLOCK), -(-min(runs, chunk) // BLOCK)
-    computed_at_once = 1 if job.world.filters.meshes else min(LANES, blocks_of_chunk, os.cpu_count() or 1)
-    rows = count_bytes(sums) * (BATCHES + BLOCK - 1) / BATCHES  # as `group_by_batch` makes them
-    kept = blocks * count_bytes(collected)
+    lanes_at_once = 1 if job.world.filters.meshes else min(LANES, blocks_of_chunk, os.cpu_count() or 1)
+    # A lane that is computed has its sums, new sums with a block added, and rows from which `group_by_batch` sums.
+    rows = count_bytes(sums) * (BATCHES + BLOCK - 1) / BATCHES
+    all_collected = blocks * count_bytes(collected)
     return NeededMemory(
-        collected=2 * kept,  # by chunk, then joined, when no trajectories are left
-        sums=min(LANES, blocks) * count_bytes(sums) + computed_at_once * (count_bytes(sums) + rows),
-        trajectories=max(0.0, computed_at_once * count_bytes(read) - kept),
+        collected=2 * all_collected,  # by chunk and joined, at a time when no trajectories are left
+        sums=min(LANES, blocks) * count_bytes(sums) + lanes_at_once * (count_bytes(sums) + rows),
+        trajectories=max(0.0, lanes_at_once * count_bytes(used_outputs) - all_collected),
     )
 
 
@@ -360,9 +362,9 @@ def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) ->
 
 
 def _reduce_runs(reducer: AbstractReducer[Any], later: NetworkSmoother | None, outputs: PyTree) -> OfStep:
-    """Return what is summed and collected of each run's trajectories, smoothed where there is a smoother."""
-    recorded: OfStep = apply_to_each_run(partial(reduce_run, reducer, later), outputs)
-    return recorded
+    """Return what is summed and collected of each run's trajectories, which the smoother `later`, if any, smooths."""
+    reduced: OfStep = apply_to_each_run(partial(reduce_run, reducer, later), outputs)
+    return reduced
 
 
 # Traced once, for their shapes and for the program alike: tracing is half of what a first call takes.

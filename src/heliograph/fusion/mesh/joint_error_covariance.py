@@ -20,13 +20,18 @@ from heliograph.numerics.types import Array, Bool, Float, Int
 def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Array, "node degree n n"]:
     """Return M_ij of e_i+ = sum_j M_ij e_j + noise, for each node i: first of itself, then of its neighbours.
 
-    e_i is the error of node i. M_ij is the gain of neighbour j's estimate, a front factor times a part. M_ii is F_i A -
-    sum_j M_ij, with A = `matrix` of the plant and F_i what a correction leaves of an error (`gains.innovation`).
+    e_i is the error of node i. M_ij, the gain of neighbour j's estimate, is L_i D_ij = `gains.common_factor`
+    `gains.neighbour_factors`. M_ii = F_i A - sum_j M_ij, with A = `matrix` of the plant and F_i = I - W_i S_i
+    (`gains.correction_map`), what a correction leaves of an error.
     """
-    parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
-    others = (gains.front[:, None] @ parts)[:, 1:]
-    itself = gains.innovation @ matrix - others.sum(axis=1)
-    transitions: Float[Array, "node degree n n"] = library(gains).concatenate([itself[:, None], others], axis=1)
+    factors = gains.neighbour_factors
+    matrices = factors if factors.ndim == 4 else factors[..., None] * np.eye(len(matrix))  # from diagonals
+    # Along the axis of neighbours the node itself comes first, whose M_ii follows from the others.
+    of_neighbours = (gains.common_factor[:, None] @ matrices)[:, 1:]
+    of_itself = gains.correction_map @ matrix - of_neighbours.sum(axis=1)
+    transitions: Float[Array, "node degree n n"] = library(gains).concatenate(
+        [of_itself[:, None], of_neighbours], axis=1
+    )
     return transitions
 
 
@@ -66,7 +71,7 @@ def scatter_blocks(
 def propagate_joint_covariance(
     joint: Float[Array, "N N"],
     transition: Any,
-    innovation: Float[Array, "node n n"],
+    correction_map: Float[Array, "node n n"],
     process_noise: Float[Array, "n n"],
     weighted_information: Any,
     weights: Any,
@@ -76,7 +81,7 @@ def propagate_joint_covariance(
     Args:
         joint: J before the step.
         transition: M (N, N), of the blocks M_ij.
-        innovation: F_i of each node, one below the other in F.
+        correction_map: F_i = I - W_i S_i of each node, one below the other in F: what a correction leaves of an error.
         process_noise: Q.
         weighted_information: matrix W S (N, N) of the blocks W_i S_j of the measurements that node i has.
         weights: matrix W (N, N) of the blocks W_i of these.
@@ -84,7 +89,7 @@ def propagate_joint_covariance(
     measured = weighted_information @ weights.T
     # Sparse matrices, outside of a program, are made dense before they are added.
     measured = measured if is_traced(measured) else measured.toarray()
-    added = propagate_by_mode(innovation.reshape(len(joint), -1), process_noise, measured)
+    added = propagate_by_mode(correction_map.reshape(len(joint), -1), process_noise, measured)
     after = propagate_by_mode(transition, joint, added)
     symmetric: Float[Array, "N N"] = (after + after.T) / 2
     return symmetric

@@ -23,7 +23,8 @@ from heliograph.numerics.check import InputError, check_count, fail, scalar, tab
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
-Ahead = tuple[np.ndarray, np.ndarray]  # parts (step, row, ...) and covariances (step, row, n, n) of weights
+# Weights of many steps: the neighbours' factors D_j (step, row, ...) and fused covariances (step, row, n, n).
+WeightsOfSteps = tuple[np.ndarray, np.ndarray]
 
 SUM = 1e-9  # shares are decimal fractions, whose sum is 1 up to rounding
 
@@ -54,11 +55,16 @@ class TraceIntersection(AbstractIntersection):
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
         """Return the shares of several estimates, all of which are present.
 
-        Shares are larger for smaller traces, to the power `self.power`, and then improved `self.improvements` times.
+        Shares are proportional to (tr P_j)^-`self.power`, and then improved `self.improvements` times.
         """
         traces = jnp.trace(covariances, axis1=1, axis2=2)
-        all_are_there = jnp.ones(len(covariances), dtype=bool)
-        estimates = NeighbourEstimates(covariances[0], traces, information, joint=None, present=all_are_there)
+        estimates = NeighbourEstimates(
+            covariance=covariances[0],  # "the node itself", of which shares by trace need no covariance
+            traces=traces,
+            information=information,
+            joint=None,
+            present=jnp.ones(len(covariances), dtype=bool),
+        )
         shares, *_ = choose_shares_by_trace(estimates, self.power, self.improvements)
         return shares
 
@@ -105,7 +111,10 @@ class DiffusionWeights(_NeighbourRule):
     given: dict[str, dict[str, float]] | None
 
     def __init__(self, shares: Mapping[str, Mapping[str, float]] | None = None):
-        """Keep the shares by node and sender; None: equal shares of a node and all its neighbours."""
+        """Check and store the shares by node and sender; None: equal shares of a node and all its neighbours.
+
+        They are stored by name in `self.given`. The array `self.shares` is None until `placed` knows the graph.
+        """
         self.shares, self.given = None, None
         if shares is not None:
             rows = table("diffusion shares", shares, "shares by neighbour")
@@ -117,37 +126,44 @@ class DiffusionWeights(_NeighbourRule):
         return True
 
     def placed(self, graph: Graph) -> "DiffusionWeights":
-        """Return the rule with its shares (degree, row) of the graph's rows, zero for the node itself."""
+        """Return the rule with the shares as an array (degree, row), from the shares by name or equal ones.
+
+        A row of `graph.senders` lists a node, first, and its neighbours. The node's own share is set to zero: it is 1
+        minus the neighbours' shares, and gains are computed for the neighbours alone.
+        """
         if unknown := sorted(set(self.given or {}) - set(graph.nodes)):
             raise fail("diffusion shares", f"those of nodes of the fusion {list(graph.nodes)[:5]}", unknown)
         shares = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
-        # The given shares of each row, if any are given; a neighbour that is not named has none.
+        # Shares by name, if there are any; a neighbour that is not named has none.
         for i, senders in enumerate(graph.senders if self.given is not None else ()):
-            name, *others = (graph.nodes[j] for j in senders[graph.present[i]])
+            name, *neighbours = (graph.nodes[j] for j in senders[graph.present[i]])
             row = (self.given or {}).get(name, {})
-            if unknown := sorted(set(row) - {name, *others}):
-                raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(others)}", unknown)
-            shares[i, 1 : 1 + len(others)] = [row.get(other, 0.0) for other in others]
-        shares[:, 0] = 0.0
+            if unknown := sorted(set(row) - {name, *neighbours}):
+                raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(neighbours)}", unknown)
+            shares[i, 1 : 1 + len(neighbours)] = [row.get(neighbour, 0.0) for neighbour in neighbours]
+        shares[:, 0] = 0.0  # of the node itself
         placed: DiffusionWeights = eqx.tree_at(
             lambda r: (r.shares, r.given), self, (shares.T, None), is_leaf=lambda leaf: leaf is None
         )
         return placed
 
     def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
-        """Return the gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
+        """Return the gains of a filter with all neighbours' measurements; an estimate's gain has its share, or is zero.
+
+        Gains do not depend on what arrives: P = (Pb^-1 + S)^-1 with the information S = `step.complete` of all
+        measurements. Only those that arrived correct, with the information `step.arrived`.
+        """
         a = jnp.asarray(step.matrix)
         predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
-        corrected, innovation = correct_by_information(predicted, jnp.asarray(step.complete))
+        corrected, complete_correction_map = correct_by_information(predicted, jnp.asarray(step.complete))
         assert self.shares is not None
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
-        # The gains are those of all measurements; only what arrived corrects: F = I - P S of the measurements that did.
-        used = jnp.eye(len(a)) - corrected @ step.arrived
+        # M_ij = (I - P S) A c_ij; what the correction leaves of an error is I - P S_arrived.
         return NodeGains(
-            front=innovation @ a,
-            parts=shares[:, None] * jnp.ones(len(a)),
+            common_factor=complete_correction_map @ a,
+            neighbour_factors=shares[:, None] * jnp.ones(len(a)),
             gain=corrected,
-            innovation=used,
+            correction_map=jnp.eye(len(a)) - corrected @ step.arrived,
             covariance=corrected,
         )
 
@@ -184,25 +200,29 @@ class FrozenWeights(_NeighbourRule):
         """Return the weights of what arrived, and the covariance that the blocks give them."""
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
 
-    def weights_ahead(self, arrived: Bool[np.ndarray, "step row degree"]) -> Ahead | None:
-        """Return parts and covariances (step, row, ...) of the weights of many steps by native code; None without it.
+    def compute_weights_of_steps(self, arrived: Bool[np.ndarray, "step row degree"]) -> WeightsOfSteps | None:
+        """Return weights and fused covariances (step, row, ...) of many steps, by native code; None if there is none.
 
-        Weights depend only on what arrives at a step, so a node's block is read once for all steps. `self.blocks`:
-        joint covariances of each node and its neighbours, with nodes along the last axis.
+        Weights depend on nothing but what arrives at a step (`arrived`) and the frozen blocks (`self.blocks`: joint
+        covariances of each node and its neighbours, nodes along the last axis). So all steps of a node are computed
+        at once, and its block is read once.
         """
-        rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
+        blocks_by_row, arrived_by_row = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
-            choice = choose_code(_weigh_neighbours, (self.rule, *rows), differs_by_run=(False, True, True))
+            # The native code runs once for each row, as it does elsewhere for each run; the rule is the same in all.
+            choice = choose_code(
+                _weigh_neighbours, (self.rule, blocks_by_row, arrived_by_row), differs_by_run=(False, True, True)
+            )
             if choice.code is None:
                 return None
-            weights: Ahead = jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())
+            weights: WeightsOfSteps = jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())
             return weights
 
 
 def _weigh_neighbours(
     rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the parts and covariances (step, ...) of one node's weights for many steps.
+    """Return the neighbours' factors and fused covariances (step, ...) of one node's weights for many steps.
 
     `joint`: Cov(e_i, e_j) of the node and its neighbours. `arrived`: which estimates came at each step.
     """
@@ -211,9 +231,9 @@ def _weigh_neighbours(
     believed = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
 
     def body(_: None, present: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
-        """Return no carry, and the weights' parts and covariance for what arrived in one step."""
+        """Return no carry, and the neighbours' factors and fused covariance for what arrived in one step."""
         weights = rule.neighbour_weights(believed._replace(present=present))
-        return None, (weights.parts, weights.covariance)
+        return None, (weights.neighbour_factors, weights.covariance)
 
     return jax.lax.scan(body, None, arrived)[1]
 

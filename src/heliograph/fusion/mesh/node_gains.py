@@ -38,14 +38,14 @@ class NeighbourEstimates(NamedTuple):
 
 
 class NeighbourWeights(NamedTuple):
-    """Weights C_j = front parts_j of the neighbours' estimates, and the covariance Pc of what is fused.
+    """Weights C_j = L D_j of the neighbours' estimates, and the covariance Pc of the fused estimate.
 
-    Shapes: front (n, n), parts (degree, n, n) or their diagonals (degree, n), covariance (n, n). Two factors, since
-    intersections share the first.
+    L = common_factor (n, n), D_j = neighbour_factors (degree, n, n) or their diagonals (degree, n), covariance (n, n).
+    Covariance intersection has C_j = P (w_j P_j^-1), so that all weights share the factor L = P.
     """
 
-    front: Float[jax.Array, "n n"]
-    parts: Float[jax.Array, "degree n *n"]
+    common_factor: Float[jax.Array, "n n"]
+    neighbour_factors: Float[jax.Array, "degree n *n"]
     covariance: Float[jax.Array, "n n"]
 
 
@@ -59,33 +59,34 @@ class NodeStep(NamedTuple):
 
 
 class NodeGains(NamedTuple):
-    """Gains of one node's step: M_j = front parts_j, of others than itself; gain W, innovation F = I - W S; P after it.
+    """Gains of one node's step: M_j = L D_j of neighbours' estimates, W of measurements, F = I - W S, and P after it.
 
-    Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n) or their diagonals (degree, n).
+    L = common_factor, W = gain, F = correction_map (what the correction leaves of an error) and P = covariance (n, n);
+    D_j = neighbour_factors (degree, n, n) or their diagonals (degree, n).
     """
 
-    front: Float[jax.Array, "n n"]
-    parts: Float[jax.Array, "degree n *n"]
+    common_factor: Float[jax.Array, "n n"]
+    neighbour_factors: Float[jax.Array, "degree n *n"]
     gain: Float[jax.Array, "n n"]
-    innovation: Float[jax.Array, "n n"]
+    correction_map: Float[jax.Array, "n n"]
     covariance: Float[jax.Array, "n n"]
 
 
 def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
-    """Return the gains of a step that fuses estimates with these weights, predicts once, and corrects.
+    """Return the gains of a step that fuses estimates with weights C_j = L D_j, predicts once, and corrects.
 
-    The gain of an estimate is `front` times its part. `innovation`, F = I - P S, is what a correction leaves of an
-    error.
+    S = `step.arrived` is the information sum_j H_j' R_j^-1 H_j of the measurements that arrived.
     """
     a = jnp.asarray(step.matrix)
+    # Pb = A Pc A' + Q; P = (Pb^-1 + S)^-1 and F = I - P S.
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
-    corrected, innovation = correct_by_information(predicted, jnp.asarray(step.arrived))
-    # The gain W of measurements in information form, H' R^-1 z, is the covariance P after the step.
+    corrected, correction_map = correct_by_information(predicted, jnp.asarray(step.arrived))
+    # M_j = F A L D_j. The correction is P sum_j H_j' R_j^-1 (z_j - H_j xb): the gain of these sums is P itself.
     return NodeGains(
-        front=innovation @ a @ weights.front,
-        parts=weights.parts,
+        common_factor=correction_map @ a @ weights.common_factor,
+        neighbour_factors=weights.neighbour_factors,
         gain=corrected,
-        innovation=innovation,
+        correction_map=correction_map,
         covariance=corrected,
     )
 

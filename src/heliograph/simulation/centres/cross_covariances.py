@@ -71,12 +71,13 @@ class CrossCovariances:
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """Return the best unbiased weights W of the nodes' estimates, and the covariance W P W' of the fused error.
 
-        P is the joint covariance of the nodes' errors. If P allows it, the time is linear in the number of nodes.
+        P is the joint covariance of the nodes' errors. The time is linear in the number of nodes if the covariance of
+        each error's independent part is regular.
         """
         weights = _choose_weights(self._error_sources)
-        # The fused error: a factor of the part from shared sources, and the covariance of the independent part.
-        shared, independent = self._error_sources.weigh(weights)
-        return weights, np.asarray(shared @ shared.T + independent)
+        # The fused error is B s + a with Cov s = I: a factor B of the shared sources s, and Cov a of the rest.
+        factor, independent = self._error_sources.weigh(weights)
+        return weights, np.asarray(factor @ factor.T + independent)
 
     @property
     def _error_sources(self) -> ErrorSources:
@@ -216,11 +217,15 @@ def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | No
 
 @quickly_compiled
 def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
-    """Return factors of the joint covariance of all errors after the steps of u, for the only informed fusion."""
-    (centre,) = filters.linear_centres  # that of the informed fusion, which knows how the errors are correlated
+    """Return the joint covariance of all nodes' errors after the steps of u, as roots times independent sources.
+
+    `filters` has one fusion by the errors' joint covariance, whose centre has the models of the errors' recursion.
+    """
+    (centre,) = filters.linear_centres
     filter_states, _, _, (centre_state,), *_ = filters.init()
-    nodes, n = centre_state.errors.bias.shape
-    # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
+    nodes, n = centre_state.errors.bias.shape  # mean errors (node, n)
+    # Each step adds sources: n of the plant's noise and, where nodes share their measurement noises, as many as all
+    # nodes receive numbers.
     are_shared = isinstance(centre.observation_model, SharedObservation)
     sources_per_step = n + (nodes * centre.size if are_shared else 0)
     start = filter_states, make_initial_factors(centre_state.errors, sources_per_step * len(u))

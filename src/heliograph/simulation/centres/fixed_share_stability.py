@@ -45,59 +45,79 @@ def check_error_decay(
 
 
 class _ErrorMaps(NamedTuple):
-    """One step of the errors: e_i+ = alone_i e_i + sum_j (pulled_ij e_j + pushed_ij e_i), j the messages that arrive.
+    """One step of the errors, e_i+ = B_i e_i + sum_j (C_ij e_j + D_ij e_i) over the messages j that arrive at node i.
 
-    Shapes: alone (node, n, n), pulled and pushed (node, degree, n, n).
+    Args:
+        without_messages: B_i (node, n, n).
+        of_sender: C_ij, from the error of the sender j (node, degree, n, n).
+        of_receiver: D_ij, from the error of the receiver i (node, degree, n, n).
     """
 
-    alone: np.ndarray
-    pulled: np.ndarray
-    pushed: np.ndarray
+    without_messages: np.ndarray
+    of_sender: np.ndarray
+    of_receiver: np.ndarray
 
 
 def _make_error_maps(
     graph: Graph, shares: np.ndarray, plant: tuple[np.ndarray, np.ndarray], squares: np.ndarray
 ) -> _ErrorMaps:
-    """Return the step of the errors with the gains of the long run; arguments as of `check_error_decay`."""
+    """Return one step of the errors e_i, with the gains that fixed shares have in the long run.
+
+    A node predicts, corrects by its own measurement, and by each message of a neighbour j: by its measurement, and by
+    the share c_ij of its estimate. With S_j = H_j' R_j^-1 H_j and F_i = I - P_i sum_j S_j
+
+      e_i+ = (A - P_i S_i A) e_i + sum_j [c_ij F_i A (e_j - e_i) - P_i S_j A e_i].
+
+    Args:
+        graph: whom each node receives, itself first.
+        shares: c_ij (node, degree), zero for the node itself.
+        plant: A and Q.
+        squares: S_j (node, n, n).
+    """
     a, q = plant
     n = len(a)
-    # P_i in the long run of a filter that receives all its neighbours' measurements, of information `total`: by STEPS
-    # steps of P- = A P A' + Q, P = (P-^-1 + total)^-1.
-    total = np.where(graph.present[:, :, None, None], squares[graph.senders], 0.0).sum(axis=1)
+    # P_i of a filter that receives all its neighbours' measurements, after STEPS steps of P- = A P A' + Q and
+    # P = (P-^-1 + sum_j S_j)^-1.
+    information = np.where(graph.present[:, :, None, None], squares[graph.senders], 0.0).sum(axis=1)
     root = np.tile(np.eye(n), (len(squares), 1, 1))
     process = np.broadcast_to(roots_of(q), root.shape)
     for _ in range(STEPS):
-        root = observe_information(np.concatenate([a @ root, process], axis=-1), total).root
+        root = observe_information(np.concatenate([a @ root, process], axis=-1), information).root
     p = covariance_of_root(root)
-    # With F_i = I - P_i total_i and S_j = H_j' R_j^-1 H_j a message of j adds c_ij F_i A (e_j - e_i) - P_i S_j A e_i.
-    pulled = shares[:, :, None, None] * ((np.eye(n) - p @ total) @ a)[:, None]
+    of_sender = shares[:, :, None, None] * ((np.eye(n) - p @ information) @ a)[:, None]  # c_ij F_i A
     return _ErrorMaps(
-        alone=a - p @ squares @ a, pulled=pulled, pushed=-pulled - p[:, None] @ squares[graph.senders] @ a
+        without_messages=a - p @ squares @ a,
+        of_sender=of_sender,
+        of_receiver=-of_sender - p[:, None] @ squares[graph.senders] @ a,
     )
 
 
 def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tuple[float, np.ndarray]:
-    """Return the growth of the errors' second moments in a step, in the long run, and their sizes by node in the end.
+    """Return by which factor the errors' second moments grow in a step, in the long run, and each node's share of them.
 
-    With E[M] the mean of the step over what gets lost, J+ = E[M] J E[M]' and on the diagonal, since messages get lost
-    independently, sum_j p_j (1 - p_j) D_j E[(e_i, e_j) (e_i, e_j)'] D_j' more, where D_j = (pushed_ij, pulled_ij) and
-    p_j is the probability of the message. Noise does not matter to growth.
+    J = E[e e'] of all nodes' errors e. The message from j to i arrives with probability p_ij, independently of others,
+    and then adds G_ij (e_i, e_j) to the error of node i, G_ij = (of_receiver_ij, of_sender_ij). With the mean step E[M]
 
-    `arrives`: probability of each message (node, degree).
+      J+ = E[M] J E[M]', plus sum_j p_ij (1 - p_ij) G_ij E[(e_i, e_j) (e_i, e_j)'] G_ij' in the block of node i.
+
+    Noise does not matter to growth.
+
+    `arrives`: p_ij of each message (node, degree). `maps`: the step of the errors.
     """
-    nodes, n = maps.alone.shape[:2]
+    nodes, n = maps.without_messages.shape[:2]
+    # E[M]: e_j enters by p_ij of_sender_ij, e_i by without_messages_i + sum_j p_ij of_receiver_ij.
     probability = arrives[:, :, None, None]
-    mean = probability * maps.pulled
-    mean[:, 0] = maps.alone + (probability * maps.pushed)[:, 1:].sum(axis=1)
-    m = scatter_blocks(mean, graph.senders, graph.present)
+    mean_step = probability * maps.of_sender
+    mean_step[:, 0] = maps.without_messages + (probability * maps.of_receiver)[:, 1:].sum(axis=1)
+    m = scatter_blocks(mean_step, graph.senders, graph.present)
     variance = (arrives * (1 - arrives))[:, :, None, None]
-    changes = np.concatenate([maps.pushed, maps.pulled], axis=3)  # D_j (node, degree, n, 2 n)
-    joint, logarithms, itself = np.eye(nodes * n), [], np.arange(nodes)
+    g = np.concatenate([maps.of_receiver, maps.of_sender], axis=3)  # (node, degree, n, 2 n)
+    joint, logarithms, each_node = np.eye(nodes * n), [], np.arange(nodes)
     for _ in range(STEPS):
-        added = propagate_by_mode(changes, _take_moments_of_pairs(joint.reshape(nodes, n, nodes, n), graph), 0.0)
+        by_message = propagate_by_mode(g, _take_moments_of_pairs(joint.reshape(nodes, n, nodes, n), graph), 0.0)
         joint = np.asarray(propagate_by_mode(m, joint, 0.0))
         blocks = joint.reshape(nodes, n, nodes, n)  # a view: writing here changes `joint`
-        blocks[itself, :, itself, :] += (variance * added).sum(axis=1)
+        blocks[each_node, :, each_node, :] += (variance * by_message).sum(axis=1)
         # Growth in this step, since before it the trace was 1 (but for the first, which is not used).
         logarithms.append(np.log(np.trace(joint)))
         joint /= np.trace(joint)

@@ -139,12 +139,12 @@ class FusionCentre(Module):
         (_, factors), _ = jax.lax.scan(propagate, start, (jnp.arange(len(u)), jnp.asarray(u)))
         return factors
 
-    def gather_matrices(self, parts: Sequence[LinearStep]) -> LinearStep:
+    def gather_matrices(self, matrices_by_source: Sequence[LinearStep]) -> LinearStep:
         """Return the filters' matrices in the order of the nodes, padded with zeros to the longest measurement.
 
-        `parts`: those of each source, with a leading axis of nodes.
+        `matrices_by_source`: of each stack of filters, with a leading axis of nodes.
         """
-        return join_step_matrices(parts, self.order, self.size)
+        return join_step_matrices(matrices_by_source, self.order, self.size)
 
     def step(
         self,
@@ -154,17 +154,23 @@ class FusionCentre(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[CentreState, dict[str, Estimate]]:
-        """Return the next state, and the fused estimates of step k by name of the fusion.
+        """Propagate the moments of all nodes' errors over step k, and fuse the nodes' estimates by every rule.
+
+        A source is a stack of filters of one structure. `self.order` brings their nodes, one source after another, into
+        the order of the nodes.
 
         Args:
-            state: before the step.
-            matrices_by_source: matrices of the sources' filters in the step, with a leading axis of nodes.
-            means_by_source: of their estimates after it (node, n), by source.
+            state: moments of the errors, and states of the rules, before the step.
+            matrices_by_source: matrices of the filters in the step, with a leading axis of nodes.
+            means_by_source: their estimates after it (node, n).
             u: inputs of the plant over the step.
             k: number of the step.
+
+        Returns:
+            The next state, and the fused estimates by name of the fusion.
         """
         error_step = self.step_errors(state.errors, self.gather_matrices(matrices_by_source), u, k)
-        reports = jnp.concatenate(means_by_source)[self.order]
+        reports = jnp.concatenate(means_by_source)[self.order]  # the nodes' estimates (node, n)
         rules_after, estimates = {}, {}
         for name, rule in self.rules.items():
             rules_after[name], (mean, covariance) = rule.fuse_step(state.rules[name], error_step, reports)
@@ -177,8 +183,8 @@ MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, 
 Matrices = TypeVar("Matrices", LinearStep, LinearisedStep)
 
 
-def join_step_matrices(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
-    """Return the matrices of several groups of filters, one after another and then in this order.
+def join_step_matrices(matrices_by_source: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
+    """Return the matrices of several stacks of filters as one stack: one stack after another, then in this order.
 
     Axes as long as the measurement are padded with zeros to `size`.
     """
@@ -192,17 +198,18 @@ def join_step_matrices(parts: Sequence[Matrices], order: np.ndarray, size: int) 
         padding = [(0, size - n) if axis in measurement_axes else (0, 0) for axis, n in enumerate(leaf.shape)]
         return jnp.pad(leaf, padding)
 
-    matrices = type(parts[0])
+    matrices_class = type(matrices_by_source[0])
     joined = {
-        field: jnp.concatenate([pad(field, getattr(part, field)) for part in parts]) for field in matrices._fields
+        field: jnp.concatenate([pad(field, getattr(matrices, field)) for matrices in matrices_by_source])
+        for field in matrices_class._fields
     }
-    return matrices(**{field: leaf[order] for field, leaf in joined.items()})
+    return matrices_class(**{field: leaf[order] for field, leaf in joined.items()})
 
 
-Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node
+NodeModels = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node
 
 
-def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
+def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: NodeModels, shared: bool) -> Claim:
     """Return the claim of fusion by a rule that knows how errors are correlated: "exact", "upper" or "nominal".
 
     "upper" where noise is known by bounds; "nominal" where probabilities are uncertain or gains depend on data.
@@ -231,12 +238,12 @@ def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shar
     return lower_claim_by_noise(claim, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
-def has_data_dependent_gains(nodes: Parts) -> bool:
+def has_data_dependent_gains(nodes: NodeModels) -> bool:
     """Return whether some filter's gains depend on data, so that errors can only be propagated along the estimates."""
     return any(isinstance(filter, GaussianFilter) and not filter.linear for _, _, filter in nodes.values())
 
 
-def _check_data_dependent_gains(rule: str, nodes: Parts, shared: bool) -> None:
+def _check_data_dependent_gains(rule: str, nodes: NodeModels, shared: bool) -> None:
     """Raise ValueError unless all filters are cubature or extended ones, and the nodes share no channel."""
     for name, (_, _, filter) in nodes.items():
         if not isinstance(filter, GaussianFilter) or filter.linear:
@@ -246,7 +253,7 @@ def _check_data_dependent_gains(rule: str, nodes: Parts, shared: bool) -> None:
                    "data", "nodes that share a channel")  # fmt: skip
 
 
-def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
+def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: NodeModels) -> None:
     """Raise unless plant and sensors are linear, and the gains of all filters depend on no data."""
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
@@ -345,25 +352,33 @@ class CentreFilter(AbstractSizedFilter):
 
     @compile_in_float64
     def init(self) -> CentreJointState:
-        """Return the state before any report: nodes' filters, moments of their errors, and what the centre believes."""
-        states, _, _, centre_states, *_ = self.filters.init()
+        """Return the state before any report: nodes' filters, moments of their errors, and the centre's estimate.
+
+        The centre estimates the plant's state, all nodes' errors, and the reports that may still arrive late.
+        """
+        filter_states, _, _, centre_states, *_ = self.filters.init()
         errors = centre_states[0].errors
-        belief = make_initial_belief(errors, self.ages - 1, self.widest, self.quantized)
-        return CentreJointState(states, errors, belief)
+        longest_delay = self.ages - 1  # ages of reports are 0, 1, ... steps
+        joint_estimate = make_initial_belief(
+            errors, delays=longest_delay, received=self.widest, quantized=self.quantized
+        )
+        return CentreJointState(nodes=filter_states, errors=errors, known=joint_estimate)
 
     @predicts
     def predict(self, state: CentreJointState, u: ArrayLike = (), k: Step = 0) -> CentreJointState:
-        """Return the state after the nodes filtered step k and sent their reports: plant and all errors are predicted.
+        """Predict the plant's state and all nodes' errors over step k, in which each node filters and sends a report.
 
         The nodes' gains depend on no data, so that the centre computes them itself.
         """
-        (centre,) = self.filters.linear_centres  # the one that fuses the reports
+        (centre,) = self.filters.linear_centres  # it has the models of the nodes' errors
         u, step = jnp.asarray(u), jnp.asarray(k)
+        # Matrices of the nodes' filters, then the step of their errors e_i = x - m_i that these make.
         filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
         error_step = centre.step_errors(state.errors, filters, u, step)
+        # The nodes' filters after the step, and the centre's estimate of (x, e_1, ..., e_nodes, past reports).
         node_states = self.filters.step_without_data(state.nodes, u, step)
-        belief = propagate_errors(state.known, error_step, at(self.links, k))
-        return CentreJointState(node_states, error_step.errors, belief)
+        joint_estimate = propagate_errors(state.known, error_step, at(self.links, k))
+        return CentreJointState(nodes=node_states, errors=error_step.errors, known=joint_estimate)
 
     @corrects
     def correct(self, state: CentreJointState, z: ArrayLike, k: Step = 0) -> tuple[CentreJointState, Innovation]:

@@ -160,8 +160,8 @@ class ReportFusion(Module):
 
         Args:
             state: of reports in transit and of the centre's filter, before the step.
-            estimates: of the nodes' filters by kind, (filter, node, ...).
-            drawn: what the uplinks do at this step.
+            estimates: of the nodes' filters, for each stack of filters of one structure (filter, node, ...).
+            drawn: gains, offsets and delays of the uplinks at this step.
             u: inputs of the plant over the step.
             k: number of the step.
 
@@ -169,13 +169,16 @@ class ReportFusion(Module):
             The state after the step; the centre's estimate; which components saturated a quantizer, and the symbols
             sent (empty without quantizers); the reports sent (node, m) as they arrive, and their delays (node,).
         """
-        flying, filter_state = state
-        means = jnp.concatenate([estimates[kind].mean[f] for kind, f in self.sources])[self.order]
-        flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
-        flying, reports = self.uplinks.arrive(flying, sent, drawn.delay)
-        received = jnp.ravel(reports)[np.array(self.centre.rows)]  # of (age, node, m), those that can arrive
+        in_transit, filter_state = state
+        # The nodes' means: from their stacks, then in the order of the nodes.
+        means = jnp.concatenate([estimates[stack].mean[filter] for stack, filter in self.sources])[self.order]
+        # Each node's report as it will arrive, and the reports (age, node, m) that arrive now, by age in steps.
+        in_transit, sent, quantizer_outcome = self.uplinks.send(in_transit, means, drawn, k)
+        in_transit, reports = self.uplinks.arrive(in_transit, sent, drawn.delay)
+        # The measurement of the centre's filter is without what only pads shorter reports.
+        received = jnp.ravel(reports)[np.array(self.centre.rows)]
         filter_state, estimate = self.centre.step(filter_state, received, u, k)
-        return (flying, filter_state), estimate, traffic, (sent, drawn.delay)
+        return (in_transit, filter_state), estimate, quantizer_outcome, (sent, drawn.delay)
 
 
 def build_report_fusions(
@@ -300,24 +303,34 @@ def list_centres(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...
 def _build_centre(
     network: Network, name: str, rules: dict[str, AbstractInformedFusion]
 ) -> FusionCentre | LinearisedCentre:
-    """Return the centre of the nodes that have the filter `name`, with its informed rules by name of the fusion."""
+    """Return the centre that fuses the estimates of the filter `name` of all nodes that have it.
+
+    `rules`: by name of the fusion; each needs the joint covariance of the nodes' errors, which the centre propagates.
+    """
     places, claims = network.places, network.claims()[FUSED]
     nodes = network.nodes_with(name)
-    # Where the nodes' filters stand, and the longest measurement.
+    # In which stacks of filters (sources) the nodes' filters are, and the nodes of each stack.
     sources, order = find_source_filters(network, places, nodes, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
-    size = max(network.nodes[node].received for node in nodes)
+    longest_measurement = max(network.nodes[node].received for node in nodes)
     claim = claims[next(iter(rules))]  # the same of all rules on one filter
-    # Where gains depend on data, the moments of the errors are followed along the estimates.
+    # Where gains depend on data, errors are propagated along the estimates of each run.
     if has_data_dependent_gains(network.parts_of(name)):
-        return LinearisedCentre(plant=network.plant, rules=rules, order=order, sources=sources, size=size, claim=claim)
+        return LinearisedCentre(
+            plant=network.plant,
+            rules=rules,
+            order=order,
+            sources=sources,
+            size=longest_measurement,
+            claim=claim,
+        )
     return FusionCentre(
         plant=network.plant,
-        observation_model=_model_measurements(network, nodes, groups, order, size),
+        observation_model=_model_measurements(network, nodes, groups, order, longest_measurement),
         rules=rules,
         order=order,
         sources=sources,
-        size=size,
+        size=longest_measurement,
         claim=claim,
     )
 
@@ -352,19 +365,19 @@ def _model_measurements(
     Args:
         network: the network.
         nodes: their names.
-        groups: names of the nodes of each source, in the stacks' order.
-        order: brings these, one group after another, into the order of `nodes`.
+        groups: names of the nodes whose sensors have one structure, and so can be stacked; one list for each stack.
+        order: indices that bring the nodes, one group after another, into the order of `nodes`.
         size: length of the longest measurement, to which others are padded.
     """
     if network.common is not None:
-        # Of each node the rows of the common channel's output that it receives, -1 for those that it lacks.
+        # All receive parts of one channel's output: the rows of each node, padded with -1.
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in nodes]
         return SharedObservation(
             network.common.sensor, compute_channel_moments(network.common.channel), np.array(padded)
         )
-    stacked = []
+    models = []
     for names in groups:
         members = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        stacked.append(stack_nodes([node.sensor for node in members], [node.channel for node in members]))
-    return SeparateObservations(tuple(stacked), order, size)
+        models.append(stack_nodes([node.sensor for node in members], [node.channel for node in members]))
+    return SeparateObservations(tuple(models), order, size)

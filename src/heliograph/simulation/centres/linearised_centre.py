@@ -70,8 +70,8 @@ class LinearisedCentre(Module):
     def step(
         self,
         state: dict[str, LinearisedFusionState],
-        parts: Sequence[LinearisedStep],
-        means: Sequence[jax.Array],
+        derivatives_by_source: Sequence[LinearisedStep],
+        means_by_source: Sequence[jax.Array],
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[dict[str, LinearisedFusionState], dict[str, Estimate]]:
@@ -79,15 +79,15 @@ class LinearisedCentre(Module):
 
         Args:
             state: before the step.
-            parts: derivatives of the sources' filters in the step, with a leading axis of nodes.
-            means: of their estimates after it (node, n), by source.
+            derivatives_by_source: of the filters in the step, for each stack of filters, with a leading axis of nodes.
+            means_by_source: their estimates after it (node, n).
             u: inputs of the plant over the step.
             k: number of the step.
         """
-        linear, reports = join_step_matrices(parts, self.order, self.size), jnp.concatenate(means)[self.order]
+        linear = join_step_matrices(derivatives_by_source, self.order, self.size)
+        reports = jnp.concatenate(means_by_source)[self.order]
         plant = at(self.plant, k)
-        # F_i = I - K_i C_i of all nodes (node, n, n).
-        keep = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output
+        error_factor = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output  # F_i = I - K_i C_i (node, n, n)
         following, results = {}, {}
         for name, rule in self.rules.items():
             before = state[name]
@@ -96,11 +96,11 @@ class LinearisedCentre(Module):
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors, by which the rule weights the reports.
-            step = _make_joint_error_step(motion, keep, linear)
+            step = _make_joint_error_step(motion, error_factor, linear)
             errors = _replace_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
             # `AllReports` estimates the errors themselves, so that their means matter too.
             if isinstance(rule, AllReports):
-                drift = _compute_drift_of_mean_errors(before.rule, matrix, moved, keep, linear)
+                drift = _compute_drift_of_mean_errors(before.rule, matrix, moved, error_factor, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
             rule_state, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
             following[name] = LinearisedFusionState(errors, known=mean, rule=rule_state)
@@ -109,17 +109,19 @@ class LinearisedCentre(Module):
 
 
 def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: LinearisedStep) -> ErrorStep:
-    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `error_factor` is F_i = I - K_i C_i.
+    """Return the step x+ = A x + b + w of the plant, and e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors.
 
-    A and w are the matrix and the noise of the plant's `motion`. K_i and nu_i are the gain and the measurement noise of
-    node i, from `linear`. The plant's state x stands before the errors. Errors do not depend on x, and only x is
-    shifted, so errors of mean zero keep that mean. `error_factor`: (node, n, n).
+    A, b and w are the matrix, shift and noise of the plant's `motion`. K_i and nu_i are the gain and the measurement
+    noise of node i, from `linear`. F_i = I - K_i C_i is `error_factor` (node, n, n). Errors do not depend on x and are
+    not shifted, so errors of mean zero keep that mean.
     """
     nodes, n, _ = error_factor.shape
     return ErrorStep(
-        transition=ErrorMap(motion.matrix, jnp.zeros_like(error_factor), error_factor @ motion.matrix),
+        transition=ErrorMap(
+            plant=motion.matrix, of_state=jnp.zeros_like(error_factor), errors=error_factor @ motion.matrix
+        ),
         shift=jnp.pad(motion.shift, (0, nodes * n)),
-        of_noise=jnp.concatenate([jnp.eye(n), error_factor.reshape(nodes * n, n)]),
+        noise_input=jnp.concatenate([jnp.eye(n), error_factor.reshape(nodes * n, n)]),
         process=motion.noise,
         gain=linear.gain,
         received=linear.noise,
@@ -127,24 +129,26 @@ def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: Line
 
 
 def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
-    """Return the moments `after` a step, with the plant's mean and cross-covariances taken from `before` it.
+    """Return the moments `after` a step of the errors, and those `before` it of the plant's state x.
 
-    Models are linearised along estimates here, so the plant's own moments are unknown and stay as they are.
-    The plant's moments are row 0 of the means (node + 1, n), and the first n rows and columns of the covariance.
-    `after.bias`: the rows of the mean below row 0, the means of the errors.
+    Models are linearised along an estimate here, which does not give moments of x before any data. No rule uses those;
+    they stay as they are, so that they stay finite.
     """
     n = before.mean.shape[1]
+    # Moments are of (x, e_1, ..., e_nodes): row 0 of the means (1 + node, n), and the first n rows and columns of the
+    # covariance, belong to x.
     is_of_error = np.arange(len(before.covariance)) >= n
     covariance = jnp.where(np.outer(is_of_error, is_of_error), after.covariance, before.covariance)
-    return ErrorMoments(jnp.concatenate([before.mean[:1], after.bias]), covariance)
+    return ErrorMoments(mean=jnp.concatenate([before.mean[:1], after.bias]), covariance=covariance)
 
 
 def _compute_drift_of_mean_errors(
     state: ReportsBelief, matrix: jax.Array, predicted_mean: jax.Array, error_factor: jax.Array, linear: LinearisedStep
 ) -> jax.Array:
-    """Return F_i (E e_i- - A E e_i) (node, n): the part of each mean error's move that the linear map A leaves out.
+    """Return the shift F_i (E e_i- - A E e_i) (node, n) of the mean errors, which the linear step does not give.
 
-    Each filter's prediction m_i- is known, so that E e_i- = E x- - m_i-.
+    The linear step takes E e_i to F_i A E e_i. But the plant is not linear: the predicted error has the mean
+    E e_i- = E x- - m_i- with the filter's prediction m_i-, and a correction leaves F_i = I - K_i C_i of it.
 
     Args:
         state: the rule's state, with the means E e_i before the step.

@@ -34,11 +34,11 @@ from heliograph.simulation.centres.late_and_quantized_messages import (
     step_messages_on_the_way,
 )
 from heliograph.simulation.centres.mesh_state_and_step import (
-    Ahead,
     Arrived,
     MeshState,
     MeshStep,
     NodeBucket,
+    PrecomputedWeights,
     compute_information,
     propagate_joint,
     pull_to_neighbours,
@@ -94,25 +94,25 @@ class Mesh(Module):
         plant = at(self.plant, k=0)
         mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
         nodes, n = len(self.senders), len(mean)
-        # Before any data all nodes' errors are the same.
+        # Before any data all nodes have the same error, x_0 - E x_0.
         joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
-        sent = None if self.alpha is None else jnp.tile(mean, (*self.senders.shape, 1))
-        way = None
-        if self.edges.past or self.quantizer is not None:
-            ages = self.edges.past  # 0 with a quantizer and no delay: nothing is on the way from step to step
+        # With events all know the plant's mean, so that it stands for what each node received last.
+        last_received = None if self.alpha is None else jnp.tile(mean, (*self.senders.shape, 1))
+        way, ages = None, self.edges.past  # a row of messages for each age; none with a quantizer and no delay
+        if ages or self.quantizer is not None:
             way = MessagesOnTheWay(jnp.tile(mean, (ages, nodes, 1)), jnp.tile(covariance, (ages, nodes, 1, 1)))
         return MeshState(
             mean=jnp.tile(mean, (nodes, 1)),
             covariance=jnp.tile(covariance, (nodes, 1, 1)),
             joint=joint,
             plant=(mean, covariance),
-            sent=sent,
+            sent=last_received,
             way=way,
         )
 
     def step(
         self, state: MeshState, z: Sequence[jax.Array], arrived: Arrived,
-        u: jax.Array, k: jax.Array, ahead: Ahead = (),
+        u: jax.Array, k: jax.Array, precomputed: PrecomputedWeights = (),
     ) -> tuple[MeshState, tuple[Estimate, ...]]:  # fmt: skip
         """Exchange, fuse, predict and correct at step k: return the next state, and the estimates by group of nodes.
 
@@ -120,16 +120,15 @@ class Mesh(Module):
 
           xhat+ = A xhat + b + sum_j M_j (xhat_j - xhat) + W (s - S (A xhat + b))
 
-        with M_j = `gains.front` `gains.parts`, W = `gains.gain`; S = sum_j H_j' R_j^-1 H_j and s = sum_j H_j' R_j^-1
-        (z_j - offset_j) over the measurements that reach the node.
+        with M_j = `gains.common_factor` `gains.neighbour_factors`, W = `gains.gain`; S = sum_j H_j' R_j^-1 H_j and
+        s = sum_j H_j' R_j^-1 (z_j - offset_j) over the measurements that reach the node.
 
         Args:
             state: before the step.
             z: measurements (node, components) by group of nodes, NaN where one is missing.
             arrived: which messages arrive (node, rounds, degree); ages in steps, -1 of none, where they may be late.
-            u: inputs of the plant over the step.
-            k: number of the step.
-            ahead: weights of this step by bucket, if they were computed before; then the rule is not asked.
+            u, k: inputs of the plant over the step, and its number.
+            precomputed: weights of this step by bucket, if they were computed before; else the rule computes them.
 
         Returns:
             The state after the step, and estimates (1, node, ...) by group of nodes.
@@ -142,12 +141,12 @@ class Mesh(Module):
         # Weights and gains, none of which depends on the estimates.
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
         step = self.compute_step_without_estimates(
-            state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages
+            state.covariance, blocks, state.plant, present, arrived, u, k, precomputed, messages
         )
-        # All rounds but the last only intersect: xhat_i + front_i sum_j parts_ij (xhat_j - xhat_i).
+        # All rounds but the last only intersect: xhat_i + L_i sum_j D_ij (xhat_j - xhat_i).
         mean = state.mean
         for weights in step.exchanges:
-            mean = mean + pull_to_neighbours(weights.front, weights.parts, mean, mean[self.senders])
+            mean = mean + pull_to_neighbours(weights.common_factor, weights.neighbour_factors, mean, mean[self.senders])
         received = self._select_received_estimates(mean, state, jnp.asarray(arrived[:, -1]), messages)
         # Rows of `state` that only send, as those of a `NodeFilter`, end here: one row goes on for each node.
         mean = mean[self.senders[:, 0]]
@@ -155,21 +154,20 @@ class Mesh(Module):
         common = jnp.mean(predicted, axis=0)
         weighted = weigh_measurements(step.data, measured, present, common)
         innovation = self._compute_innovation(predicted, common, weighted, step, arrived)
-        pulled = pull_to_neighbours(step.gains.front, step.gains.parts, mean, received)
-        mean = predicted + pulled + jnp.einsum("iab,ib->ia", step.gains.gain, innovation)
+        gains = step.gains
+        pulled = pull_to_neighbours(gains.common_factor, gains.neighbour_factors, mean, received)
+        mean = predicted + pulled + jnp.einsum("iab,ib->ia", gains.gain, innovation)
         # Covariance of all errors where the rule needs it; it is then what is claimed.
         joint = None
         if state.joint is not None:
             joint = propagate_joint(state.joint, step, arrived[:, -1], self.senders, self.edges.present)
-        claimed = step.gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
-        # What neighbours received is predicted along, and messages go on towards them.
+        claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
+        # What neighbours received last is predicted along, and messages go on towards them.
         last = None if state.sent is None else received @ step.motion.matrix.T + step.motion.shift
         way = None
         if messages is not None and state.way is not None:
             way = step_messages_on_the_way(messages, state.way, step.motion, common, weighted, step.data.information)
-        after = MeshState(
-            mean=mean, covariance=step.gains.covariance, joint=joint, plant=step.plant, sent=last, way=way
-        )
+        after = MeshState(mean=mean, covariance=gains.covariance, joint=joint, plant=step.plant, sent=last, way=way)
         return after, self._split_by_group(mean, claimed)
 
     def _compute_innovation(
@@ -185,23 +183,24 @@ class Mesh(Module):
         return sums - jnp.einsum("iab,ib->ia", step.information, predicted - common)
 
     def _gather_late_or_quantized(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
-        """Return the estimates that arrive if messages may be late or quantized, else (`state.way` is None) None.
+        """Return the estimates that arrive, if messages may be late or quantized; otherwise None.
 
-        `arrived` (node, rounds, degree): flags, or ages where messages may be late.
+        `state.way`: messages on the way, None if they all arrive unchanged at once or never. `arrived` (node, rounds,
+        degree): whether a message arrives or, if messages may be late (`self.edges.past` > 0), its age in steps.
         """
         if state.way is None:
             return None
-        ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)  # 0: at once, -1: not at all
+        ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)  # 0: sent in this step, -1: no message
         return gather_messages(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
 
     def _select_received_estimates(
         self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: ArrivingEstimates | None
     ) -> Float[jax.Array, "node degree n"]:
-        """Return the estimates that each node has of its neighbours: those of now, or what it received last or late.
+        """Return the estimate that each node uses of each neighbour: the present one, a late one, or the last received.
 
         Args:
             mean: estimates of the nodes now (node, n).
-            state: before the step, with what each node received last.
+            state: before the step; with events, `state.sent` is what each node received last, predicted to this step.
             arrives: which messages arrive in the last round (node, degree).
             messages: late or quantized estimates that arrive; None where they are sent as they are.
         """
@@ -210,7 +209,7 @@ class Mesh(Module):
         present_estimates = mean[self.senders]
         if state.sent is None or self.alpha is None:
             return present_estimates
-        # With events: a node sends only where its estimate has moved beyond what somebody received last.
+        # With events: a node sends if its estimate is further than `alpha` from what some neighbour received last.
         information = jax.vmap(invert_positive_definite)(state.covariance)[self.senders]
         are_sent = find_event_senders(
             self.alpha, present_estimates - state.sent, information, self.senders, self.edges.present
@@ -220,7 +219,7 @@ class Mesh(Module):
     def compute_step_without_estimates(
         self, covariance: Float[Array, "node n n"], blocks: Float[Array, "node degree n degree n"] | None,
         moments: tuple[Array, Array], measured: Bool[Array, "node m"], arrived: Arrived, u: Array, k: Array,
-        ahead: Ahead = (), messages: ArrivingEstimates | None = None,
+        precomputed: PrecomputedWeights = (), messages: ArrivingEstimates | None = None,
     ) -> MeshStep:  # fmt: skip
         """Return all of step k but the estimates: models, moments of the plant, weights and gains.
 
@@ -232,7 +231,7 @@ class Mesh(Module):
             arrived: which messages arrive.
             u: inputs of the plant over the step.
             k: number of the step.
-            ahead: weights that were computed before, by bucket.
+            precomputed: weights that were computed before, by bucket.
             messages: late or quantized estimates that arrive; None where they are sent as they are.
         """
         covariance, measured, arrived, u = (jnp.asarray(x) for x in (covariance, measured, arrived, u))
@@ -256,7 +255,7 @@ class Mesh(Module):
         arrives, senders = arrived[:, -1], None
         if messages is not None:
             covariance, senders, arrives = messages.covariance, messages.senders, messages.arrives[:, -1]
-        gains = self.compute_gains(covariance, blocks, arrives, motion, information, complete, ahead, senders)
+        gains = self.compute_gains(covariance, blocks, arrives, motion, information, complete, precomputed, senders)
         return MeshStep(
             motion=motion,
             plant=after,
@@ -277,26 +276,25 @@ class Mesh(Module):
         blocks: jax.Array | None,
         present: jax.Array,
         *rest: jax.Array,
-        ahead: Ahead = (),
+        precomputed: PrecomputedWeights = (),
         senders: Array | None = None,
     ) -> PyTree:
-        """Return function(rule, estimates of the neighbours, *rest, ahead) of every node, with a leading axis of nodes.
+        """Return function(rule, estimates of the neighbours, *rest, precomputed) with a leading axis of nodes.
 
         Args:
-            function: of one node; it returns a tuple with a field `parts`, of which it has a row for each message.
+            function: of one node; its result has a field `neighbour_factors`, of a row for each message.
             covariance: of all estimates (row, n, n), one row for each node unless `senders` says otherwise.
             blocks: joint covariance of each neighbourhood (node, degree, n, degree, n); None where no rule needs it.
             present: which messages arrive (node, degree).
             *rest: further arguments, with a leading axis of nodes.
-            ahead: weights computed before, by bucket.
+            precomputed: weights computed before, by bucket.
             senders: row of `covariance` for each message that a node receives (node, degree); None for the graph's.
         """
         information, traces = jax.vmap(invert_positive_definite)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         # Axes of the nodes: the last of a rule's arrays, the first of all else.
         over_nodes = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
-        # Bucket by bucket: nodes of about as many neighbours.
-        by_bucket = []
-        for bucket, bucket_ahead in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
+        by_bucket = []  # nodes of about as many neighbours together
+        for bucket, bucket_weights in zip(self.buckets, precomputed or [()] * len(self.buckets), strict=True):
             rows, width = bucket.rows, bucket.width
             # What these nodes received, without the padding beyond the bucket's width.
             sent_by = (self.senders if senders is None else senders)[rows, :width]
@@ -309,11 +307,12 @@ class Mesh(Module):
             )
             if self.alpha is not None:
                 received = widen_for_events(received, self.alpha)
-            by_bucket.append(over_nodes(bucket.rule, received, *(leaf[rows] for leaf in rest), bucket_ahead))
+            by_bucket.append(over_nodes(bucket.rule, received, *(leaf[rows] for leaf in rest), bucket_weights))
         if len(by_bucket) == 1:  # it has all nodes, in their order
             return by_bucket[0]
         # Padded to as many messages for all nodes, and in the order of the nodes.
-        padded = [r._replace(parts=_pad_to_degree(r.parts, self.senders.shape[1])) for r in by_bucket]
+        degree = self.senders.shape[1]
+        padded = [r._replace(neighbour_factors=_pad_to_degree(r.neighbour_factors, degree)) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
     def _sum_over_reached_nodes(self, values: jax.Array, arrived: Arrived) -> jax.Array:
@@ -338,7 +337,8 @@ class Mesh(Module):
 
     def compute_gains(
         self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array, motion: Motion,
-        information: jax.Array, complete: jax.Array, ahead: Ahead = (), senders: Array | None = None,
+        information: jax.Array, complete: jax.Array, precomputed: PrecomputedWeights = (),
+        senders: Array | None = None,
     ) -> NodeGains:  # fmt: skip
         """Return the gains by which every node fuses, predicts and corrects, with a leading axis of nodes.
 
@@ -349,7 +349,7 @@ class Mesh(Module):
             motion: the plant over the step.
             information: sum of H_j' R_j^-1 H_j over the measurements that reach each node (node, n, n).
             complete: the same sum if none were missing (node, n, n).
-            ahead: weights computed before, by bucket; empty where the rule computes them.
+            precomputed: weights computed before, by bucket; empty where the rule computes them.
             senders: row of `covariance` for each message that a node receives (node, degree); None for the graph's.
         """
 
@@ -358,25 +358,26 @@ class Mesh(Module):
             received: NeighbourEstimates,
             information: jax.Array,
             complete: jax.Array,
-            weights_ahead: Sequence[jax.Array],
+            node_weights: Sequence[jax.Array],
         ) -> NodeGains:
-            """Return the gains of one node, by the weights computed ahead if there are any, else by the rule."""
+            """Return the gains of one node, by weights that were computed before if there are any, else by the rule."""
             step = NodeStep(motion.matrix, motion.noise, arrived=information, complete=complete)
-            if weights_ahead:
-                neighbour_weights, fused_covariance = weights_ahead
-                return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), neighbour_weights, fused_covariance), step)
+            if node_weights:
+                factors, fused_covariance = node_weights
+                return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), factors, fused_covariance), step)
             return rule.neighbour_gains(received, step)
 
         gains: NodeGains = self._map_nodes(compute_node_gains, covariance, blocks, present, information, complete,
-                                         ahead=ahead, senders=senders)  # fmt: skip
+                                         precomputed=precomputed, senders=senders)  # fmt: skip
         return gains
 
-    def compute_weights_ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
-        """Return the weights of many steps, by bucket (nodes of like degree), from what arrives; steps come first.
+    def compute_weights_of_steps(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> PrecomputedWeights:
+        """Return frozen weights of many steps, with a leading axis of steps, for each bucket of nodes.
 
-        The result is empty if the weights also depend on covariances before the step.
+        Frozen weights depend on nothing but which messages arrive. The result is empty for other rules, and where there
+        is no native code to compute the weights.
         """
-        weights = [bucket.rule.weights_ahead(arrived[:, bucket.rows, -1, : bucket.width])
+        weights = [bucket.rule.compute_weights_of_steps(arrived[:, bucket.rows, -1, : bucket.width])  # the last round
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
 
@@ -394,6 +395,6 @@ def _weigh_neighbours(rule: AbstractFusion, received: NeighbourEstimates, *_: Py
     return rule.neighbour_weights(received)
 
 
-def _pad_to_degree(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
-    """Return the weights of each node's messages, padded with zeros to `degree` messages."""
-    return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
+def _pad_to_degree(factors: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
+    """Return the factors (node, message, ...) of each node's messages, padded with zeros to `degree` messages."""
+    return jnp.pad(factors, ((0, 0), (0, degree - factors.shape[1]), *[(0, 0)] * (factors.ndim - 2)))

@@ -96,12 +96,13 @@ def find_claim_of_errors(name: str, fusion: Fusion, network: HasNodes) -> Claim:
 
 
 def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
-    """Return the claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance.
+    """Return what is claimed of every node's covariance: "exact", an "upper" bound, or "nominal" (neither).
 
-    `name`: the name of `fusion`, a fusion between neighbours, in the network. The claim is weaker if laws are known
-    only up to a radius, if weights are frozen means over losses, or if data decide what arrives. Data decide if a
-    sender chooses by what it measured, limits refuse values, or a quantizer saturates; so it is with words, whose
-    rounding no weight knows.
+    A rule that weighs by the joint covariance of all errors gives that covariance, an intersection a bound. The claim
+    is weaker if laws are known only up to a radius. It is "nominal" if the joint covariance is a mean over losses that
+    is not updated (`FrozenWeights`), and if data decide what arrives: if a sender chooses by what it measured, limits
+    refuse values, or a quantizer saturates; and if codewords are sent, whose rounding no weight
+    knows. `name`: the name of `fusion`, between neighbours, in the network.
     """
     claim_of_errors = find_claim_of_errors(name, fusion, network)
     nodes = [network.nodes[node] for node in network.mesh_nodes(name)]
@@ -139,14 +140,20 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
 
 
 def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
-    """Raise ValueError for links that do not serve, and for delays and quantizers with which no bound is known.
+    """Raise ValueError for links, delays and quantizers with which the covariances of the nodes would not hold.
+
+    `build_edges` refuses links that it cannot draw. A late or quantized estimate has an error of its own: covariance
+    intersection needs a bound on it alone, but rules by the joint covariance would have to follow it, which they do
+    not. Exchanges in several rounds and events are of present estimates that arrive as they are. A quantizer's error
+    must have a bound that no loss can break.
 
     `what`: the fusion, for errors.
     """
-    past, kind = build_edges(fusion, graph).past, type(fusion.rule).__name__
-    if not past and fusion.quantizer is None:
+    longest_delay, kind = build_edges(fusion, graph).past, type(fusion.rule).__name__
+    if not longest_delay and fusion.quantizer is None:
         return
-    expected = f"a rule that intersects, where there are {'messages that come late' if past else 'quantizers'}"
+    cause = "messages that come late" if longest_delay else "quantizers"
+    expected = f"a rule that intersects, where there are {cause}"
     if fusion.rule.needs_joint or isinstance(fusion.rule, FrozenWeights):
         raise fail(f"{what} by {kind}", expected, kind)
     if fusion.rounds > 1 or fusion.alpha is not None:
@@ -336,11 +343,11 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
 def _measures_alike_at_each_step(node: Node) -> bool:
     """Return whether a node's measurement has one law at every step, with noise that does not grow with the signal.
 
-    Noise grows with the signal if the channel's gains are random: if the gains' part of `center`, the covariance of
-    (gains, offset), is not 0.
+    Noise grows with the signal if the gains G of the channel z = G y + n are random, Cov(G_ij, G_kl) != 0.
     """
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
     moments = second_order(node.channel.condition_on_arrival())
+    # `center` [i, k, j, l] is the covariance of the entries (i, j) and (k, l) of [G, n]; the last column is n.
     gain_covariance = np.asarray(moments.nominal.center)[:, :, :-1, :-1]
     return not np.any(gain_covariance)

@@ -185,36 +185,41 @@ def _compute_step_when_all_is_measured(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
-    """Return the parts of step k that do not depend on the estimates, such as gains, if no measurement is missing.
+    """Return what does not depend on the estimates in step k, such as gains, if no measurement is missing.
 
-    The arguments are those of `Mesh.compute_step_without_estimates`.
+    It is one compiled program, called at every step. `covariance` (node, n, n) weighs the nodes' estimates before the
+    step, `blocks` (node, degree, n, degree, n) is the joint covariance of each node's and its neighbours' errors if the
+    rule needs it, `moments` are the mean and covariance of the plant's state, and `arrived` (node, rounds, degree) says
+    which messages arrive.
     """
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, arrived, u, k)
 
 
 def _propagate_joint(mesh: Mesh, joint: np.ndarray, step: MeshStep, arrived: np.ndarray) -> np.ndarray:
-    """Return the joint covariance (N, N) of all errors after a step, by sparse matrices, from J before it.
+    """Return the joint covariance J+ = M J M' + F Q F' + sum_l W_l S_l W_l' of all errors after a step, N = nodes n.
 
-    `arrived`: which messages arrive in it (node, rounds, degree).
+    Node i adds W_il H_l' R_l^-1 z_l of node l's measurement z_l, and S_l = H_l' R_l^-1 H_l. M mixes the errors of
+    neighbours, F is what the corrections leave of the plant's noise of covariance Q. The matrices (N, N) are sparse.
+    `joint` is J, and `arrived` (node, rounds, degree) says which messages arrive.
     """
     gains, present, senders = step.gains, mesh.edges.present, mesh.senders
-    # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i), so that C_ii = I - sum_j C_ij.
+    # Each round of exchange before the last only fuses: e_i + sum_j C_ij (e_j - e_i), so that C_ii = I - sum_j C_ij.
     for number, weights in enumerate(step.exchanges):
-        mixing = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
-        mixing[:, 0] = np.eye(mixing.shape[-1]) - mixing[:, 1:].sum(axis=1)
-        joint = np.asarray(propagate_by_mode(scatter_blocks(mixing, senders, present), joint, 0.0))
+        c_if_all_arrive = weights.common_factor[:, None] @ weights.neighbour_factors
+        c = np.where(arrived[:, number, :, None, None], c_if_all_arrive, 0.0)
+        c[:, 0] = np.eye(c.shape[-1]) - c[:, 1:].sum(axis=1)
+        joint = np.asarray(propagate_by_mode(scatter_blocks(c, senders, present), joint, 0.0))
     m = scatter_blocks(error_transitions(gains, step.motion.matrix), senders, present)
-    # Measurements of neighbours (node, degree), or (node, node) of all that a node has after several rounds.
+    # Whose measurements a node has: its neighbours' (node, degree), or after several rounds any node's (node, node).
     known = arrived[:, 0] & present
     if mesh.edges.rounds > 1:
         known = np.asarray(mesh.find_known_measurements(arrived))
         senders = np.broadcast_to(np.arange(len(known)), known.shape)
-    # W_il of H_l' R_l^-1 z_l, so that K_il R_l K_jl' = W_il S_l W_jl'.
-    weights_of_data = measurement_weights(gains.gain, known)
-    ws = scatter_blocks(weights_of_data @ step.data.information[senders], senders, known)
-    w = scatter_blocks(weights_of_data, senders, known)
-    return np.asarray(propagate_joint_covariance(joint, m, gains.innovation, step.motion.noise, ws, w))
+    weight_blocks = measurement_weights(gains.gain, known)  # W_il
+    ws = scatter_blocks(weight_blocks @ step.data.information[senders], senders, known)
+    w = scatter_blocks(weight_blocks, senders, known)
+    return np.asarray(propagate_joint_covariance(joint, m, gains.correction_map, step.motion.noise, ws, w))
 
 
 def best_possible(
@@ -260,13 +265,21 @@ def best_possible(
 
 
 def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshStep]) -> list[np.ndarray]:
-    """Return for each step the information (node, n, n) of those of its measurements that reach each node by the end.
+    """Return for each step the sum of H_j' R_j^-1 H_j over the measurements that reach a node by the last step.
 
-    `flags`: what arrives (step, node, rounds, degree). `steps`: each has the information of each node's measurement.
+    A measurement reaches a node if messages carry it there at its own step or at later ones, through others too.
+
+    Args:
+        mesh: the fusion between neighbours.
+        flags: which messages arrive (step, node, rounds, degree).
+        steps: models of all steps, with the information of each node's measurement.
+
+    Returns:
+        For each step an array (node, n, n).
     """
     count = len(mesh.nodes)
-    # Go from the last step back, since a step's measurements pass through all later exchanges. `reaches` is sparse
-    # (node, node), with a one where data of the column's node reach the row's node by the end.
+    # From the last step back: a measurement passes through the exchanges of its own step and of all later ones.
+    # `reaches` is sparse (node, node), with a one where data of the column's node reach the row's node by the end.
     reaches: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
     information: list[np.ndarray] = []
     for step, arrived in zip(reversed(steps), reversed(flags), strict=True):
@@ -279,9 +292,14 @@ def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshSt
 
 @quickly_compiled
 def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
-    """Return a step at which everything arrives. Only its models of plant and measurements are of use, not its gains.
+    """Return step k as if everything arrived; callers use its models of plant and measurements, not its gains.
 
-    `covariance` (node, n, n): any regular one. The other arguments are those of `Mesh.compute_step_without_estimates`.
+    Args:
+        mesh: the fusion between neighbours.
+        covariance: of the nodes' estimates (node, n, n); it only matters to the gains, so any regular one will do.
+        moments: mean (n,) and covariance (n, n) of the plant's state before the step, before any data.
+        u: inputs of the plant over the step.
+        k: number of the step.
     """
     all_arrive = mesh.edges.lossless()
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
@@ -365,9 +383,10 @@ def find_mesh(network: Network, fusion: str) -> Mesh:
 
 
 def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
-    """Return flags of what arrives at each step, from real neighbours only; raise ValueError if `arrived` does not fit.
+    """Return flags of which messages arrive at each step; raise ValueError if `arrived` does not fit.
 
-    `arrived`: flags of this shape, or a number of steps at which everything arrives.
+    `arrived`: flags of this shape, or a number of steps at which everything arrives. Late messages (a longest delay
+    `mesh.edges.past` > 0) are refused, since flags say nothing of ages.
     """
     if mesh.edges.past:
         raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")

@@ -141,20 +141,26 @@ def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: Arrival
 def _compute_gains_by_pattern(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
-    """Return the gains for what arrives in each pattern, with a leading axis of patterns.
+    """Return the gains of a node for each pattern of arriving messages, with a leading axis of patterns.
 
     Args:
-        rows: the mesh, with a row for each pattern.
+        rows: the mesh with a row for each pattern of each node, instead of one for each node.
         covariance: covariances of the nodes' estimates before the step (node, n, n), which set the weights.
-        blocks: of J, the joint covariance of all errors, at each node's neighbours (node, degree, n, degree, n).
-        patterns: what arrives.
+        blocks: joint covariance of the errors of each node and its neighbours (node, degree, n, degree, n).
+        patterns: which messages arrive, and at which node.
         step: a step at which everything arrives; its models and its measurements' information are used.
     """
+    # Sums of H_j' R_j^-1 H_j over the measurements that arrive in the pattern, and over all that could.
     information = rows.sum_over_messages(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
-    blocks_by_pattern = jnp.asarray(blocks)[patterns.node]
-    return rows.compute_gains(jnp.asarray(covariance), blocks_by_pattern, jnp.asarray(patterns.present), step.motion,
-                      information, complete)  # fmt: skip
+    return rows.compute_gains(
+        covariance=jnp.asarray(covariance),
+        blocks=jnp.asarray(blocks)[patterns.node],
+        present=jnp.asarray(patterns.present),
+        motion=step.motion,
+        information=information,
+        complete=complete,
+    )
 
 
 def _average_joint(
@@ -180,7 +186,7 @@ def _average_joint(
 
     # Of every pattern r: M_r (the node itself first), F_r, and the weights W_rl of H_l' R_l^-1 z_l for what arrived, so
     # that K_rl = W_rl H_l' R_l^-1 and K_rl R_l K_rl' = W_rl S_l W_rl'.
-    m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
+    m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.correction_map)
     w = np.asarray(measurement_weights(gains.gain, patterns.present))
     # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.
     mean_w = mean(w)
@@ -205,23 +211,26 @@ def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPa
     P(pattern) = prod_j p_ij over the edges j to i that deliver, and 1 - p_ij over those that do not.
     `chances`: p of every edge, receiver after receiver.
     """
+    # Number of neighbours of each node; in the axis of messages the node's own, which always arrives, comes first.
     counts = mesh.edges.present[:, 1:].sum(axis=1)
     if len(counts) > NODES or counts.max() > DEGREE:
         raise fail("mean errors between neighbours", f"at most {NODES} nodes of at most {DEGREE} neighbours",
                    f"{len(counts)} nodes of up to {counts.max()}")  # fmt: skip
-    rows: list[int] = []
+    node: list[int] = []
     present: list[list[bool]] = []
     probability: list[float] = []
     start: list[int] = []
-    for i, of_node in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
-        start.append(len(rows))
-        # What arrives for certain is not varied.
-        for flags in product(*[[True] if p == 1 else [True, False] for p in of_node]):
-            rows.append(i)
-            present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
-            probability.append(float(np.prod(np.where(flags, of_node, 1 - of_node))))
+    degree = mesh.senders.shape[1]
+    for i, node_chances in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
+        start.append(len(node))
+        # A message that arrives for certain has one outcome.
+        for flags in product(*[[True] if p == 1 else [True, False] for p in node_chances]):
+            node.append(i)
+            padding = [False] * (degree - 1 - len(flags))  # up to the node with the most neighbours
+            present.append([True, *flags, *padding])
+            probability.append(float(np.prod(np.where(flags, node_chances, 1 - node_chances))))
     return ArrivalPatterns(
-        node=np.array(rows), present=np.array(present), probability=np.array(probability), start=np.array(start)
+        node=np.array(node), present=np.array(present), probability=np.array(probability), start=np.array(start)
     )
 
 

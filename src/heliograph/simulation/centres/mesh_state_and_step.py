@@ -27,9 +27,9 @@ from heliograph.simulation.centres.late_and_quantized_messages import MessagesOn
 
 # Which messages arrive, each node's from itself first; where they may be late, their ages in steps, -1 of none.
 Arrived = Bool[Array, "node rounds degree"]
-# Weights computed before a step: for each bucket of nodes the parts and the covariance of `NeighbourWeights`, a row for
-# each node of the bucket; empty where none are.
-Ahead = Sequence[Sequence[Array]]
+# Weights computed before a step: for each bucket of nodes the `neighbour_factors` and the `covariance` of
+# `NeighbourWeights`, a row for each node of the bucket; empty where none are.
+PrecomputedWeights = Sequence[Sequence[Array]]
 
 
 class NodeBucket(Module):
@@ -149,23 +149,25 @@ def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEst
 
 
 def pull_to_neighbours(
-    front: Float[jax.Array, "node n n"],
-    parts: Float[jax.Array, "node degree n *n"],
+    common_factor: Float[jax.Array, "node n n"],
+    neighbour_factors: Float[jax.Array, "node degree n *n"],
     mean: Float[jax.Array, "node n"],
     received: Float[jax.Array, "node degree n"],
 ) -> Float[jax.Array, "node n"]:
-    """Return front_i sum_j parts_ij (received_ij - mean_i) over the neighbours j of each node i.
+    """Return L_i sum_j D_ij (xhat_ij - xhat_i) over the neighbours j of each node i: its move towards their estimates.
 
     Args:
-        front: a matrix for each node.
-        parts: a matrix for each message, or its diagonal alone.
-        mean: the nodes' own estimates.
-        received: the estimates that each node received. Place 0 is its own estimate, which adds nothing.
+        common_factor: L_i, a matrix for each node.
+        neighbour_factors: D_ij, a matrix for each message, or its diagonal alone.
+        mean: the nodes' own estimates xhat_i.
+        received: the estimates xhat_ij that each node received. Place 0 is its own estimate, which adds nothing.
     """
     difference = (received - mean[:, None]).at[:, 0].set(0.0)
-    is_matrix = parts.ndim == 4
-    pull = jnp.einsum("idab,idb->ia", parts, difference) if is_matrix else jnp.sum(parts * difference, axis=1)
-    return jnp.einsum("iab,ib->ia", front, pull)
+    if neighbour_factors.ndim == 4:
+        weighted_sum = jnp.einsum("idab,idb->ia", neighbour_factors, difference)
+    else:
+        weighted_sum = jnp.sum(neighbour_factors * difference, axis=1)
+    return jnp.einsum("iab,ib->ia", common_factor, weighted_sum)
 
 
 def propagate_joint(
@@ -175,10 +177,12 @@ def propagate_joint(
     senders: np.ndarray,
     present: np.ndarray,
 ) -> Float[jax.Array, "node n node n"]:
-    """Return the joint covariance M J M' + F Q F' + sum_l K_l R_l K_l' of all nodes' errors after a step, from J.
+    """Return the joint covariance J+ = M J M' + F Q F' + sum_l W_l S_l W_l' of all nodes' errors after a step.
 
-    F is `step.gains.innovation`. Node i adds W_il H_l' R_l^-1 z_l of node l's measurement, so that
-    K_l = W_l H_l' R_l^-1 and K_l R_l K_l' = W_l S_l W_l'.
+    The errors e_i = x - xhat_i of all nodes, one below the other, become M e + F w - sum_l W_l H_l' R_l^-1 v_l. w is
+    the plant's noise, Cov w = Q; F_i = I - W_i S (`step.gains.correction_map`) is what the correction of node i leaves
+    of an error. v_l is the noise of node l's measurement, Cov v_l = R_l, weighted by W_l at the nodes that receive it;
+    S_l = H_l' R_l^-1 H_l. M mixes the estimates.
 
     Args:
         joint: J before the step.
@@ -189,10 +193,10 @@ def propagate_joint(
     """
     gains, motion, size = step.gains, step.motion, joint.shape[0] * joint.shape[1]
     weights = measurement_weights(gains.gain, jnp.asarray(arrived))
-    # M, W S and W as (N, N) matrices, from their blocks (node, degree, n, n).
+    # M, W S and W as matrices (N, N), N = nodes n, from their blocks (node, degree, n, n).
     blocks = error_transitions(gains, motion.matrix), weights @ step.data.information[senders], weights
-    transition, noise_factor, weight_matrix = (scatter_blocks(jnp.asarray(each), senders, present) for each in blocks)
+    m, ws, w = (scatter_blocks(jnp.asarray(each), senders, present) for each in blocks)
     covariance = propagate_joint_covariance(
-        joint.reshape(size, size), transition, gains.innovation, motion.noise, noise_factor, weight_matrix
+        joint.reshape(size, size), m, gains.correction_map, motion.noise, weighted_information=ws, weights=w
     )
     return jnp.asarray(covariance).reshape(joint.shape)

@@ -79,28 +79,35 @@ class NodeFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: NodeState, u: ArrayLike = (), k: Step = 0) -> NodeState:
-        """Predict from the node's estimate alone, as if no message came."""
-        return self._step_from(state.now, jnp.full(self.received, jnp.nan), jnp.asarray(u), k)
+        """Return the state after step k as if nothing came, neither a measurement nor a message.
+
+        The step starts from the estimate with all that came until now (`state.now`). `correct` repeats it from the same
+        start with the data of the step.
+        """
+        nothing_received = jnp.full(self.received, jnp.nan)
+        return self._step_from(state.now, nothing_received, jnp.asarray(u), k)
 
     @corrects
     def correct(self, state: NodeState, z: ArrayLike, k: Step = 0) -> tuple[NodeState, Innovation]:
-        """Fuse, predict and correct from `state.before` with what came in z.
+        """Return the state after step k with what came in z, and the innovation of all measurements in z.
 
-        Returns the next state, and the innovation of all measurements in z about the node's prediction, `state.now`.
+        Neighbours' estimates are of before the step, so that fusion comes before prediction: the step is taken again
+        from `state.before`. The innovation is about the prediction without data, `state.now`.
         """
         after = self._step_from(state.before, jnp.asarray(z), state.inputs, k)
         # Measurements z_i = M_i x + o_i + nu_i of the node and its neighbours, without padding.
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
-        sensed, _ = self._split_measurements(jnp.asarray(z), state.before)
+        measurements, _ = self._split_measurements(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
             return after, no_innovation()
         gain = jnp.concatenate([observation.gain[i, :size] for i, size in sensors])
         offset = jnp.concatenate([observation.offset[i, :size] for i, size in sensors])
         noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
-        total = gain @ covariance @ gain.T + noise
-        return after, gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
+        innovation_covariance = gain @ covariance @ gain.T + noise
+        innovation = gaussian_innovation(jnp.concatenate(measurements), gain @ mean + offset, innovation_covariance)
+        return after, innovation
 
     @estimates
     def estimate(self, state: NodeState) -> Estimate:
@@ -134,14 +141,21 @@ class NodeFilter(AbstractSizedFilter):
         return measurements, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
     def _step_from(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
-        """Return the state after step k from `before` with z, the node's measurement and its neighbours' messages."""
+        """Return the state after step k of the mesh, which has the node as its only receiver, started from `before`.
+
+        z: the node's measurement, then each neighbour's message with its estimate before the step and its measurement.
+        """
         measurements, state_with_messages = self._split_measurements(z, before)
         # All messages are flagged as arrived, since NaN already marks those that did not come.
-        everything = jnp.ones((1, 1, len(measurements)), dtype=bool)
+        all_arrive = jnp.ones((1, 1, len(measurements)), dtype=bool)
         after, _ = self.mesh.step(
-            state_with_messages, [x[None] for x in measurements], everything, jnp.asarray(u), jnp.asarray(k)
+            state=state_with_messages,
+            z=[measurement[None] for measurement in measurements],
+            arrived=all_arrive,
+            u=jnp.asarray(u),
+            k=jnp.asarray(k),
         )
-        return NodeState(before, u, after)
+        return NodeState(before=before, inputs=u, now=after)
 
 
 def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:

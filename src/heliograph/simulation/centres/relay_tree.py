@@ -160,34 +160,36 @@ class _Leaves(NamedTuple):
 
 @quickly_compiled
 def _propagate_block(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> tuple[Array, Array, ErrorSources]:
-    """Propagate the errors of a block of leaves over all steps, and fuse them at the relays above.
+    """Propagate the errors of a block of leaves (nodes with sensors) over all steps, and fuse them at their relays.
 
     Args:
-        leaves: what all have in common.
-        numbers: of each leaf of the block, with a leading axis.
+        leaves: the plant, the filter's name, the function that makes a leaf, and the number of leaves of a relay.
+        numbers: arguments of that function, arrays with a leading axis of leaves.
         u: inputs of the plant (step, inputs).
 
     Returns:
-        Covariances of the leaves' errors (leaf, n, n), weights of the relays above them (relay, n, child, n), and the
-        relays' errors.
+        Covariances of the leaves' errors (leaf, n, n), weights of each relay for its children's estimates (relay, n,
+        child, n), and the errors of the relays' fused estimates.
     """
     errors = _propagate_leaves(leaves, numbers, u)
-    # Full relays at once, then the last one if it has fewer children.
+    # Relays with `degree` children at once, then the last relay if it has fewer.
     count, degree = len(errors.independent), leaves.degree
-    full = count - count % degree
-    weights, above = jax.vmap(_weigh_children)(
-        jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), errors)
-    )
-    if count > full:
-        last_weights, last_error = _weigh_children(jax.tree.map(lambda a: a[full:], errors))
+    count_in_full = count - count % degree
+    errors_by_relay = jax.tree.map(lambda a: a[:count_in_full].reshape(-1, degree, *a.shape[1:]), errors)
+    weights, relay_errors = jax.vmap(_weigh_children)(errors_by_relay)
+    if count > count_in_full:
+        last_weights, last_error = _weigh_children(jax.tree.map(lambda a: a[count_in_full:], errors))
         last_weights = jnp.pad(last_weights, ((0, 0), (0, degree - last_weights.shape[1]), (0, 0)))
         weights = jnp.concatenate([weights, last_weights[None]])
-        above = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), above, last_error)
-    return errors.covariances(), weights, above
+        relay_errors = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), relay_errors, last_error)
+    return errors.covariances(), weights, relay_errors
 
 
 def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorSources:
-    """Return the errors of a block of leaves after all steps, by their sources; arguments as of `_propagate_block`."""
+    """Return the errors of a block of leaves after all steps, as roots times shared sources and independent parts.
+
+    `leaves`: what all leaves have in common. `numbers`: of each leaf, with a leading axis. `u`: inputs of the plant.
+    """
     # All leaves of the block from their numbers.
     nodes = eqx.filter_vmap(leaves.node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])

@@ -88,9 +88,13 @@ class Uplinks(Module):
 
     @property
     def rows(self) -> np.ndarray:
-        """Places among (age, node, m), flattened, of the numbers that may arrive: all but what pads shorter reports."""
-        exists = np.arange(max(self.received)) < np.array(self.received)[:, None]
-        return np.flatnonzero(np.broadcast_to(exists, (self.delay.shape[1], *exists.shape)))
+        """Indices of the numbers that may arrive, among the reports (age, node, m), flattened.
+
+        Shorter reports are padded to m, the length of the longest one; what pads them never arrives.
+        """
+        ages = self.delay.shape[1]
+        is_number = np.arange(max(self.received)) < np.array(self.received)[:, None]  # (node, m)
+        return np.flatnonzero(np.broadcast_to(is_number, (ages, *is_number.shape)))
 
     def init(self) -> ReportsInTransit:
         """Return the state with no report in transit from the nodes to the centre."""

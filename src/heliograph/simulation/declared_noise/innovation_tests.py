@@ -58,23 +58,27 @@ def examine_innovations(
         filter: the filter, as declared or refitted.
         classes: class of each row, -1 of a row that is not used.
     """
-    # Innovations of this link's values over their claimed deviation: independent with variance 1 if the claim is true.
-    white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
-    # Probability of each end of a class's interval, so that all classes together contradict a true claim in LEVEL.
+    # u = S^-1/2 (z - E z) of the link's values: independent of each other, of variance 1, if S is true.
+    values_of_link = declared.place.values  # columns of z
+    whitened = whitened_innovations(declared.z, filter, declared.u)[:, values_of_link]
+    # Probability beyond each end of a class's interval. All classes together contradict a true claim with probability
+    # LEVEL.
     tail = LEVEL / declared.classes / 2
     nis = list[NisOfClass]()
     for number in range(declared.classes):
-        squares = white[classes == number] ** 2
+        squares = whitened[classes == number] ** 2
         count = int(np.sum(~np.isnan(squares)))
         mean = float(np.nansum(squares) / count)
-        if filter.knows_gain:  # count times the mean is chi-squared of `count` degrees of freedom
+        if filter.knows_gain:
+            # With known gains innovations are Gaussian: count times the mean is chi-squared of `count` degrees.
             quantiles = (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail))
-            low, high = quantiles if count else (0, 1)  # without values anything will do: the mean is NaN
-        else:  # Gaussian, with an error that counts correlations between rows
+            low, high = quantiles if count else (0, 1)  # without values the mean is NaN, in no interval
+        else:
+            # With random gains only the mean of many squares is, with an error that counts correlations between rows.
             _, error = average_correlated(np.nanmean(squares, axis=1))
             low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
-        nis.append(NisOfClass(mean, float(low), float(high)))
-    correlation, p_value = _test_correlation(white[classes >= 0], filter.knows_gain)
+        nis.append(NisOfClass(mean=mean, low=float(low), high=float(high)))
+    correlation, p_value = _test_correlation(whitened[classes >= 0], exact=filter.knows_gain)
     return InnovationTests(nis, correlation, p_value)
 
 

@@ -119,7 +119,7 @@ class DeclaredJudgement:
         return sizes or self.p_value < LEVEL
 
     def sentences(self, unit: str = "steps") -> list[str]:
-        """Return what is to be said, a line each; nothing where the declared variances may be true.
+        """Return what the user should know of the declared variances, a line each; nothing where they may be true.
 
         Args:
             unit: of the plant's time; steps by default.
@@ -133,10 +133,12 @@ class DeclaredJudgement:
                 "neither a scale of the declared variances nor a bias explains the innovations: correlated over one "
                 f"message ({self.refit_correlation:.2f}) after a refit, by something that the model forgets"
             ]
+        # Scales of the classes' variances; where none is found, innovations that are far too large in some class.
         lines = [line for one in self.classes for line in _describe_scale(one, len(self.classes) > 1)]
         worst = max((one.nis for one in self.classes if not one.nis <= LEAST * one.nis_high), default=0.0)
-        unexplained = f"no scale explains the innovations, whose squares are {worst:.3g} times what is claimed"
-        return lines or [unexplained] * bool(worst)
+        if lines or not worst:
+            return lines
+        return [f"no scale explains the innovations, whose squares are {worst:.3g} times what is claimed"]
 
 
 def judge_declared(
@@ -207,59 +209,61 @@ def judge_declared_links(
 def _judge_link(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[DeclaredJudgement | None, int]:
-    """Return the judgement of one link, None where too few of its values came; and how many rows had some.
+    """Return the judgement of what one link declares of its noise, None of too few rows; and how many rows it had.
 
-    `link`: its number, as of `list_links_declaring_noise`. `z` and `u`: measurements and inputs.
+    Messages are divided into classes by their declared variances. If their innovations contradict these, a scale of the
+    variances of each class is fitted; if innovations are still correlated over time, a bias of the outputs beside it.
+    `link`: number of the link among those that report numbers with each message. `z`, `u`: measurements and inputs.
     """
     declared, classes = _classify_rows(filter, link, z, u)
-    heard = int(np.sum(classes >= 0))
-    if heard < FEWEST:
-        return None, heard
-    # With the variances as declared: where the innovations fit them, all scales are 1.
-    before = examine_innovations(declared, filter, classes)
-    if not before.contradicts:
+    rows_with_values = int(np.sum(classes >= 0))
+    if rows_with_values < FEWEST:
+        return None, rows_with_values
+    # The variances as declared: where the innovations fit them, all scales are 1.
+    tests = examine_innovations(declared, filter, classes)
+    if not tests.contradicts:
         ones = np.ones(declared.classes)
-        return _make_judgement(declared, classes, (before, before), (ones, ones, ones), None), heard
-    # With the scales that fit best. Where innovations are still correlated over time, a bias is tried beside them.
+        return _make_judgement(declared, classes, (tests, tests), (ones, ones, ones), bias=None), rows_with_values
     refit = refit_scales(declared)
-    after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
-    bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
-    low, high = ([find_interval_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
+    tests_of_refit = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
+    bias = _find_bias(declared, refit) if tests_of_refit.p_value < LEVEL else None
     # The scale of each class, with the ends of its interval.
+    low, high = ([find_interval_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
     scales = np.exp(refit.logs if refit.found else np.nan * refit.logs), np.exp(low), np.exp(high)
-    return _make_judgement(declared, classes, (before, after), scales, bias), heard
+    return _make_judgement(declared, classes, (tests, tests_of_refit), scales, bias), rows_with_values
 
 
 class _DeclaredVariances(eqx.Module):
-    """The variances of a told link's noises as a function of the numbers that it is told."""
+    """The noise variances of a link as a function of the numbers that are reported with each message."""
 
-    told: AbstractToldMap
+    told: AbstractToldMap  # the link whose law depends on reported numbers
 
     def __call__(self, numbers: Array) -> Array:
-        """Return the variances of these numbers' noises, one after another."""
+        """Return the variances of all noises of the link whose law these numbers report."""
         return list_noise_variances(self.told.believed(numbers))
 
 
 def _compute_declared_variances(
     link_place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
 ) -> Float[np.ndarray, "steps outputs"]:
-    """Return the variances that each row's message declares, NaN where one of its numbers is missing.
+    """Return the noise variances that each row's message reports, NaN where one of its numbers is missing.
 
-    Typical numbers stand for missing ones in the computation, so that the law has a variance for every row.
+    Variances are a function of the reported numbers. Where these are missing it is computed of the values that the link
+    assumes for them (`typical`), so that it never fails.
     """
     numbers = z[:, link_place.numbers]
-    complete = ~np.isnan(numbers).any(axis=1)[:, None]
-    with_typical = np.where(complete, numbers, np.asarray(link_place.told.typical))
-    variances = np.asarray(over_runs(_DeclaredVariances(link_place.told), with_typical))
-    return np.asarray(np.where(complete, variances, np.nan))
+    is_complete = ~np.isnan(numbers).any(axis=1)[:, None]
+    assumed_numbers = np.asarray(link_place.told.typical)
+    variances = over_runs(_DeclaredVariances(link_place.told), np.where(is_complete, numbers, assumed_numbers))
+    return np.asarray(np.where(is_complete, np.asarray(variances), np.nan))
 
 
 def _classify_rows(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
-    """Divide a link's rows into classes of similar declared variances; arguments as of `_judge_link`.
+    """Divide the rows with messages of a link into classes by the mean logarithm of the variances that they declare.
 
-    A row's size is the mean logarithm of the variances that its message declares.
+    `link`: its number among the links that report numbers with each message. `z`, `u`: measurements and inputs.
 
     Returns:
         The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
@@ -325,14 +329,10 @@ def _make_judgement(
     scales: tuple[np.ndarray, np.ndarray, np.ndarray],
     bias: DeclaredBias | None,
 ) -> DeclaredJudgement:
-    """Return the judgement of what was found; messages of similar declared variances are one class.
+    """Return the judgement of a link from the tests of its innovations (`tested`), before and after the refit.
 
-    Args:
-        declared: the filter and the recording.
-        classes: class of each row, -1 of a row that is not used.
-        tested: tests of the innovations, before and after the refit.
-        scales: of each class, with the lower and the upper ends of their intervals, (classes,) each.
-        bias: what explains the innovations where no scale does; None without.
+    `classes`: class of each row, -1 of a row that is not used. `scales`: of each class, with the lower and the upper
+    ends of their intervals. `bias`: what explains the innovations where no scale does; None without.
     """
     before, after = tested
     place, judged_classes = declared.place, []
@@ -341,19 +341,18 @@ def _make_judgement(
         rows = declared.z[classes == class_index]
         variances = np.exp(np.mean(np.log(_compute_declared_variances(place, rows)), axis=1))
         scale, scale_low, scale_high = (float(values[class_index]) for values in scales)
-        judged_classes.append(
-            DeclaredClass(
-                low=float(variances.min()),
-                high=float(variances.max()),
-                numbers=int(np.sum(~np.isnan(rows[:, place.values]))),
-                nis=nis,
-                nis_low=nis_low,
-                nis_high=nis_high,
-                scale=scale,
-                scale_low=scale_low,
-                scale_high=scale_high,
-            )
+        judged = DeclaredClass(
+            low=float(variances.min()),
+            high=float(variances.max()),
+            numbers=int(np.sum(~np.isnan(rows[:, place.values]))),
+            nis=nis,
+            nis_low=nis_low,
+            nis_high=nis_high,
+            scale=scale,
+            scale_low=scale_low,
+            scale_high=scale_high,
         )
+        judged_classes.append(judged)
     names = first(declared.filter.sensor).outputs
     return DeclaredJudgement(
         outputs=tuple(names[i] for i in place.outputs or ()),  # none where values are not outputs one by one

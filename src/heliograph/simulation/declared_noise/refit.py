@@ -70,17 +70,17 @@ class DeclaredRows(NamedTuple):
 
     @property
     def place(self) -> "ReceivedLinkPlace":
-        """Return where the link stands in what is received."""
+        """Which columns of z are the judged link's reported numbers and values, and which outputs it carries."""
         return find_link_place(self.filter, self.link)
 
 
 class ReceivedLinkPlace(NamedTuple):
-    """Where a link that tells numbers stands in what is received, and which of the sensor's outputs it carries.
+    """Which received numbers belong to a link that reports numbers of its law, and which outputs the link carries.
 
     Args:
-        told: the map of which numbers are told.
-        numbers: rows of z of these numbers.
-        values: rows of z of the values whose law they give.
+        told: the link's map, whose law depends on reported numbers such as a noise variance.
+        numbers: indices of these numbers in a row of z.
+        values: indices in a row of z of the values whose law they give.
         outputs: outputs of the sensor that the link carries; None where values are not outputs one by one.
     """
 
@@ -91,24 +91,30 @@ class ReceivedLinkPlace(NamedTuple):
 
 
 def find_link_place(filter: ToldFilter, link: int) -> ReceivedLinkPlace:
-    """Return the place of one of the links that tell numbers.
+    """Return which received numbers belong to one of the links that report numbers of their law with each message.
+
+    A row of z has values and reported numbers: `filter.values` and `filter.numbers` are their indices in it.
 
     Args:
-        filter: the filter of all.
-        link: its number among `list_told_maps`.
+        filter: the filter of all links.
+        link: number of the link among those that report numbers, in the filter's order (`list_told_maps`).
     """
-    # Columns of its numbers among all that are told, and rows of the values on which they have an effect.
     maps, sensor = list_told_maps(first(filter.link)), first(filter.sensor)
-    before = sum(affine.memory.announced for affine in maps[:link])
-    columns = list(range(before, before + maps[link].memory.announced))
-    of_link = np.flatnonzero(list_told_numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
-    whole = len(of_link) == len(filter.values)  # all that is received comes over this link
-    outputs = list(range(len(sensor.outputs))) if whole else of_link
+    # The link's numbers among all reported numbers: those of the links before it come first.
+    begin = sum(affine.memory.announced for affine in maps[:link])
+    numbers_of_link = list(range(begin, begin + maps[link].memory.announced))
+    # The values that come over the link are those whose law depends on its numbers.
+    has_effect = list_told_numbers_of_outputs(first(filter.link))[:, numbers_of_link].any(axis=1)
+    values_of_link = np.flatnonzero(has_effect).tolist()
+    # A link that carries all values carries all outputs, mixed or not. Otherwise value i has to be output i.
+    carries_all = len(values_of_link) == len(filter.values)
+    outputs = list(range(len(sensor.outputs))) if carries_all else values_of_link
+    has_value_for_each_output = len(sensor.outputs) == len(filter.values)
     return ReceivedLinkPlace(
         told=maps[link],
-        numbers=[filter.numbers[column] for column in columns],
-        values=[filter.values[row] for row in of_link],
-        outputs=outputs if whole or len(sensor.outputs) == len(filter.values) else None,
+        numbers=[filter.numbers[number] for number in numbers_of_link],
+        values=[filter.values[value] for value in values_of_link],
+        outputs=outputs if carries_all or has_value_for_each_output else None,
     )
 
 
@@ -151,22 +157,26 @@ def list_noise_variances(link: AbstractRandomAffine) -> jax.Array:
 
 
 def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
-    """Return the links, by number, whose messages tell the variances of Gaussian noise, which a scale may correct."""
+    """Return which links report with each message the variance of their Gaussian noise; a scale may correct these.
+
+    Links are numbered among those that report any numbers, in the filter's order (`list_told_maps`).
+    """
     maps = list_told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
     return [number for number, affine in enumerate(maps) if isinstance(affine, ToldMap) and _declares_noise(affine)]
 
 
 @in_float64
 def _declares_noise(affine: ToldMap) -> bool:
-    """Return whether a map's noise is Gaussian and changes with the number that the map is told.
+    """Return whether the noise of a link is Gaussian, with a variance that the numbers reported with a message give.
 
-    The number is changed by the part ALMOST of itself to see this. A map that is told its gain declares no noise.
+    To see whether they do, the noise is compared at the numbers that are assumed where none are reported (`typical`),
+    and at numbers that are larger by the share ALMOST. A link whose reported number is its gain declares no noise.
     """
     if isinstance(affine.make, ToldGainHop):
         return False
-    typical = np.asarray(affine.typical)
-    noises = _list_link_noises(affine.believed(typical))
-    changed_noises = _list_link_noises(affine.believed(typical * (1 + ALMOST)))
+    assumed_numbers = np.asarray(affine.typical)
+    noises = _list_link_noises(affine.believed(assumed_numbers))
+    changed_noises = _list_link_noises(affine.believed(assumed_numbers * (1 + ALMOST)))
     has_changed = any(
         not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, changed_noises, strict=True)
     )
@@ -223,7 +233,11 @@ class RefitLikelihood(eqx.Module):
     declared: DeclaredRows
 
     def __call__(self, logs: Array) -> Array:
-        """Return the log-likelihood of these numbers, in nats."""
+        """Return the log-likelihood of the recording, in nats, with the noise of the judged link rescaled.
+
+        `logs`: logarithms of the scale of each class and, with a bias of the outputs, of two numbers more: its
+        deviation over the root of its memory, and its memory.
+        """
         refit = refit_filter(self.declared, logs)
         return jnp.asarray(log_likelihood(refit, self.declared.z, self.declared.u))
 
@@ -241,7 +255,10 @@ class Refit(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether the numbers give the recording a likelihood."""
+        """Whether the search found numbers under which the recording is possible: its likelihood is neither 0 nor NaN.
+
+        Others count as a log-likelihood of -LOST nats.
+        """
         return self.likelihood > -LOST
 
 
@@ -251,14 +268,15 @@ def refit_scales(declared: DeclaredRows) -> Refit:
 
 
 def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
-    """Return the best scales together with the best deviation and memory of a bias of each output, as logarithms.
+    """Return the best scales of the classes together with the best bias of the outputs, all as logarithms.
 
-    `scales`: the best scales without a bias. The search begins from them, once for each memory of TIMES (in steps).
+    A bias has a deviation s (in units of the declared one) and a memory T, its time constant. After the logarithms of
+    the scales come those of s / sqrt(T), which the data tell better than s, and of T. `scales`: the best scales without
+    a bias. The search begins from them, once for each memory of TIMES (in steps).
     """
     time_step = find_median_step(declared)
     start_scales = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
-    # After the scales come two logarithms: the bias's deviation over the root of its memory, and its memory.
-    log_deviation = (np.mean(scales.logs) - np.log(time_step)) / 2
+    log_deviation = (np.mean(scales.logs) - np.log(time_step)) / 2  # of s / sqrt(T)
     starts = [np.append(start_scales, [log_deviation, np.log(memory * time_step)]) for memory in TIMES]
     refits = [_maximise_likelihood(declared, start) for start in starts]
     return max(refits, key=lambda refit: refit.likelihood)
@@ -314,10 +332,12 @@ def _maximise_likelihood(
 
     Args:
         declared: the filter and the recording.
-        start: logarithms of each class's scale and, with a bias, its two, as of `refit_filter`.
-        fixed: index of one that stays; None if all are free.
+        start: logarithms of the scale of each class of messages. With a bias two more: of its deviation over the root
+            of its memory, and of its memory.
+        fixed: index of a logarithm that stays; None if all are free.
     """
-    # Limits of the logarithms: FARTHEST either way; of a bias's memory FAST steps and SLOW recordings.
+    # Every logarithm is searched from -FARTHEST to FARTHEST; that of a bias's memory, the last, from FAST steps to SLOW
+    # times the length of the recording.
     free = np.arange(len(start)) != fixed
     low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
     has_bias = len(start) > declared.classes

@@ -96,26 +96,29 @@ def _find_unseen_states(
 
 
 def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each state with limits that a filter has at one of them in most rows.
+    """Yield a line for each state with limits whose estimate lies at one of them in most rows.
 
-    A filter says mean and deviation of its Gaussian given the limits. One whose mean is held at a limit has the mean
-    sqrt(2 / pi) s inside it, and the deviation sqrt(1 - 2 / pi) s: of ratio HELD, and of a larger one where the mean
-    is inside. That holds of one limited state; of several, of which each changes those before it, nearly.
+    The filter's Gaussian N(m, s^2) is cut off at the limits; it tells the mean and the deviation of what remains. If m
+    lies at a limit, a half Gaussian remains, of mean sqrt(2 / pi) s from the limit and deviation sqrt(1 - 2 / pi) s.
+    Their ratio is HELD; it is larger if m lies further inside. The ratio is exact for one limited state; with several
+    limited states it holds nearly (up to the share CLOSE). Limits nearer to each other than APART deviations are not
+    judged, since both cut.
     """
     for node, label, filter, _ in _yield_filters_with_covariance(network):
         if not isinstance(filter, LimitedFilter):
             continue
         estimate = record.estimates[node][label]
-        for place, *limits in filter.limits:
-            mean = np.asarray(estimate.mean)[:, place]
-            deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, place, place], 0.0))
+        for state, *limits in filter.limits:
+            mean = np.asarray(estimate.mean)[:, state]
+            deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, state, state], 0.0))
             for limit in (end for end in limits if np.isfinite(end)):
-                held = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
-                held &= np.ptp(limits) > APART * deviation  # so that the other limit changes nothing
-                if np.count_nonzero(held) > MOST * len(mean):
+                is_at_limit = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
+                is_at_limit &= np.ptp(limits) > APART * deviation
+                rows = np.count_nonzero(is_at_limit)
+                if rows > MOST * len(mean):
                     yield (
-                        f"{node}/{label}: {network.states[place]!r} is held at its limit {limit:g} in "
-                        f"{np.count_nonzero(held)} of {len(mean)} rows, as where what arrives puts it beyond: if it is "
+                        f"{node}/{label}: {network.states[state]!r} is held at its limit {limit:g} in "
+                        f"{rows} of {len(mean)} rows, as where what arrives puts it beyond: if it is "
                         "not there, a sensor, the plant or the limit is off"
                     )
 

@@ -210,7 +210,11 @@ def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
-    """Yield a doubt, with the reason, for each node whose messages tell it numbers that allow no claim."""
+    """Yield a doubt for each node with filters behind a link whose reported numbers do not give its law exactly.
+
+    With each message such a link reports numbers of its law, such as a gain. If they are not the whole truth, for the
+    reason that the link gives, filters that use them claim "nominal": their covariance is neither exact nor a bound.
+    """
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not node.filters:
             continue
@@ -221,22 +225,23 @@ def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
-    """Yield a doubt for filters made for other models than those where they stand, like ones in one line.
+    """Yield a doubt for filters that were made for other models than those of the node where they stand.
 
-    `forgetful`: for each filter, the nodes where it ignores the memory of their links. `belief.lowered`: True if the
-    filter's claim was lowered for this.
+    Filters of one name that are wrong in the same parts of the model make one line, which names all their nodes. The
+    doubt is serious if the filter's claim of its covariance was lowered to "nominal" for this.
     """
-    beliefs_by_words: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
-    forgetful = _list_forgetful_nodes(network)
+    beliefs_by_line: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
+    # For each filter the nodes where it ignores the memory of their links: another doubt tells of these.
+    nodes_with_ignored_memory = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
-        if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
-            continue  # `_doubt_forgetful_filters` says this already
-        beliefs_by_words.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
-    for (lowered, _, _), beliefs in beliefs_by_words.items():
+        if belief.parts == (CHANNEL,) and belief.node in nodes_with_ignored_memory.get(belief.filter, ()):
+            continue
+        beliefs_by_line.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
+    for (was_lowered, _, _), beliefs in beliefs_by_line.items():
         other_nodes = join_names([repr(belief.node) for belief in beliefs[1:]])
         places = f" (and at {other_nodes})" if len(beliefs) > 1 else ""
-        consequence = ", so that its claim is nominal" if lowered else ""
-        yield Doubt(serious=lowered, words=f"another world: {beliefs[0].words}{places}{consequence}")
+        consequence = ", so that its claim is nominal" if was_lowered else ""
+        yield Doubt(serious=was_lowered, words=f"another world: {beliefs[0].words}{places}{consequence}")
 
 
 def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
@@ -248,9 +253,13 @@ def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
 
 
 def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return a channel with typical values of the numbers that messages tell, since being told takes no memory."""
-    link, _, numbers = separate_told_numbers(channel)
-    return believe_typical(link) if numbers else channel
+    """Return a channel with fixed values for the numbers of its law that are reported with each message.
+
+    A filter needs no memory to use a reported number, which comes with the message. So the number is fixed at the value
+    that is assumed where none is reported, before it is judged whether the channel's memory matters.
+    """
+    link, _, reported_numbers = separate_told_numbers(channel)
+    return believe_typical(link) if reported_numbers else channel
 
 
 def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:

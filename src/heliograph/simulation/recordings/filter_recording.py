@@ -307,9 +307,10 @@ def _find_refused_rows(
     network: Network, outputs: PyTree, z: dict[str, np.ndarray], z_by_group: tuple[np.ndarray, ...],
     task: FilteringTask, before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
-    """Return, by node, the rows that its filters refuse and that were not refused `before`, with the reason.
+    """Return, by node, the rows that its filters refuse as implausible and that were not refused `before`.
 
-    Rows that the central filters refuse are those of the node to blame.
+    A central filter refuses a row of all nodes' measurements. The row is then refused of one node alone, which is to
+    blame: one that no filter of its own judges, and without whose values the central filters find the row plausible.
 
     Args:
         network: the network.
@@ -318,14 +319,19 @@ def _find_refused_rows(
         z_by_group: the same (steps, node, received) by group.
         task: filters and all else that the recording is filtered with.
         before: rows that were refused already, by node, with the reason.
+
+    Returns:
+        {node: {row: reason}}.
     """
-    refused, centrally = find_refused_rows(network, outputs)  # by nodes' filters, and by those of all measurements
+    refused, refused_centrally = find_refused_rows(network, outputs)  # by the nodes' filters, and by central ones
     filters, u = task.filters, task.u
-    if centrally:
-        states = find_central_states_before_rows(task, z_by_group)
-        in_order = {name: z[name] for name in network.names}
-        nodes = JudgementReader(network).without_own
-        refused |= blame_nodes_for_implausible_rows(filters.central, states, in_order, u, centrally, nodes)
+    if refused_centrally:
+        central_states = find_central_states_before_rows(task, z_by_group)
+        z_in_order = {name: z[name] for name in network.names}
+        nodes_to_blame = JudgementReader(network).nodes_without_judge
+        refused |= blame_nodes_for_implausible_rows(
+            filters.central, central_states, z_in_order, u, refused_centrally, nodes_to_blame
+        )
     new_rows = {
         name: {k: reason for k, reason in rows.items() if k not in before.get(name, ())}
         for name, rows in refused.items()

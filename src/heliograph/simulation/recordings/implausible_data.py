@@ -138,9 +138,9 @@ class JudgementReader:
         return np.moveaxis(np.array(judgements), (0, 1), (-2, -1))
 
     @property
-    def without_own(self) -> list[str]:
-        """Nodes that no filter of their own judges, but the central ones."""
-        return [name for name, places in self._places.items() if not places]
+    def nodes_without_judge(self) -> list[str]:
+        """Names of the nodes without a filter that judges their measurements; only central filters judge these."""
+        return [name for name, places_of_filters in self._places.items() if not places_of_filters]
 
 
 def find_refused_rows(
@@ -153,13 +153,15 @@ def find_refused_rows(
     judgements.
     """
     reader, refused = JudgementReader(network), dict[str, dict[int, str]]()
-    without_own = reader.without_own
+    nodes_without_judge = reader.nodes_without_judge
     for name in network.names:
-        if name not in without_own:
+        if name not in nodes_without_judge:
             reasons_by_row = _list_rows_refused_by_all(reader.read_node(outcome, name))
             if reasons_by_row:
                 refused[name] = reasons_by_row
-    refused_centrally = _list_rows_refused_by_all(reader.read_node(outcome, without_own[0])) if without_own else {}
+    refused_centrally = (
+        _list_rows_refused_by_all(reader.read_node(outcome, nodes_without_judge[0])) if nodes_without_judge else {}
+    )
     return refused, refused_centrally
 
 

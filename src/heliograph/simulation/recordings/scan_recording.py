@@ -116,14 +116,15 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
     and "state", the filters' last states. They are computed in chunks side by side, by native code, or by XLA.
 
     Args:
-        task: the filters, inputs, and what else filtering needs.
+        task: the filters, the smoother, inputs, which messages arrive between nodes, and where the rows begin.
         z: measurements (steps, node, received) by group.
         judged: True to leave out measurements that filters judge implausible.
     """
     results = None if judged else _filter_in_chunks(task, z)
     if results is not None:
         return results
-    # Native code cannot store a joint covariance here, since its layout depends on the graph, an argument.
+    # Native code lays arrays out when it is compiled. A joint covariance between neighbours is indexed by their graph,
+    # which is data here. So such networks, and steps of very many operations, are left to XLA.
     by_xla = any(mesh.has_long_step or mesh.needs_joint for mesh in task.filters.meshes.values())
     if by_xla:
         return _scan_in_parts(task, z, judged)
@@ -183,11 +184,16 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
 
 
 def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
-    """Return what `filter_rows` does, by XLA, some rows at a time.
+    """Return the outputs of all filters for all rows, smoothed if the task has a smoother, by XLA some rows at a time.
 
-    Weights between neighbours that depend on arrivals alone are computed ahead, for these rows at once.
+    Weights between neighbours that depend on nothing but what arrives are computed for the rows of a part at once.
+
+    Args:
+        task: the filters, inputs and arrivals; rows of a network with fusions between neighbours continue no others.
+        z: measurements (steps, node, received) by group.
+        judged: True to leave out measurements that filters judge implausible.
     """
-    filters, smoother, u, arrivals, _ = task  # rows of such a network are behind no others
+    filters, smoother, u, arrivals, _ = task
     # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
     count = -(-len(u) // ROWS)
     size = -(-len(u) // count)
@@ -195,10 +201,14 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
     for start in range(0, len(u), size):
         # The last part is filled with its last row, which does not count again.
         indices = np.minimum(np.arange(start, start + size), len(u) - 1)
-        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
-        drawn |= {name: (drawn[name], mesh.compute_weights_ahead(drawn[name])) for name, mesh in filters.meshes.items()}
+        k, u_k, z_k, arrivals_k = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
+        # Of fusions between neighbours: which messages arrive, and the weights that follow from this.
+        arrivals_k |= {
+            name: (arrivals_k[name], mesh.compute_weights_of_steps(arrivals_k[name]))
+            for name, mesh in filters.meshes.items()
+        }
         is_counted = np.arange(start, start + size) < len(u)
-        states, results = _part_by_xla(filters, states, (k, u_k, z_k, drawn), judged, is_counted)
+        states, results = _part_by_xla(filters, states, (k, u_k, z_k, arrivals_k), judged, is_counted)
         parts.append(to_numpy(results))
     all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
     return to_numpy(_collect_results(smoother, z, states, all_rows))

@@ -103,30 +103,32 @@ def _describe_refused(
 
 
 def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
-    """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
+    """Return the rows with values that their sender's rule forbids: no further than delta from the last value sent.
 
-    Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
-    uses such a value and gives it a floor of 1e-6 as its probability.
+    A sender on delta sends if its measurement differs from what it sent last by more than delta, in its norm (region
+    "ball") or in some component, or if a heartbeat is due after so many steps. Rules that compare with a prediction, or
+    send each component by itself (region "each"), are not judged; nor are channels that lose or change what is sent.
+    Forbidden values are used all the same.
     """
     trigger = node.trigger if isinstance(node, Node) else None
     if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
         return []
     assert isinstance(node, Node)  # as it has a trigger
     channel = first(node.channel)
-    is_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
-    if not is_as_sent:
+    arrives_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
+    if not arrives_as_sent:
         return []
-    # Each row that came whole against the one before it, `last`.
-    forbidden, last = list[int](), None
+    # Compare each row that arrived with the one that arrived before it; RIM leaves room for rounding.
+    forbidden, last_row = list[int](), None
     for k, row in enumerate(z[:, : len(node.outputs)]):
         if np.isnan(row).any():
             continue
-        if last is not None:
-            heartbeat_is_due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
-            change = np.abs(row - z[last, : len(row)])
+        if last_row is not None:
+            heartbeat_is_due = trigger.heartbeat is not None and k - last_row >= trigger.heartbeat
+            change = np.abs(row - z[last_row, : len(row)])
             delta = (1 - RIM) * np.asarray(trigger.delta)
-            is_inside = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
-            if is_inside and not heartbeat_is_due:
+            is_within = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
+            if is_within and not heartbeat_is_due:
                 forbidden.append(k)
-        last = k
+        last_row = k
     return forbidden

@@ -124,10 +124,11 @@ def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) ->
 
 
 def reduce_run(reducer: AbstractReducer[Result], smoother: NetworkSmoother | None, outputs: PyTree) -> OfStep:
-    """Return what a reducer makes of a run's `outputs` (time, ...).
+    """Return what a reducer makes of a run's `outputs` (time, ...): `sums`, `ever` and `collected`.
 
-    With a smoother, which smooths a whole run, it is a pair for filtered and smoothed estimates. The sums then end with
-    sums of the NIS, the normalised innovations squared, by which the filters are tested.
+    `sums` are numbers of each step that are then summed over runs. `ever` are flags that are True at some step, summed
+    as a count of runs. `collected` is stored for each run. With a smoother each is a pair, of filtered and of smoothed
+    estimates, and `sums` has a third entry: the normalised innovations squared (NIS), by which the filters are tested.
     """
     if smoother is None:
         return reduce_rows(reducer, outputs)

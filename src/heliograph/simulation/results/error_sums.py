@@ -57,24 +57,29 @@ class Statistics(AbstractReducer[StatisticsByName]):
     """Reduce to error statistics of every filter of every node; memory does not grow with the number of runs."""
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Return what is summed of a step: products of errors, e' B^-1 e, claimed covariances, and flags of failures.
+        """Return the numbers of one step of one run that are summed over runs, and flags of failures.
 
-        `step`: as of `AbstractReducer`. Estimates of all kinds, then fused ones by name, lie along one axis `part`.
-        Claimed covariances alone stay apart, a tuple by kind, since all runs may share those of one kind.
+        They are, for each estimate with error e and claimed covariance B: the products e_i e_j (i <= j), the normalised
+        error squared (NEES) e' B^-1 e, B_ij, and whether e or the NEES is no number; and what the nodes' quantizers
+        sent. The flags are also returned as `ever`, to count the runs in which they are true at some step.
+
+        `step`: the truth, estimates by kind (a stack of filters of one structure), and fused ones by name. All lie one
+        after another along one axis (`part`). But covariances are a tuple with an array for each kind: if a filter's
+        covariance is the same in all runs, it need be held only once, and that may differ between kinds.
         """
         truth = jnp.asarray(step["truth"])
-        parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
+        estimates = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
         n = len(truth)
-        means = [jnp.asarray(estimate.mean).reshape(-1, n) for estimate in parts]
-        claimed = [jnp.asarray(estimate.covariance).reshape(-1, n, n) for estimate in parts]
+        means = [jnp.asarray(estimate.mean).reshape(-1, n) for estimate in estimates]
+        claimed = [jnp.asarray(estimate.covariance).reshape(-1, n, n) for estimate in estimates]
         # Errors and their NEES, and where these are invalid.
-        errors = [replace(estimate, mean=mean).error(truth) for estimate, mean in zip(parts, means, strict=True)]
+        errors = [replace(estimate, mean=mean).error(truth) for estimate, mean in zip(estimates, means, strict=True)]
         distances = jax.vmap(squared_distance, in_axes=(0, 0, None))
         nees = [distances(b, e, truth) for b, e in zip(claimed, errors, strict=True)]
         all_errors, all_nees = jnp.concatenate(errors), jnp.concatenate(nees)
-        finite = jnp.all(jnp.isfinite(all_errors), axis=1)
-        failed = jnp.stack([~finite, jnp.isnan(all_nees)])
-        # Pairs i <= j of symmetric matrices.
+        is_finite = jnp.all(jnp.isfinite(all_errors), axis=1)
+        failed = jnp.stack([~is_finite, jnp.isnan(all_nees)])
+        # Entries i <= j of symmetric matrices.
         rows, columns = np.triu_indices(n)
         sums = {
             "pairs": all_errors[:, rows] * all_errors[:, columns],
@@ -163,18 +168,21 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def others(
         self, filtered: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
-        """Return the statistics of filtered estimates, with those of the smoothed estimates in their field `smoothed`.
+        """Add the statistics of the smoothed estimates to those of the filtered ones, as their field `smoothed`.
 
-        `claims`: claims of the smoothed estimates' covariances, by node and filter.
+        Args:
+            filtered: statistics of the filtered estimates, which are changed and returned.
+            smoothed: statistics of the smoothed estimates, with the claims of the filters.
+            claims: what smoothed covariances claim, by node and filter, in place of these.
         """
-        statistics = {
+        statistics_with_claims = {
             node: {
                 name: replace(statistics_of_filter, claim=claims[node][name])
                 for name, statistics_of_filter in filters.items()
             }
             for node, filters in smoothed.items()
         }
-        filtered.smoothed = StatisticsByName(statistics, smoothed.states)
+        filtered.smoothed = StatisticsByName(statistics_with_claims, smoothed.states)
         return filtered
 
 

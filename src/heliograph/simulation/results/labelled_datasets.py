@@ -192,27 +192,28 @@ class FilterLabels:
         return {"attitude": order} if rotations else {}
 
     def make_quantizer_fields(self) -> dict[str, np.ndarray]:
-        """Return the fields of what the quantizers sent, by fusion and sender; none without quantizers.
+        """Return what quantizers sent as arrays (..., fusion, sender, state) by field; {} without quantizers.
 
-        Integers and booleans stay what they are.
+        `self.uplinks` holds for each fusion the fields SENT with the axes (..., node, state), of the nodes that it
+        fuses. Integers and booleans stay what they are. "place" (fusion, sender) is the number of the sender among the
+        fusion's nodes, -1 where it is none of them.
         """
         if not self.uplinks:
             return {}
-        # Empty: "place" of each sender in each fusion, -1 for none, and of each field of an uplink (rows, fusion,
-        # sender, state), of the type that the first uplink has.
+        # Arrays of zeros, of the types that the first fusion has.
         senders, n, first = self.senders, len(self.states), next(iter(self.uplinks.values()))
         places = np.full((len(self.uplinks), len(senders)), -1, dtype=np.int64)
-        parts = {}
-        for name in SENT:
-            example = getattr(first, name)
-            parts[name] = np.zeros((*example.shape[: len(self.rows)], *places.shape, n), example.dtype)
-        # Values by fusion and sender.
+        values_by_field = {}
+        for field in SENT:
+            example = getattr(first, field)
+            values_by_field[field] = np.zeros((*example.shape[: len(self.rows)], *places.shape, n), example.dtype)
         for i, uplink in enumerate(self.uplinks.values()):
             for j, node in enumerate(uplink.nodes):
-                places[i, senders.index(node)] = j
-                for name, values in parts.items():
-                    values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
-        return {"place": places, **parts}
+                sender = senders.index(node)
+                places[i, sender] = j
+                for field, values in values_by_field.items():
+                    values[..., i, sender, :] = getattr(uplink, field)[..., j, :]
+        return {"place": places, **values_by_field}
 
     def make_dataset(
         self, title: str, fields: Mapping[str, np.ndarray], time: np.ndarray, units: Mapping[str, str]

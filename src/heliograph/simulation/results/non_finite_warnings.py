@@ -29,7 +29,8 @@ def warn_of_non_finite_numbers(record: Record, complete: Iterable[str] = (), sta
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             bad = find_not_finite(np.asarray(estimate.mean), 1)
-            if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
+            # The covariance of a fused estimate may be NaN for good reason: a quantizer that saturates has no bound.
+            if estimate.claim != "none" and node != FUSED:
                 bad |= find_not_finite(np.asarray(estimate.covariance), 2)
             what = "mean" if estimate.claim == "none" else "covariance"
             for when in describe_bad_steps(bad):

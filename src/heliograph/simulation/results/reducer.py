@@ -60,9 +60,13 @@ class AbstractReducer(Module, Generic[Result]):
         raise unwritten(self, "of_step")
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
-        """Return what `finish` takes of all runs, from sums by batch (time, ..., batch) over `count` runs each.
+        """Return what `finish` needs of the sums over runs; nothing by default.
 
-        `common` says of each part whether it is the same in all runs: it stands in the sums as of one run, (time, ...).
+        Args:
+            sums: `sums` and `ever` of `of_step`, summed over the runs of each batch, (time, ..., batch). A number that
+                is the same in all runs is not summed: it is that of one run, (time, ...).
+            common: for each array of `sums`, whether it is the same in all runs.
+            count: number of runs in each batch (batch,).
         """
         return ()
 
@@ -97,12 +101,17 @@ class AbstractReducer(Module, Generic[Result]):
         return split_measurements(network, groups)
 
     def others(self, filtered: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
-        """Return the result with that of smoothed estimates as its `smoothed`.
+        """Return the result of the filtered estimates with that of the smoothed ones in its field `smoothed`.
 
-        `claims`: of the smoothed estimates, by node and filter.
+        A reducer that can hold both defines it.
+
+        Args:
+            filtered: result of the filtered estimates.
+            smoothed: result of the smoothed estimates.
+            claims: what the covariances of the smoothed estimates claim, by node and filter.
 
         Raises:
-            ValueError: a reducer without results for smoothed estimates.
+            ValueError: always here: the reducer has no results for smoothed estimates.
         """
         raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
 

@@ -120,20 +120,23 @@ def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, d
 def split_by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], Any], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Split what is collected of estimates by node and filter, at its axes (filter, node), the first of them at `axis`.
+    """Return arrays that are stacked over filters and nodes as one array for each node and filter, by their names.
+
+    Filters that differ in numbers alone, at nodes that do so (a group), are of one kind and are stacked.
 
     Args:
-        network: the network, whose `kinds` are the filters of each.
-        batch: "estimates" by kind, and "fused" by name, which has not these two axes.
-        read: gives the array of an entry of `batch`.
-        axis: of the filters in that array; the nodes' follows it.
+        network: the network; its `kinds` are (group, names of the filters) of each stack, and `mesh_kinds` those of
+            fusions between neighbours, which have an estimate at each node too.
+        batch: "estimates" with an entry for each kind, and "fused" by name, without axes of filters and nodes.
+        read: returns the array of an entry of `batch`.
+        axis: index of the axis of filters in that array; the axis of nodes follows it.
     """
     by_node: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
-    parts = batch["estimates"]
-    kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
-    for (group, filters), estimate in zip(kinds, parts, strict=True):
-        # The axes of filters and nodes first, to go through them.
-        values = np.moveaxis(np.asarray(read(estimate)), (axis, axis + 1), (0, 1))
+    entries = batch["estimates"]
+    # Judgements of measurements are made by filters alone: then there is no entry for fusions between neighbours.
+    kinds = (network.kinds + network.mesh_kinds)[: len(entries)]
+    for (group, filters), entry in zip(kinds, entries, strict=True):
+        values = np.moveaxis(np.asarray(read(entry)), (axis, axis + 1), (0, 1))  # (filter, node, ...)
         for name, values_of_filter in zip(filters, values, strict=True):
             for node, value in zip(network.groups[group], values_of_filter, strict=True):
                 by_node[node][name] = value

@@ -104,20 +104,23 @@ def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterCo
 
 
 def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighingColumns]:
-    """Return the columns in a row of outputs that say what filters that weigh made of their components.
+    """Return by (node, filter) in which columns of a row a filter's weights of its received components stand.
 
-    They are given by (node, filter); central filters have the node FUSED. `outcome`: the outputs of a step with the
-    number of its column in place of each value, and None for kinds of filters that do not weigh.
+    Filters that weigh tell of each component its innovation, the variance of this and the weight that it got. Central
+    filters have FUSED in place of a node.
+
+    `outcome`: the outputs of a step as a tree that has the number of its column in place of each value. It is stacked
+    by kind of filter and then (filter, node), with None for kinds that do not weigh.
     """
-    columns_by_place = {
+    columns_of_nodes = {
         name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
         for name, place in network.places.items()
         if outcome["weighed"][place.kind] is not None
     }
     weighed_centrally = outcome["weighed_centrally"].items()
-    central = {(FUSED, name): list(columns) for name, columns in weighed_centrally if columns is not None}
+    columns_of_central = {(FUSED, name): list(columns) for name, columns in weighed_centrally if columns is not None}
     weights = {}
-    for name, columns in (columns_by_place | central).items():
+    for name, columns in (columns_of_nodes | columns_of_central).items():
         value, variance, weight = (tuple(map(int, field)) for field in columns)
         weights[name] = WeighingColumns(value, variance, weight)
     return weights

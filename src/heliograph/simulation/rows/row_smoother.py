@@ -62,7 +62,8 @@ class BackwardSweep(Module):
         Returns:
             The filters' states after the step, and their smoother steps.
         """
-        # Refuse again the measurements that were refused when the row was filtered.
+        # Refuse again the measurements that were refused when the row was filtered. Reasons are by kind of the nodes'
+        # filters (a stack of one structure), and by name of central ones.
         by_kind, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
         z = self.network_step.group_measurements(received)
@@ -71,9 +72,15 @@ class BackwardSweep(Module):
         return after, (steps_by_kind, outputs["central_steps"])
 
     def states_after(self, history: RowHistory, row: jax.Array) -> PyTree:
-        """Return the states after a row of the filters that can be smoothed, as `AllFilters.step` takes them."""
+        """Return the states after a row of the filters that can be smoothed, in the form in which a step takes them.
+
+        That is a tuple of six: states of the nodes' filters by kind, and of central ones by name; the states of
+        quantizers, centres, fusions by message, and fused estimates under test are empty, since nothing is fused here.
+        """
         by_kind, central, *_ = history.state_after(row)
-        return by_kind, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
+        central_states = {name: central[name] for name in self.network_step.filters.central}
+        quantizers, centres, exchanges, tested = (), (), dict[str, PyTree](), dict[str, PyTree]()
+        return by_kind, central_states, quantizers, centres, exchanges, tested
 
     def make_estimates(
         self, steps: NetworkSmootherStep, later: PyTree
@@ -165,17 +172,14 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
 
 
 def _make_step_into_row(dt: int) -> StepInto:
-    """Return the function that computes the smoother step into a row: what the backward pass needs of that step.
+    """Return the function that computes the terms of the backward pass for the step that ends at a row.
 
-    For continuous time, with one step for each row; `dt`: place of the time between rows among the inputs.
+    It is for plants whose steps are of any length: one step leads from each row to the next. `dt`: index among the
+    inputs of that length.
     """
 
     def step_into_row(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
-        """Return what the backward pass needs to smooth over the step into a row, for all filters.
-
-        It is computed from their states after the previous row. `dt`: the place among the inputs of the time between
-        rows.
-        """
+        """Filter one row again from the states after the row before, and return the terms of the backward pass."""
         row, _ = step_of_row
         state = sweep.states_after(history, row - 1)
         received, _, _ = history.read_row(row)
@@ -186,34 +190,38 @@ def _make_step_into_row(dt: int) -> StepInto:
     return step_into_row
 
 
-def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
-    """Return the row before, with its step."""
-    row, _ = place
+def _find_earlier_row(history: RowHistory, step_of_row: StepOfRow) -> StepOfRow:
+    """Return the row before, with the number of its step."""
+    row, _ = step_of_row
     return row - 1, history.step[row - 1]
 
 
 def _compute_step_into_k(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
-    """Return what the backward pass needs to smooth over step k, for all filters.
+    """Return the terms of the backward pass for step k, of a plant whose time counts steps.
 
-    The filters step on from the previous row, without measurements before k. `step_of_row`: the row at k or the next
-    row after it, and k.
+    Between two rows there may be many steps, in which nothing was measured. The filters' states are known after rows
+    alone, so all steps after the previous row are filtered again, up to k.
+
+    `step_of_row`: (row, k), the first row whose step is k or later, and k.
     """
     row, k = step_of_row
 
-    def step_on(j: jax.Array, state: PyTree) -> PyTree:
-        """Step the filters' states by step j."""
+    def filter_step_j(j: jax.Array, state: PyTree) -> PyTree:
+        """Return the filters' states after step j, in which nothing was measured."""
         after, _ = sweep.step(history, row, state, *history.read_step(row, j), j)
         return after
 
-    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, step_on, sweep.states_after(history, row - 1))
+    first_step = history.step[row - 1] + 1  # after the previous row
+    state = jax.lax.fori_loop(first_step, k, filter_step_j, sweep.states_after(history, row - 1))
     _, smoother_steps = sweep.step(history, row, state, *history.read_step(row, k), k)
     return smoother_steps
 
 
-def _find_earlier_step(history: RowHistory, place: StepOfRow) -> StepOfRow:
-    """Return step k - 1, and the row that it is of or leads to."""
-    row, k = place
-    return jnp.where(k - 1 == history.step[row - 1], row - 1, row), k - 1
+def _find_earlier_step(history: RowHistory, step_of_row: StepOfRow) -> StepOfRow:
+    """Return (row, k - 1) from (row, k): the first row whose step is k - 1 or later, and that step."""
+    row, k = step_of_row
+    is_step_of_previous_row = k - 1 == history.step[row - 1]
+    return jnp.where(is_step_of_previous_row, row - 1, row), k - 1
 
 
 @readable
@@ -308,9 +316,9 @@ def _take_only_run(results: PyTree) -> PyTree:
 
 
 def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Estimate:
-    """Return the estimate at an index (filter, node) of stacked estimates, with this claim.
+    """Return one estimate of stacked ones, by its index (filter, node), with this claim of its covariance.
 
-    The claim is lowered to "none" if the mean is not finite or the covariance is none.
+    If the mean is not finite, or the matrix is no covariance (not positive semidefinite), it claims "none".
     """
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
     mean, covariance = (np.asarray(stacked_values)[index] for stacked_values in (outputs.mean, outputs.covariance))

@@ -112,21 +112,23 @@ class RowStep:
 
     @in_float64
     def __init__(self, network: Network):
-        """Lay out state, measurement and outputs of one step of the network's filters in rows; compile the step."""
+        """Lay out state, measurement and outputs of one step of the network's filters in rows; compile the step.
+
+        Filters judge whether measurements are plausible, and fused estimates are tested by what arrives after them.
+        """
         instance("network", network, Network, "a Network")
         self._network = network
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
-        # All filters, split into the arrays in them and all else; and how their states before the first step stand in
-        # a row of doubles.
         filters = AllFilters(network, judges=True, tests=True)
         _check_reports(filters)
         start = initial_states(filters)
+        # The step's arrays are arguments of the compiled program; all else of it, `static`, is part of the program.
         numbers, static = split_structure(NetworkStep(network, filters))
         self._shapes = tuple(_make_shape(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = make_flat_layout(start)
         self._layout = RowLayout(static, self.state, received, inputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
-        # How the outputs stand in a row, from the shapes of a step.
+        # A row of the result: the states, flattened to doubles, then the outputs.
         _, output_shapes = _trace_step(self._layout, self._shapes).out_info
         self.outputs = make_flat_layout(output_shapes)
         self.columns = find_filter_columns(network, self.outputs)
@@ -148,17 +150,17 @@ class RowStep:
         return self._code is not None
 
     @property
-    def _rows_of_call_and_turn(self) -> tuple[int, int]:
-        """Return how many rows one call of XLA's program takes, and how many one turn of its loop.
+    def _rows_of_call_and_iteration(self) -> tuple[int, int]:
+        """Return how many rows one call of XLA's program takes, and how many one iteration of its loop.
 
-        The layout alone decides, so that a result does not depend on the number of rows. A turn steps at most TOGETHER
-        rows in parallel, and a call at most WIDTH rows. Long rows are fewer, since NUMBERS_TOGETHER and NUMBERS limit
-        the numbers in a turn and in a call.
+        The length of a row alone decides, so that a result does not depend on the number of rows. An iteration steps at
+        most TOGETHER rows in parallel, of at most NUMBERS_TOGETHER numbers in all; a call steps at most WIDTH rows, of
+        at most NUMBERS numbers. Both are at least one row.
         """
-        longest = max(self._layout.size, self.state.size + self.outputs.size)
-        together = min(max(NUMBERS_TOGETHER // longest, 1), TOGETHER)
-        turns = min(max(NUMBERS // (together * longest), 1), WIDTH // together)
-        return turns * together, together
+        row_length = max(self._layout.size, self.state.size + self.outputs.size)  # before or after a step
+        together = min(max(NUMBERS_TOGETHER // row_length, 1), TOGETHER)
+        iterations = min(max(NUMBERS // (together * row_length), 1), WIDTH // together)
+        return iterations * together, together
 
     @cached_property
     def remarking(self) -> tuple[tuple[str, str], ...]:
@@ -202,22 +204,26 @@ class RowStep:
         return OneRowStep(self, None if self._code is None else self._code.make_in_place_code(1))
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
-        """Return the states and outputs after a row, which is given in parts that stand side by side.
+        """Return the states and outputs after each row of (state, received, inputs, step number), one below the other.
 
-        Native code computes them, or XLA if there is none (`self._code` is None). The next call overwrites the result.
+        Native code computes them, or XLA if there is none (`self._code` is None). The next call overwrites the result
+        of native code. `alone`: rows come one at a time, so that XLA's program is one of a single row.
         """
         if self._code is not None:
             stepped: np.ndarray = self._code(rows)
             return stepped
-        # Blocks of rows, the last filled up; of its turns no more run than have rows.
-        width, together = (1, 1) if alone else self._rows_of_call_and_turn
-        run = _compile_xla(self._layout, self.outputs, width, together, is_long=self._rows_of_call_and_turn[1] == 1)
-        done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
+        # XLA steps blocks of `width` rows, `together` rows in each iteration of a loop. The last block may have fewer
+        # rows: then the loop ends after the iterations that have some.
+        width, together = (1, 1) if alone else self._rows_of_call_and_iteration
+        is_long = self._rows_of_call_and_iteration[1] == 1
+        run = _compile_xla(self._layout, self.outputs, width, together, is_long)
+        done, block = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
             count = min(width, len(rows) - begin)
-            filled[:count] = rows[begin : begin + count]
+            block[:count] = rows[begin : begin + count]
+            iterations = np.int32(-(-count // together))
             with jax.enable_x64(True):
-                stepped = run(self._numbers, filled, np.int32(-(-count // together)))
+                stepped = run(self._numbers, block, iterations)
             done[begin : begin + count] = np.asarray(stepped)[:count]
         return done
 
@@ -313,28 +319,34 @@ def _write_step_text(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...
 
 @lru_cache
 def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: int, is_long: bool) -> PyTree:
-    """Return XLA's program (numbers, rows, turns) -> stepped rows: a loop, of whose turns each steps `together` rows.
+    """Return XLA's program (numbers, rows, iterations) -> stepped rows, a loop that steps `together` rows at once.
 
-    The number of turns is an argument, so that one program serves any number of rows up to `width`. `is_long`: rows so
-    long that each is stepped alone; to optimise their program would take longer than all steps to come.
+    The number of iterations is an argument, so that one program serves any number of rows up to `width`.
+
+    Args:
+        layout: the structure of the step, and where state, measurements and inputs stand in a row.
+        outputs: how the outputs stand in a row.
+        width: number of rows of an array that is passed.
+        together: rows that each iteration steps in parallel.
+        is_long: whether rows are so long that each is stepped alone: to optimise their program would take longer than
+            all steps to come, so it is compiled quickly.
     """
     step = _make_row_function(layout)
 
-    def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        """Return the states and outputs after each of `width` rows; only the first `turns` turns are computed.
+    def run(numbers: list[jax.Array], rows: jax.Array, iterations: jax.Array) -> jax.Array:
+        """Return (states, outputs) after each of the first `iterations` * `together` rows, zeros for the others.
 
-        A turn steps `together` rows in parallel. `numbers`: the arrays of a network's step. From outside: `step` of one
-        row; `layout` and `outputs`, with the lengths of a row's state and outputs.
+        `numbers`: the arrays of a network's step.
         """
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:
-            """Return `done` with the `together` rows of turn i stepped, in parallel, at their places."""
-            rows_of_turn = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
-            stepped = jax.vmap(lambda row: step(numbers, row))(rows_of_turn)
+            """Return `done` with the `together` rows of iteration i stepped, in parallel, at their places."""
+            rows_of_iteration = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
+            stepped = jax.vmap(lambda row: step(numbers, row))(rows_of_iteration)
             return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, axis=0)
 
         columns = layout.state.size + outputs.size
-        stepped: jax.Array = jax.lax.fori_loop(0, turns, step_rows, jnp.zeros((width, columns)))
+        stepped: jax.Array = jax.lax.fori_loop(0, iterations, step_rows, jnp.zeros((width, columns)))
         return stepped
 
     return jax.jit(run, compiler_options=in_haste() if is_long else understood())

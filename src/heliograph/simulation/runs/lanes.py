@@ -63,29 +63,32 @@ class RunLanes:
     def advance(self, start: int, blocks: int) -> PyTree:
         """Return what is collected of each run in `blocks` blocks from block number `start` on, as NumPy arrays.
 
-        A block is BLOCK runs. Blocks are dealt to the lanes in turn, and their results are put in order again.
+        A block is BLOCK runs. Block b belongs to lane b mod `self.count`: a lane adds up the sums of its blocks one
+        after another, so that no bit depends on which lanes run at once. Results are put in the order of the runs.
         """
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
-        recorded = self._run_on_devices(runs, lanes) if self.wide else self._run_in_threads(runs, lanes)
-        blocks_as_dealt = np.concatenate(lanes)
-        return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), blocks_as_dealt), *recorded)
+        recorded_by_lane = self._run_on_devices(runs, lanes) if self.wide else self._run_in_threads(runs, lanes)
+        blocks_by_lane = np.concatenate(lanes)
+        return jax.tree.map(
+            lambda *of_lanes: _order_blocks(np.concatenate(of_lanes), blocks_by_lane), *recorded_by_lane
+        )
 
     def _run_in_threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Return what is recorded of each run, by lane: each lane runs in a thread of its own, carrying its sums on.
+        """Return what is recorded of each run, by lane; each lane runs in a thread of its own.
 
-        `runs` (block, BLOCK): numbers of the runs. `lanes`: which of these blocks are each lane's.
+        A lane is a sequence of blocks of runs, whose sums are added one after another to the lane's sums so far, its
+        carry (`self.carries`). `runs` (block, BLOCK): numbers of the runs. `lanes`: for each lane the indices of its
+        blocks, which are rows of `runs`.
         """
 
         def advance_lane(lane: int) -> PyTree:
-            """Return what is recorded of one lane's runs, and add these runs to the lane's sums.
-
-            `lanes`: for each lane, which rows of `runs` are its blocks.
-            """
+            """Simulate one lane's blocks: add them to the lane's sums, and return what is recorded of their runs."""
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
-                self.carries[lane], recorded = self.alone(runs[lanes[lane]], carry)
+                runs_of_lane = runs[lanes[lane]]
+                self.carries[lane], recorded = self.alone(runs_of_lane, carry)
                 return to_numpy(recorded)
 
         if self.pool is None:
@@ -93,10 +96,10 @@ class RunLanes:
         return list(self.pool.map(advance_lane, [lane for lane, blocks in enumerate(lanes) if len(blocks)]))
 
     def _run_on_devices(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Return what is recorded of each run, by lane; all lanes run at once, dealt to the devices.
+        """Return what is recorded of each run, by lane; all lanes run at once, divided among the devices.
 
-        The arguments are those of `_run_in_threads`; here all lanes have equally many blocks. `self.carries`: the
-        lanes' sums so far, a list before the first call, and then stacked on the devices.
+        `runs` (block, BLOCK): numbers of the runs. `lanes`: for each lane the indices of its blocks; all lanes have
+        equally many. `self.carries`: the lanes' sums so far, a list before the first call, then stacked on the devices.
         """
         sharding = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):

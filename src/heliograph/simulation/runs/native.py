@@ -131,12 +131,12 @@ class _KnownEntries:
     def of(cls, array: np.ndarray) -> "_KnownEntries":
         """Return what is known of an array when a program is made: its shape and type, and the values of some entries.
 
-        Known are zeros and ones of real arrays, and all entries of other arrays that are no arguments. All else is an
-        argument of the program. Nothing is known of the entries of an argument with more than FEW numbers.
+        Arrays of reals and of checksums are arguments of the program. Zeros and ones of at most FEW reals are known all
+        the same, which saves operations. All other integers are part of the program.
         """
-        is_known = _find_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_argument(array))
-        if array.size > FEW and _is_argument(array):
-            is_known[...] = False
+        is_known = np.full(array.shape, not _is_argument(array))
+        if array.dtype.kind == "f" and array.size <= FEW:
+            is_known = _find_zeros_and_ones(array)
         values = np.where(is_known, array, 0).astype(array.dtype)
         return cls(array.shape, array.dtype.str, is_known.tobytes(), values.tobytes())
 
@@ -151,10 +151,9 @@ class _KnownEntries:
         return np.frombuffer(self.values, dtype=self.kind).reshape(self.shape)
 
 
-def _find_plain(array: np.ndarray) -> np.ndarray:
+def _find_zeros_and_ones(array: np.ndarray) -> np.ndarray:
     """Return the mask of the entries that are 0, 1 or -1 (PLAIN)."""
-    plain: np.ndarray = np.logical_or.reduce([array == number for number in PLAIN])
-    return plain
+    return np.asarray(np.logical_or.reduce([array == number for number in PLAIN]))
 
 
 def _is_argument(array: np.ndarray) -> bool:
@@ -200,21 +199,22 @@ def _split_arrays(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
 
 @cache_by_object
 def _split_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
-    """Return a world's structure and its arrays, once for all simulations of it."""
+    """Return all of a world (plant, channels and filters) but its arrays, and these; once for all its simulations."""
     return _split_arrays(world)
 
 
 @lru_cache(PROGRAMS)
 def _find_program(
-    world: _Structure, rest: _Structure, counting: bool, precision: Precision
+    of_world: _Structure, of_rest: _Structure, is_partitionable: bool, precision: Precision
 ) -> tuple[Any, Any] | Unsupported:
-    """Return the program that `_compile_program` makes, or the reason why there is none; both are cached.
+    """Return the program of runs and the structure of what they return, or the reason why there is no program; cached.
 
-    `world`, `rest`: everything but the arrays of what is simulated, and of what is computed from it. `counting`, JAX's
-    way of counting draws, is only part of the cache's key, since what is traced depends on it.
+    Structures are all but the arrays: of the world (plant, channels and filters), and of (smoother, inputs, reducer).
+    `is_partitionable`, JAX's way to number random draws, is read when a program is traced; as an argument it keeps
+    programs of both ways apart.
     """
     try:
-        return _compile_program(world, rest, precision)
+        return _compile_program(of_world, of_rest, precision)
     except Unsupported as error:
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
@@ -254,9 +254,9 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
 
 @eqx.filter_jit
 def _step_world(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-    """Step a world as `World.step` does, traced once for worlds that differ in numbers alone.
+    """Step plant, channels and filters as `World.step` does, traced once for worlds that differ in numbers alone.
 
-    So it is however long the run and whatever is collected of it.
+    The trace serves runs of every length, and every reducer.
     """
     return world.step(state, key, row)
 

@@ -37,28 +37,31 @@ class _RunningChunk(NamedTuple):
 
 
 class NativeRuns:
-    """Runs of a native program, dealt to lanes with separate sums, chunk by chunk.
+    """Runs of a native program, chunk by chunk, in lanes.
 
-    Threads compute the first chunk from the moment that this is made, while the caller does something else: it may make
-    the next program ready, or finish the runs of the last one.
+    BLOCK runs are a block; block b belongs to lane b mod LANES, which has sums of its own. A lane adds its blocks one
+    after another, and the lanes' sums are added in one order, so that no bit depends on the number of threads. Threads
+    compute the first chunk from the moment that this is made, while the caller makes the next program ready, or
+    finishes the runs of the last one.
     """
 
     def __init__(
         self, code: NativeProgram, first_run: int, runs: int, chunk: int, memory: list[list[np.ndarray]] | None = None
     ):
-        """Start the first chunk of runs; sums are kept for each of LANES lanes.
+        """Divide the runs into chunks, and start the first one.
 
         Args:
             code: the program.
             first_run: number of the first run.
             runs: number of runs.
             chunk: number of runs between two reports of progress.
-            memory: arrays of earlier runs' sums that can be used again, and are given back in the end; None allocates
-                new ones. For a few nodes and runs, allocating takes as long as computing.
+            memory: arrays in which to sum, left by earlier runs; they are put back into the list in the end. None
+                allocates new ones. For a few nodes and runs, allocating takes as long as computing.
         """
         self.code, self.first_run, self.runs = code, first_run, runs
         self.memory: list[list[np.ndarray]] = [] if memory is None else memory
-        self.sums: list[list[np.ndarray] | None] = [None] * LANES
+        self.sums: list[list[np.ndarray] | None] = [None] * LANES  # of each lane; None until it has a run
+        # The lanes are threads of one processor: a chunk need not fill them all (`wide`).
         self.chunks = split_into_chunks(LANES, wide=False, runs=runs, chunk=chunk)
         self._first = self._start(self.chunks[0])
 
@@ -71,20 +74,20 @@ class NativeRuns:
         return self._total()._replace(collected=self._join_chunks(collected_by_chunk))
 
     def _start(self, blocks: range) -> "_RunningChunk":
-        """Let threads simulate these blocks, each lane's in order."""
-        numbers = np.array(blocks)
+        """Let threads simulate these blocks of runs: each lane is a thread, which takes its blocks in order."""
+        numbers, program = np.array(blocks), self.code.begun
         runs_of_lane = {lane: self._list_runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
-        used = [lane for lane, runs in runs_of_lane.items() if len(runs)]
+        lanes_with_runs = [lane for lane, runs in runs_of_lane.items() if len(runs)]
 
         def simulate_lane(lane: int) -> list[np.ndarray | None]:
             """Return what is collected of a lane's runs, and add them to the lane's sums; runs in its own thread."""
-            sums = self.sums[lane] = self.sums[lane] or self.code.begun.make_zero_sums(self.memory)
-            collected: list[np.ndarray | None] = self.code.begun.add_runs(runs_of_lane[lane], sums)
+            sums = self.sums[lane] = self.sums[lane] or program.make_zero_sums(self.memory)
+            collected: list[np.ndarray | None] = program.add_runs(runs_of_lane[lane], sums)
             return collected
 
         return _RunningChunk(
-            runs=np.concatenate([runs_of_lane[lane] for lane in used]),
-            collected_by_lane=get_thread_pool().map(simulate_lane, used),  # begins at once
+            runs=np.concatenate([runs_of_lane[lane] for lane in lanes_with_runs]),
+            collected_by_lane=get_thread_pool().map(simulate_lane, lanes_with_runs),  # begins at once
         )
 
     def _advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
@@ -106,28 +109,30 @@ class NativeRuns:
         return runs[runs < self.first_run + self.runs]
 
     def _total(self) -> ReducedRuns:
-        """Return the sums over all runs, by batch of runs, without what is collected; give the lanes' memory back.
+        """Return the sums over all runs, by batch of runs, without what is collected.
 
-        `shared`: by result its value where it is the same in all runs, else None; `summed`: whether it is summed.
+        A result that is the same in all runs is not summed: its value in one run stands in the place of its sum. The
+        arrays of the lanes' sums go back to the memory for later runs.
         """
-        code = self.code.begun
-        used = [sums for sums in self.sums if sums is not None]
-        totals = iter(code.add_partial_sums(used))
-        self.memory += used
-        leaves, common = [], []
-        # Results that all runs share stand as of one run.
-        for fixed, is_summed in zip(code.shared, code.summed, strict=True):
-            by_batch = next(totals) if is_summed and fixed is None else None
-            leaves.append(by_batch if fixed is None else to_double(fixed))
-            common.append(fixed is not None)
+        program = self.code.begun
+        sums_of_lanes = [sums for sums in self.sums if sums is not None]
+        totals = iter(program.add_partial_sums(sums_of_lanes))
+        self.memory += sums_of_lanes
+        leaves, are_common = [], []
+        # `shared`: for each result its value if all runs share it, else None. `summed`: whether it is one to be summed.
+        for shared_value, is_summed in zip(program.shared, program.summed, strict=True):
+            by_batch = next(totals) if is_summed and shared_value is None else None
+            leaves.append(by_batch if shared_value is None else to_double(shared_value))
+            are_common.append(shared_value is not None)
         count = count_runs_by_batch(self.first_run, self.first_run + self.runs)
-        sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return ReducedRuns(sums=sums, common=same, runs=count, collected=None)
+        sums, common = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, are_common))
+        return ReducedRuns(sums=sums, common=common, runs=count, collected=None)
 
     def _join_chunks(self, collected_by_chunk: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Return what is collected of all runs (run, ...), from what `_advance` returned for each chunk.
+        """Return what is collected of all runs (run, ...), from a list of results (run, ...) or None for each chunk.
 
-        `shared`: by leaf, the value that all runs share, or None. A shared value is repeated as a view.
+        A result that is the same in all runs is None in every chunk. The program has its value in one run (`shared`,
+        None for other results), of which a view is repeated for all runs.
         """
         leaves: list[Any] = []
         for shared_value, *values_by_chunk in zip(self.code.begun.shared, *collected_by_chunk, strict=True):
@@ -135,7 +140,7 @@ class NativeRuns:
                 leaves.append(np.broadcast_to(to_double(shared_value), (self.runs, *shared_value.shape)))
             elif len(values_by_chunk) > 1 and values_by_chunk[0] is not None:
                 leaves.append(np.concatenate(values_by_chunk))
-            else:  # a single chunk need not be copied; None: the leaf is not collected
+            else:  # a single chunk need not be copied; None: the result is summed, not collected
                 leaves.append(values_by_chunk[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected
 

@@ -76,10 +76,15 @@ def _on_host(leaf: PyTree) -> PyTree:
 
 
 def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
-    """Return the network of these nodes alone, which are of one structure; unchecked, since the whole network is."""
+    """Return the network of these nodes alone, all of one structure.
+
+    Its fields are set without the constructor, which would check again what the whole network has passed.
+    """
+    # In the whole network these nodes are part of one group (nodes of one structure); here they are the only group,
+    # number 0. A kind is the filters of one structure at the nodes of a group.
     group = next(g for g, members in enumerate(network.groups) if names[0] in members)
-    kinds = tuple(AlikeFilters(0, kind.filters) for kind in network.kinds if kind.group == group)
-    size = network.nodes[names[0]].received
+    kinds = tuple(AlikeFilters(group=0, filters=kind.filters) for kind in network.kinds if kind.group == group)
+    size = network.nodes[names[0]].received  # numbers that each of them receives
     claimed = {(name, f): network.claimed[name, f] for name in names for f in network.nodes[name].filters}
     return _with_fields(
         network,
@@ -87,9 +92,9 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
         names=names,
         groups=(names,),
         kinds=kinds,
-        places=FrozenMapping(find_estimate_places((names,), kinds)),
+        places=FrozenMapping(find_estimate_places((names,), kinds)),  # where each filter's estimate stands
         rows=FrozenMapping({name: range(i * size, (i + 1) * size) for i, name in enumerate(names)}),
-        claimed=FrozenMapping(claimed),
+        claimed=FrozenMapping(claimed),  # what each filter claims of its covariance
     )
 
 

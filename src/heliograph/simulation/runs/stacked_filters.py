@@ -206,9 +206,15 @@ def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
 
 
 def stack_by_kind(network: Network, smoothed_kinds: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
-    """Return the nodes' filters, those of each kind stacked, filter after filter and node after node for each.
+    """Return the filters of a network's nodes as stacks: filters that differ in numbers alone along one axis.
 
-    `smoothed_kinds`: numbers of the kinds whose steps are to be smoothed. `judges`: filters judge their data.
+    A group holds the nodes of one structure. A kind holds filters of one structure at all nodes of one group; along its
+    axis are the first filter of all nodes, then the second one, and so on.
+
+    Args:
+        network: the network.
+        smoothed_kinds: numbers of the kinds whose estimates are to be smoothed.
+        judges: whether filters judge if their measurements are plausible.
     """
     alike = []
     for number, kind in enumerate(network.kinds):

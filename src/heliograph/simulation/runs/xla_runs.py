@@ -61,9 +61,10 @@ def simulate_trajectories(
 
 
 def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
-    """Apply a function of one run's values to all runs: (run, ...), or (1, ...) where they share it, in and out.
+    """Apply a function of one run's values to all runs.
 
-    A result that depends on no value of single runs is computed once.
+    `values` have a leading axis of runs: of length `runs`, or 1 for a value that all runs share. So do the results: a
+    result that depends on shared values alone is computed once, and is shared too.
     """
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
@@ -72,13 +73,14 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
     traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(
         *of_first_run
     )
-    # A result differs between runs if the program, cut to that result alone, still needs an argument that does.
+    # A result differs between runs if it depends on an argument that does. JAX's dead-code elimination tells which
+    # arguments are needed for one result alone.
     results = range(len(traced.jaxpr.outvars))
     result_varies = []
     for i in results:
         _, is_needed = dce_jaxpr(traced.jaxpr, [i == j for j in results])
         result_varies.append(any(differs and needed for differs, needed in zip(varies, is_needed, strict=True)))
-    # The axis of runs last inside, first outside.
+    # Inside, the axis of runs is the last one, so that numbers of different runs stand side by side in memory.
     in_axes, out_axes = _list_run_axes(varies), _list_run_axes(result_varies)
     apply = jax.vmap(jaxpr_as_fun(traced), in_axes=in_axes, out_axes=out_axes, axis_size=runs)
     arguments = [

@@ -33,17 +33,20 @@ def make_reception(network: Network) -> AbstractMedium:
         rows = network.rows
         received = tuple(np.array([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, received)
-    # A sensor and a channel for each node, stacked by group.
+    # A sensor and a channel for each node. The numbers that seed the draws of a node's memories, the states of sensor
+    # and channel that are random over time, follow from names: nodes that share a memory draw it alike.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories_of = number_memory_seeds(
         {name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant
     )
-    groups = [[name for name in names if name in nodes] for names in network.groups]
-    # A group has the same structure in all its nodes: all of them have a sensor, or none has.
+    # A group has the same structure in all its nodes, so that they stack: all of them have a sensor, or none has.
     media: list[NodeGroup | NodesWithoutSensor] = []
-    for sensing, names in zip(groups, network.groups, strict=True):
-        of_group = {name: nodes[name] for name in sensing}
-        media.append(_stack_group(network, of_group, memories_of) if sensing else NodesWithoutSensor(len(names)))
+    for names in network.groups:
+        nodes_with_sensor = {name: nodes[name] for name in names if name in nodes}
+        if nodes_with_sensor:
+            media.append(_stack_group(network, nodes_with_sensor, memories_of))
+        else:
+            media.append(NodesWithoutSensor(len(names)))
     return SeparateChannels(tuple(media))
 
 

@@ -167,18 +167,26 @@ def move_modes(
 def deliver_signal(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
-    """Return a channel's next state, and what it delivers of y at step k; a late channel delivers past signals too.
+    """Draw a channel z = G y + n at step k: return its next state, and what it delivers of y.
 
-    `source`: the number that seeds its own draws. `shared`: the numbers that seed those of its memories. `matrix` in
-    the code is the drawn [G n; 0 1].
+    Args:
+        channel: a link, or one for each step.
+        state: of its memories (states that are random over time, such as fading); of a late link also past signals.
+        y: signal of this step.
+        key: of the run.
+        k: number of the step.
+        source: number that seeds the link's own draws.
+        shared: numbers that seed the draws of its memories, which other links may share.
     """
     link, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
-    if link.past:  # a late link carries y and the signals before it, the latest first
+    # `matrix` is the drawn [G n; 0 1].
+    if link.past:
+        # A late link has G for y and the signals before it, the latest first; `line` holds these signals.
         signals = jnp.concatenate([y, state.line])
-        after, matrix = _draw_link(link, state.channel, key, k, link_key, shared)
-        return LateChannelState(after, signals[: -len(y)]), apply(matrix, signals)
-    state, matrix = _draw_link(link, state, key, k, link_key, shared)
-    return state, apply(matrix, y)
+        memory, matrix = _draw_link(link, state.channel, key, k, link_key, shared)
+        return LateChannelState(memory, signals[: -len(y)]), apply(matrix, signals)
+    memory, matrix = _draw_link(link, state, key, k, link_key, shared)
+    return memory, apply(matrix, y)
 
 
 def _draw_link(

@@ -128,11 +128,16 @@ class SeparateChannels(AbstractMedium):
         """Return the links' states before the first step by group, (node, ...); () of nodes without a sensor."""
 
         def start_node(group: NodeGroup) -> LinkState:
-            """Return the initial state of one node's link: channel, sender's trigger, sensor's modes, and feedback."""
+            """Return the initial state of one node's link; `group` is the row of its group that is the node's.
+
+            The channel and the sensor begin in states that are drawn. A sender that decides when to transmit begins
+            with nothing sent. The estimate fed back to the sensor, or compared by the sender, is the filter's first.
+            """
             feed_back = None if group.reference_filter is None else _get_initial_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
             modes = start_modes(group.sensor, key, group.modes)
+            # `checksums` are of the nodes' names, one each: they seed a node's own draws.
             memory = start_channel(group.channel, key, group.checksums, group.memories)
             return LinkState(memory=memory, feed_back=feed_back, sender=sender, modes=modes)
 
@@ -182,7 +187,11 @@ class SeparateChannels(AbstractMedium):
         return tuple(feed_group(group, link) for group, link in zip(self.groups, state, strict=True))
 
     def reasons(self, state: PyTree) -> dict[str, jax.Array]:
-        """Return, by number of the group, why senders that decide transmitted at this step, (node, m)."""
+        """Return, by number of the group, why senders with a trigger transmitted at this step, (node, m).
+
+        A trigger decides whether a sender transmits, and stores the reason of its last decision (`sender.last`) for
+        each of the m components.
+        """
         links = ((g, link) for g, link in enumerate(state) if isinstance(link, LinkState))
         return {str(g): link.sender.last for g, link in links if link.sender is not None}
 

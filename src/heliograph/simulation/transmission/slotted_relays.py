@@ -56,26 +56,38 @@ class SlottedRelays(AbstractMedium):
     def receive(
         self, state: RelayStates, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[RelayStates, Measurements]:
-        """Send over the hops of this step's slot, and sum what comes at each listener.
+        """Send over the hops of this step's slot, and sum at each listener what arrives over its hops.
 
-        Arguments and results as of `AbstractMedium`.
+        Args:
+            state: the relays' estimates of the step before, and the states of hops with memory.
+            x: the plant's state after the step.
+            u: inputs of the plant over the step.
+            key: of the run.
+            k: number of the step.
+
+        Returns:
+            The next state, and for each group of listeners what they receive (listener, m).
         """
-        # Signals: of the sensor, and C s of each relay.
+        # The sensor (SENDER is its name) sends y = C x + v, as it reports it: perhaps rounded. Each relay sends C s of
+        # its estimate s.
         sensor = at(self.relays.sensor, k)
-        y = sensor.noise.report(sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR)))
+        v = sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR))
+        y = sensor.noise.report(sensor.measure(x) + v)
         signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
         sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
-        # Hops without memory by a branch of the program for the slot. Those with memory are drawn at every step, since
-        # their memories move on, and count in their own slot.
+        # Hops without memory are drawn only in their slot. Those with memory are drawn at every step, since their
+        # memories move on, but what they deliver counts only in their own slot.
         received = self._sum_without_memory(k, sent, key)
-        hops, slot = {}, k % len(self.relays.slots)
+        hop_states, slot = {}, k % len(self.relays.slots)
         for name, hop in find_hops_with_memory(self.relays).items():
-            hops[name], z = deliver_signal(
-                hop.channel, state.hops[name], sent[hop.sender], key, k, hop.source, self.memories[name]
+            hop_states[name], z = deliver_signal(
+                hop.channel, state.hops[name], sent[hop.sender], key, k, hop.source, shared=self.memories[name]
             )
             received[hop.listener] = received[hop.listener] + jnp.where(slot == hop.slot, z, 0.0)
-        order = [received[name] for name in self.relays.filters]
-        return RelayStates(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
+        # A group is a tuple of listeners' numbers, in the order of the network's listeners.
+        in_order = [received[name] for name in self.relays.filters]
+        received_by_group = tuple(jnp.stack([in_order[i] for i in group]) for group in self.groups)
+        return RelayStates(state.estimates, hop_states), received_by_group
 
     def feed_back(self, state: RelayStates, estimates: Sequence[Estimate]) -> RelayStates:
         """Return the state with the relays' estimates, to be sent at the next step."""
