@@ -16,8 +16,6 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
-    FreshNumbers,
-    FreshReading,
     PilotedHop,
     ToldGainHop,
     ToldMap,
@@ -28,6 +26,7 @@ from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 from heliograph.random_affine.series_and_stack import Stack
 
 M = TypeVar("M", bound=AbstractRandomAffine)
