@@ -1,12 +1,13 @@
 """Arrays of a call of native code: contiguous numbers of the code's types, and their addresses."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from straightline.llvm.memory_layout import LINE
+from straightline.machine_code import MachineCode
 from straightline.result_memory import align_to_cache_line
 
 
@@ -34,3 +35,20 @@ def list_addresses(arrays: Sequence[np.ndarray]) -> list[int]:
 def allocate_aligned(size: int) -> np.ndarray:
     """Return so many bytes of zero, at an address that is a multiple of a cache line."""
     return align_to_cache_line(np.zeros(size + LINE, np.uint8))
+
+
+class MemoryOfCall(NamedTuple):
+    """Code and all the memory of one call, held by each thread that computes a part of it.
+
+    Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
+    """
+
+    machine: MachineCode
+    pointers: np.ndarray
+    memory: Any
+    runs: int
+
+    def compute(self, begin: int, end: int, scratch: int) -> None:
+        """Compute blocks `begin` to `end` of runs in this thread, with `scratch` bytes of its own."""
+        memory = allocate_aligned(scratch)
+        self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)

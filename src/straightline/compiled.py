@@ -6,16 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cache
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
+from straightline.call_arrays import MemoryOfCall, allocate_aligned, convert_to_memory, list_addresses
 from straightline.constant_folding import DTYPES
 from straightline.llvm.module_text import ModuleText, write_module
-from straightline.machine_code import MachineCode, TieredCode, choose_hasty_width, emit_code, find_processor_features
+from straightline.machine_code import TieredCode, choose_hasty_width, emit_code, find_processor_features
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
 from straightline.result_memory import make_aligned_array
@@ -34,7 +34,10 @@ class CompiledFunction:
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
-        """Write the code as text of LLVM, which the first call compiles; the class says what the arguments are."""
+        """Write the program's code as text of LLVM, of which the first call makes machine code.
+
+        `differs`: of which arguments each run has its own. `width`: runs of a vector; None for what suits the program.
+        """
         self.differs = list(differs)
         self.types = [DTYPES[b.type] for b in program.inputs]
         self.shapes, self.tree = [b.shape for b in program.inputs], program.tree
@@ -43,7 +46,8 @@ class CompiledFunction:
         self.code: ModuleText = write_module(program, self.differs, width, fuse=fuses, alone=is_one_run)
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
-        # Code for blocks of runs, for what all runs share, and for one run alone, each in haste and with care.
+        # Code for blocks of runs, for what all runs share (if anything), and for one run alone. Pairs: runs of a vector
+        # in quickly made code and in optimised code.
         self.blocks = TieredCode(self.code.blocks, (width or choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
         self.single = TieredCode(self.code.blocks, (1, 1))
@@ -63,25 +67,25 @@ class CompiledFunction:
         return new
 
     def make_in_place_code(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlaceCode":
-        """Return the same code for so many runs at a time, with memory of its own: no call of it makes an array.
+        """Return the same code for so many runs, with arrays of its own for arguments and results, which a call fills.
 
         Args:
             runs: how many.
-            inputs: arrays that are read in place, by the numbers of the arguments that calls do not leave out; others
-                are made.
+            inputs: arrays that stand for some argument arrays, by the argument's number; 0 is the first after the bound
+                ones.
         """
         return InPlaceCode(self, runs, inputs)
 
     def generate_code(self, arrays: Sequence[Any] = ()) -> str:
         """Generate machine code for a first call of these arrays; return why LLVM makes none, "" if it makes code."""
-        if self._refusal is None:  # the answer is kept: a later call generates nothing
+        if self._refusal is None:  # not tried yet
             runs = self._count_runs(arrays)
             try:
-                if self.once is not None:  # the code of what all runs share
+                if self.once is not None:  # computes what all runs share
                     self.once.generate_code(blocks=1)
                 if not all(self.code.common):  # some results differ between runs
-                    tiers, width = self._choose_code_and_width(runs)
-                    tiers.generate_code(blocks=divide_rounded_up(runs, width))
+                    code_of_runs, width = self._choose_code_and_width(runs)
+                    code_of_runs.generate_code(blocks=divide_rounded_up(runs, width))
                 self._refusal = ""
             except Unsupported as error:
                 self._refusal = str(error)
@@ -135,8 +139,8 @@ class CompiledFunction:
         if all(code.common):
             return jax.tree.unflatten(self.tree, outputs)
         # What differs between runs, block by block: each call computes its own rows of the outputs.
-        tiers, width = self._choose_code_and_width(sum(counts))
-        machine, begin = tiers.choose_machine(divide_rounded_up(sum(counts), width)), 0
+        code_of_runs, width = self._choose_code_and_width(sum(counts))
+        machine, begin = code_of_runs.choose_machine(divide_rounded_up(sum(counts), width)), 0
         for call_arrays, count in zip(arrays, counts, strict=True):
             rows = [x[begin : begin + count] for x in outputs]
             pointers, memory = self._list_addresses(call_arrays, rows, shared), (call_arrays, code.tables, rows, shared)
@@ -166,7 +170,7 @@ class CompiledFunction:
         own = list_addresses(arrays[len(self._first) :])
         return np.array([*self._addresses, *own, *self._tables, *list_addresses([*outputs, shared])], dtype=np.uint64)
 
-    def _compute_blocks(self, call: "MemoryOfCall", cores: int | None) -> None:
+    def _compute_blocks(self, call: MemoryOfCall, cores: int | None) -> None:
         """Compute all blocks (runs of one vector) of a call: in this thread if that is little work, else in several."""
         blocks, scratch = divide_rounded_up(call.runs, call.machine.width), self.code.scratch
         # Blocks that a thread computes at a time: an even share, but no less than is worth a thread.
@@ -184,23 +188,6 @@ class CompiledFunction:
             if is_common:
                 size = buffer.size * array.itemsize
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
-
-
-class MemoryOfCall(NamedTuple):
-    """Code and all the memory of one call, held by each thread that computes a part of it.
-
-    Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
-    """
-
-    machine: MachineCode
-    pointers: np.ndarray
-    memory: Any
-    runs: int
-
-    def compute(self, begin: int, end: int, scratch: int) -> None:
-        """Compute blocks `begin` to `end` of runs in this thread, with `scratch` bytes of its own."""
-        memory = allocate_aligned(scratch)
-        self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)
 
 
 class InPlaceCode:
@@ -221,10 +208,10 @@ class InPlaceCode:
         self._pointers = np.array(list_addresses(self._memory), dtype=np.uint64)
         self._scratch, self._is_common = allocate_aligned(code.scratch), all(code.common)
         self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
-        # The code for so many runs, and whether a call is so little work that threads would cost more.
-        self._tiers, width = compiled._choose_code_and_width(runs)
+        # The code for so many runs, and whether a call is so little work that threads would cost more than they save.
+        self._code_of_runs, width = compiled._choose_code_and_width(runs)
         self._blocks = divide_rounded_up(runs, width)
-        self._is_little = runs == 1 or self._blocks * code.blocks.work < LITTLE
+        self._needs_one_thread = runs == 1 or self._blocks * code.blocks.work < LITTLE
         # What all runs share is computed now, unless an argument of the calls decides it.
         self._shared_varies = compiled.once is not None and not all(differs)
         if compiled.once is not None and not self._shared_varies:
@@ -249,14 +236,18 @@ class InPlaceCode:
         return inputs
 
     def __call__(self) -> None:
-        """Compute `outputs` from `inputs`: first what all runs share, if it may have changed, and then the runs."""
+        """Compute `outputs` from `inputs`: first what all runs share, if it may have changed, and then the runs.
+
+        A block is as many runs as a vector of the machine code has. Many blocks are computed in several threads.
+        """
         if self._shared_varies and self._compiled.once is not None:
             self._compute_shared(self._compiled.once)
         if self._is_common:  # all runs share all results
             return
-        machine = self._tiers.choose_machine(self._blocks)
-        if self._is_little:
-            machine.run(*self._addresses, 0, divide_rounded_up(self.runs, machine.width), self.runs)
+        machine = self._code_of_runs.choose_machine(self._blocks)
+        if self._needs_one_thread:
+            blocks = divide_rounded_up(self.runs, machine.width)
+            machine.run(*self._addresses, 0, blocks, self.runs)
         else:
             call = MemoryOfCall(machine=machine, pointers=self._pointers, memory=self._memory, runs=self.runs)
             self._compiled._compute_blocks(call, cores=None)
@@ -274,7 +265,10 @@ class SingleRunCode:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
-        """Write and compile the code of one run, and allocate its memory; the class says what `in_place` is."""
+        """Write and compile the code of one run, and allocate its arrays of arguments and results.
+
+        `in_place`: numbers of results that are written, after all others, to arrays of arguments; and of the latter.
+        """
         all_differ, (*_, fuses) = [True] * len(program.inputs), find_processor_features()
         self.code = write_module(program, differing=all_differ, width=1, fuse=fuses, alone=True, last=in_place)
         level = int(self.code.operations <= ALONE)  # LLVM's: 1, but 0 for a program that would take long to compile

@@ -14,7 +14,7 @@ from straightline.size_limits import LONGEST
 
 
 class Graph:
-    """A program under construction: blocks of nodes (operations), of which one block is open, to which nodes are added.
+    """A program under construction: blocks of nodes (operations); new nodes are added to the block that is open.
 
     By default it may have twice as many nodes as the longest program: folding makes some that the result does not need.
     """
@@ -77,21 +77,24 @@ class Graph:
             self.max_nodes, self.current = before, block
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Return the node of buffer[offset + sum strides * indices].
+        """Return the node of the number buffer[offset + sum strides * indices].
 
-        It lies in no block outside the one that fills the buffer (`buffer.block`). `buffer.first` says of each place
-        in a row which earlier place surely holds the same number; it is empty if nothing is known.
+        The load must not be moved out of the block that fills the buffer (`buffer.block`), where the memory is not
+        filled yet. A buffer may consist of rows in which some entries are always equal, as in symmetric matrices: then
+        buffer.first[i] is the first entry of a row that equals entry i. It is empty if no entries are known to be
+        equal.
         """
         # Indices that are known become part of the offset; `varying` are the strides and indices of all others.
         varying = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
         if buffer.table is not None and not varying:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
-        # If the other indices only choose a row, it is known which place of the row is loaded. Load instead the first
-        # place that holds the same number.
+        # If the other indices only choose a row, it is known which entry of the row is loaded. Load instead the first
+        # entry that is equal, so that equal loads are one node.
         row_length = len(buffer.first)
         if row_length and all(s % row_length == 0 for s, _ in varying):
-            offset += buffer.first[offset % row_length] - offset % row_length
+            entry = offset % row_length
+            offset += buffer.first[entry] - entry
         indices = tuple(i for _, i in varying)
         value = (buffer, offset, tuple(s for s, _ in varying))
         return self._find_or_make("load", buffer.type, indices, value, buffer.block.depth)
@@ -103,21 +106,22 @@ class Graph:
         self.current.items.append(statement)
 
     def _find_or_make(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
-        """Return the equal node of an open block, or make one: in the outermost block that may have it.
+        """Return an equal node of the open block or of a block around it; if there is none, make one.
 
-        That block has all arguments in it or around it, and is at least `depth` blocks deep; a pinned block keeps what
-        is made within it.
+        A new node is put in the outermost block in which it can be computed, so that a loop does not compute anew what
+        it does not change. All its arguments must be in that block or around it, and the block must be at least `depth`
+        blocks deep. A pinned block, the body of a guard, is computed only where a run needs it: a node that is made
+        within it is not moved out of it.
         """
         key, block = (op, type, args, value), self.current
         while (equal := block.seen.get(key)) is None and block.parent is not None:
             block = block.parent
         if equal is not None:
             return equal
-        # Outwards from the open block, as far as the arguments allow, and a block that is pinned.
         block = self.current
         if block.parent is not None:
-            depth = max(depth, *[a.block.depth for a in args], 0)
-            while block.depth > depth and not block.pinned and block.parent is not None:
+            least_depth = max(depth, *[a.block.depth for a in args], 0)
+            while block.depth > least_depth and not block.pinned and block.parent is not None:
                 block = block.parent
         made = block.seen[key] = self.make_fresh_node(op, type, args, block, value)
         block.items.append(made)

@@ -1,4 +1,4 @@
-"""Machine code from text of LLVM IR: generated in haste first, and again with care once it is executed often."""
+"""Machine code from text of LLVM IR: quickly made code first (LLVM's level 0), optimised code (level 1) if it pays."""
 
 import ctypes
 from collections.abc import Callable
@@ -46,14 +46,14 @@ class MachineCode:
     """Machine code of one text of LLVM IR; its function `run` may be called as long as this object exists.
 
     LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
-    `level` is that of the generation: 0 in haste, 1 with registers assigned with care; `width` is the count of runs of
-    a vector. Results have the same bits whatever both are.
+    `level` is that of the generation: 0 for code that is quickly made, 1 for optimised code, whose registers are better
+    assigned. `width` is the number of runs of a vector. Results have the same bits whatever both are.
     """
 
     def __init__(self, source: FunctionSource, level: int, width: int):
         """Generate machine code from a function's LLVM text, for vectors of `width` runs.
 
-        `level` is LLVM's level of optimisation: 0 in haste, 1 with care.
+        `level` is LLVM's level of optimisation: 0 for code that is quickly made, 1 for optimised code.
         """
         self.level, self.width = level, width
         cpu, flags, *_ = find_processor_features()
@@ -70,28 +70,32 @@ class MachineCode:
 
 
 def choose_hasty_width(width: int) -> int:
-    """Return the runs of one register where `width` are those of one of the widest: for code in haste, sooner made so.
+    """Return how many runs a vector has in quickly made code (LLVM's level 0): as many as fit one register here.
 
-    LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
+    `width` runs fit one register of AVX-512, and half of them one of other processors. LLVM can split a longer vector,
+    but then takes three times as long to make code of selections and comparisons. Optimised code uses `width` anyhow.
     """
     return width if "+avx512f" in find_processor_features()[1].split(",") else width // 2
 
 
 @cache
 def get_careful_thread() -> ThreadPoolExecutor:
-    """Return the thread that generates code with care while that in haste is executed."""
+    """Return the one thread that generates optimised code, while calls execute the code that was quickly made.
+
+    All programs share it, so that optimised code is generated for one program after another.
+    """
     return ThreadPoolExecutor(1)
 
 
 @cache
-def _get_hasty_thread() -> ThreadPoolExecutor:
+def _get_waiting_thread() -> ThreadPoolExecutor:
     """Return the thread that generates code for which the main thread waits."""
     return ThreadPoolExecutor(1)
 
 
 @turn_failures_into_refusals("a program")
 def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
-    """Return machine code for vectors of `width` runs, made at LLVM's `level`: 0 in haste, 1 with care.
+    """Return machine code for vectors of `width` runs, made at LLVM's `level`: 0 quickly made, 1 optimised.
 
     The code is never generated in the main thread. There Python may raise a signal's exception between any two
     operations. An LLVM object that is just changing its owner would then be freed twice.
@@ -101,13 +105,13 @@ def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
     """
     if current_thread() is not main_thread():
         return MachineCode(source, level, width)
-    return _get_hasty_thread().submit(MachineCode, source, level, width).result()
+    return _get_waiting_thread().submit(MachineCode, source, level, width).result()
 
 
-def _generate_with_care(source: FunctionSource, width: int, hasty: MachineCode) -> MachineCode:
-    """Return code generated with care (LLVM's level 1, optimised); if this fails, warn once and return `hasty`.
+def _generate_optimised(source: FunctionSource, width: int, quick: MachineCode) -> MachineCode:
+    """Return optimised code (LLVM's level 1) of a source; if this fails, warn once and return `quick`.
 
-    `hasty` is the code that was generated in haste (level 0).
+    `quick` is the code of this source that was quickly made (level 0).
     """
     try:
         return MachineCode(source, 1, width)
@@ -115,25 +119,25 @@ def _generate_with_care(source: FunctionSource, width: int, hasty: MachineCode) 
         warn_once(
             f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on"
         )
-        return hasty
+        return quick
 
 
 class TieredCode:
-    """Code of one text, generated again with care when its executions have cost as much as that.
+    """Machine code of one source: quickly made code first, and optimised code once it is executed often enough.
 
-    A call that executes a program `often` waits for care; any other goes on in haste until care is done in the
-    background. Both have the same results, bit for bit, so that nothing but time depends on earlier calls. `widths` are
-    the runs of a vector in haste and with care.
+    A call that executes the program at least OFTEN times waits for the optimised code. Any other call executes the
+    quickly made code until the optimised code is done in the background. Both have the same results, bit for bit, so
+    that nothing but time depends on earlier calls.
     """
 
     def __init__(self, source: FunctionSource, widths: tuple[int, int]):
         """Begin without machine code.
 
-        `widths`: how many runs a vector has in code made in haste, and in code made with care.
+        `widths`: how many runs a vector has in quickly made code, and in optimised code.
         """
         self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
         self._machine: MachineCode | None = None
-        self._careful: Future[MachineCode] | None = None
+        self._optimised: Future[MachineCode] | None = None
 
     def generate_code(self, blocks: float) -> None:
         """Generate code for a first execution for so many blocks, if there is none."""
@@ -141,28 +145,33 @@ class TieredCode:
             self._make_first(self._executions + self._count_executions(blocks))
 
     def choose_machine(self, blocks: float) -> MachineCode:
-        """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
-        made = self._machine
-        if made is not None and made.level:  # nothing better is to come
-            return made
+        """Return the code that a call is to execute for so many blocks, and count these executions.
+
+        A block is as many runs as a vector of optimised code has. The caller holds the code while it runs, since this
+        object may replace it.
+        """
+        machine = self._machine
+        if machine is not None and machine.level:  # optimised already
+            return machine
         with self._lock:
             executions = self._count_executions(blocks)
             self._executions += executions
             machine = self._make_first(self._executions)
-            # In haste so far, but care pays by now. (The level is asked for last: JAX takes 30 us to say its setting.)
+            # `_choose_level` comes last, since JAX takes 30 us to say its setting.
             if not machine.level and self._choose_level(self._executions):
-                self._careful = self._careful or get_careful_thread().submit(
-                    _generate_with_care, self._source, self._widths[1], machine
+                width = self._widths[1]  # of optimised code
+                self._optimised = self._optimised or get_careful_thread().submit(
+                    _generate_optimised, self._source, width, machine
                 )
-                # A call that is long enough waits for it; others go on in haste until it is done.
-                if executions >= OFTEN or self._careful.done():
-                    self._machine = machine = self._careful.result()
+                # A long call waits for the optimised code. Others do not.
+                if executions >= OFTEN or self._optimised.done():
+                    self._machine = machine = self._optimised.result()
             return machine
 
     def _make_first(self, executions: float) -> MachineCode:
         """Return the first machine code, and make it if this is the first call.
 
-        `executions`, how often the code will run, decides whether it is made in haste (level 0) or with care (1).
+        `executions`, how often the code will run, decides whether it is quickly made (level 0) or optimised (1).
         """
         if self._machine is None:
             level = self._choose_level(executions)
@@ -170,10 +179,10 @@ class TieredCode:
         return self._machine
 
     def _count_executions(self, blocks: float) -> float:
-        """Return the executions of each operation, on average, for so many blocks."""
+        """Return how often each operation is executed, on average, for so many blocks; in a loop once an iteration."""
         return blocks * self._source.work / max(self._source.operations, 1)
 
     def _choose_level(self, executions: float) -> int:
-        """Return 1, with care, if that pays for so many executions and JAX's setting allows it, else 0, in haste."""
+        """Return LLVM's level: 1 (optimised) if it pays for so many executions and JAX's setting allows it, else 0."""
         pays = executions >= OFTEN
         return int(pays and not jax.config.values["jax_disable_most_optimizations"])

@@ -159,21 +159,27 @@ def _list_needs(node: Any) -> list[Any]:
 
 
 def _list_dependencies(node: Any) -> list[Any]:
-    """Return what a node, store, guard or loop needs before it can be computed."""
+    """Return what a node, store, guard or loop needs before it can be computed.
+
+    A "parameter" is a number that a loop carries, as its body reads it, and a "result" the same after the loop. A
+    "counter" is the number of a loop's iteration, and "guarded" a number that a guarded block computes. Of these, and
+    of a load, the attribute `value` says to which statement or buffer they belong.
+    """
     if isinstance(node, Store):
         return [node.node, *node.indices]
     if isinstance(node, Guard):
         return [node.condition]
     if isinstance(node, Loop):
         return [] if node.condition is None else [node.condition]
-    # Nodes: a load needs its buffer, a result of a loop the loop and the carry.
     if node.op == "load":
-        return [*node.args, node.value[0]]
+        buffer, _offset, _strides = node.value
+        return [*node.args, buffer]
     if node.op in ("parameter", "result"):
         loop, index = node.value
         return [loop, loop.initial[index], loop.following[index]]
     if node.op == "counter":
-        return [node.value]
+        loop = node.value
+        return [loop]
     if node.op == "guarded":
         guard, index = node.value
         return [guard, guard.values[index]]
@@ -194,17 +200,18 @@ def find_fused_product(node: Node, products: set[Node]) -> Node | None:
 def find_fusable_products(items: Iterable[Any]) -> set[Node]:
     """Return the products that are fused with the one sum or difference that uses them: a b + c, rounded once.
 
-    The attribute `value` of such a product, which no product needs otherwise, becomes that sum. A sum takes one
-    product: of two the later one.
+    A product is fused if nothing else uses it and both are in one block. Of two products in a sum only the later one
+    is. Each fused product's attribute `value`, otherwise not used for products, is set to its sum: so the writer of
+    the sum finds it.
     """
-    users: dict[Node, Any] = {}  # of each product the item that uses it; None of products that are used twice
+    users: dict[Node, Any] = {}  # for each product the one item that uses it, or None if several do
     for item in items:
         for used in list_used_nodes(item):
             if used.op == "mul" and used.type in REAL:
                 users[used] = None if used in users else item
     fused: set[Node] = set()
     sums_with_product: set[Node] = set()
-    for product in sorted(users, key=lambda n: -n.serial):  # the later one, which a sum takes, comes first
+    for product in sorted(users, key=lambda n: -n.serial):  # later products first
         user = users[product]
         is_sum = isinstance(user, Node) and user.op in ("add", "sub")
         if is_sum and user.block is product.block and user not in sums_with_product:
@@ -286,46 +293,53 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
 
 
 def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return which of the sorted `items` differ between runs: those that vary with `inputs`, and some memory.
+    """Return which of the sorted `items` have a number for each run: those that vary with `inputs`, and some memory.
 
-    What runs share is computed once, before all runs. Of an array that a loop carries in memory, only the last turn's
-    numbers are then left. If runs need the numbers of every turn, the array counts as differing: each run has its own.
+    All other items are computed once, before the runs. A loop overwrites an array that it carries in memory ("carried")
+    in each iteration, so that only the last iteration's numbers would be left when the runs are computed. If the runs'
+    own code reads the array within the loop, it needs those of every iteration. Then each run gets its own array.
     """
     differing = find_varying_items(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
-    # Add carried memory that runs read within the loop, and what follows from it, until there is no more.
-    while read_in_turns := (
-        carried and _find_memory_read_in_parts(find_crossing_items(items, differing)) & carried - differing
-    ):
-        differing = find_varying_items(items, [*inputs, *read_in_turns, *(carried & differing)])
+    # An array that gets a copy for each run makes more items differ, which may read more carried arrays.
+    while carried:
+        read_in_loops = _find_memory_read_in_parts(find_crossing_items(items, differing))
+        newly_differing = read_in_loops & carried - differing
+        if not newly_differing:
+            break
+        differing = find_varying_items(items, [*inputs, *newly_differing, *(carried & differing)])
     return differing
 
 
 def _find_memory_read_in_parts(items: Iterable[Any]) -> set[Buffer]:
-    """Return the buffers that items read by parts which a loop's turn fills.
+    """Return the whole buffers of which `items` load from a part that is filled in another block than the whole.
 
-    Such a part is filled in another block than the buffer that it lies in. That buffer is returned.
+    An array that a loop carries in memory is such a buffer: each iteration of the loop's body fills a part anew.
     """
-    used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_list_dependencies(x)) if isinstance(n, Node))
-    parts = {n.value[0] for n in used if n.op == "load"}
-    return {part.owner[0] for part in parts if part.block is not part.owner[0].block}
+    users = [x for x in items if not isinstance(x, Buffer)]
+    nodes = (node for x in users for node in (x, *_list_dependencies(x)) if isinstance(node, Node))
+    loaded_buffers = {node.value[0] for node in nodes if node.op == "load"}
+    return {buffer.owner[0] for buffer in loaded_buffers if buffer.block is not buffer.owner[0].block}
 
 
-def find_crossing_items(items: Iterable[Any], spread: set[Any]) -> set[Any]:
-    """Return which items the function of blocks, which computes what differs between runs, has to write.
+def find_crossing_items(items: Iterable[Any], differing: set[Any]) -> set[Any]:
+    """Return the items of the code that computes what differs between runs, for a block of runs at once.
 
-    They are the items in `spread` (those that differ), the stores into their memory, and the loops and guards around
-    them.
+    They are the items that differ (`differing`), the stores into memory that differs, and the loops and guards in which
+    these stand: a loop is also executed there if only a part of its body differs.
     """
-    written = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
-    to_visit = list(written)
+    found = {x for x in items if x in differing or (isinstance(x, Store) and x.buffer.owner[0] in differing)}
+    to_visit = list(found)
     while to_visit:
         item = to_visit.pop()
-        around = [] if isinstance(item, Buffer) else [item.block.owner]
-        around += [item.value[0]] if isinstance(item, Node) and item.op in ("parameter", "result", "guarded") else []
-        to_visit += [statement for statement in around if statement is not None and statement not in written]
-        written.update(around)
-    return written - {None}
+        # The loop or guard around the item, and the one whose carried or guarded number it is.
+        statements = [] if isinstance(item, Buffer) else [item.block.owner]
+        if isinstance(item, Node) and item.op in ("parameter", "result", "guarded"):
+            loop_or_guard, _index = item.value
+            statements.append(loop_or_guard)
+        to_visit += [statement for statement in statements if statement is not None and statement not in found]
+        found.update(statements)
+    return found - {None}
 
 
 def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:

@@ -1,12 +1,15 @@
 """Values of a loop that repeat bit for bit with a period: computed once, then read from a ring of stored rows.
 
 The covariance of a Kalman filter converges until it stands still, or goes round among a few roundings, and with it
-gains, variances and logarithms; from then on means are all that a turn has to compute, a tenth of it. Of a loop's body
-let S be the numbers that follow from carried numbers C, from tests of a turn's rows (did it arrive?) and from what the
-loop does not change, where C is the largest set of carried numbers whose next values are in S. S becomes a guarded
-block; what other numbers need of it goes to a row of a ring, and so do the tests. If after rows 0 ... p - 1 of the ring
-C has the bits that it had before row 0, these rows are those of all further turns, in turn, as long as the tests are
-theirs: S is not computed. Where these are other ones, and where the ring is full, row 0 is next.
+gains, variances and logarithms; from then on means are all that an iteration has to compute, a tenth of it.
+
+Let S be the set of numbers of a loop's body that follow from a set C of carried numbers, from tests of the data of the
+iteration (did a measurement arrive?), and from what the loop does not change. C is the largest set of carried numbers
+whose next values are in S. S is moved to a guarded block, which an iteration skips if it knows the numbers already. The
+numbers of S that others need, and the outcomes of the tests, are stored as a row of a ring of RING rows. If after rows
+0 ... p - 1 the numbers C have the bits that they had before row 0, a cycle of period p is found: as long as the tests
+have the outcomes of the cycle's next row, that row has the numbers of the iteration. If they have not, or if the ring
+is full without a cycle, S is computed again and stored from row 0 on. "Turn" stands for iteration in names.
 
 All results have the bits that they had. A turn of a filter of four states and two outputs, 1,400 operations, takes 120
 ns in a program of one run, 22 in a cycle, and a tenth more than 120 where one is sought in vain. Of 35 filters of
@@ -30,16 +33,17 @@ INTEGERS: dict[Type, Type] = {"f64": "i64", "f32": "i32"}  # that have the bits 
 
 
 class RecurringNodes(NamedTuple):
-    """Numbers of a loop's body whose values may repeat from turn to turn: S and C of this file's beginning.
+    """Numbers of a loop's body whose values may repeat, iteration by iteration.
 
-    nodes: S, in order; carried: C, by number; tests: of a turn's rows, of which S needs the outcome; rows: what these
-    are computed of, in order, and they themselves.
+    nodes: the set S of numbers that may repeat, in order. carried: the set C of carried numbers from which S follows,
+    by number in the carry. tests: flags of the iteration's data on which S depends, such as whether a measurement
+    arrived. test_nodes: all nodes that compute the tests, in order, and the tests.
     """
 
     nodes: dict[Node, None]
     carried: list[int]
     tests: list[Node]
-    rows: dict[Node, None]
+    test_nodes: dict[Node, None]
 
 
 def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
@@ -50,28 +54,28 @@ def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any,
     """
     items = list_needed_items(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
-        found = _find_recurring(loop, items)
-        if found is None:
+        recurring = _find_recurring(loop, items)
+        if recurring is None:
             continue
-        kept = _list_needed_elsewhere(items, found)
-        if len(found.nodes) > DEAR + len(kept):
-            _rewrite_loop(graph, items, loop, found, kept)
+        stored = _list_needed_elsewhere(items, recurring)
+        if len(recurring.nodes) > DEAR + len(stored):
+            _rewrite_loop(graph, items, loop, recurring, stored)
             items = list_needed_items(outputs)
     return items
 
 
 def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | None:
-    """Return S and C of a loop's body, and the tests of rows that S needs; None where S is no more than DEAR nodes.
+    """Return the numbers S of a loop's body that may repeat, with C and the tests on which they depend.
 
-    S, C, tests and rows are those of this file's beginning. Sets of nodes are the keys of a dict, which keeps an order.
-
-    `needed`: items that the outputs need, gone through for a large S only: some programs have hundreds of small loops.
+    C is the largest set of carried numbers such that S, all that follows from C, from tests of the iteration's data and
+    from what the loop does not change, has the next values of C. Return None if S has no more than DEAR nodes. Sets of
+    nodes are the keys of a dict, which keeps an order. `needed` are the items that the outputs need.
     """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]
-    of_rows = _find_nodes_of_rows(loop, nodes)
-    # Tests: flags of rows that are computed of numbers, rather than of other flags.
-    tests = {n for n in of_rows if n.type == "bool" and all(a.type != "bool" for a in n.args)}
+    data_nodes = _find_nodes_of_data(loop, nodes)
+    # Tests: flags that are computed from numbers of the data, rather than from other flags.
+    tests = {n for n in data_nodes if n.type == "bool" and all(a.type != "bool" for a in n.args)}
     # The largest set C: begin with all carried numbers, and drop those whose next value does not follow from C.
     carried = [k for k, parameter in enumerate(loop.parameters) if parameter in needed]
     operations = [(n, _list_nodes_of_body(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
@@ -87,14 +91,14 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | Non
         carried = still_carried
     if not carried or len(computed) <= DEAR:
         return None
-    _leave_fused_products_in_turn(needed, computed)
-    # Only the tests that S or C's next values use; what these are computed of is no part of S, even where it follows
-    # from other tests, since the tests are computed in each turn.
+    _remove_products_fused_outside(computed, needed)
+    # Only the tests that S or C's next values use. The nodes that compute them are not in S, even if they follow from
+    # other tests, since the tests are computed in each iteration.
     used = {a for n in computed for a in n.args} | {loop.following[k] for k in carried}
-    used_tests = [n for n in of_rows if n in tests and n in used]
-    sources = _list_sources(of_rows, used_tests)
-    recurring = {n: None for n in computed if n not in sources}
-    return RecurringNodes(nodes=recurring, carried=carried, tests=used_tests, rows=sources)
+    used_tests = [n for n in data_nodes if n in tests and n in used]
+    test_nodes = _list_sources(data_nodes, used_tests)
+    recurring = {n: None for n in computed if n not in test_nodes}
+    return RecurringNodes(nodes=recurring, carried=carried, tests=used_tests, test_nodes=test_nodes)
 
 
 def _list_nodes_of_body(nodes: Sequence[Node], body: Block) -> list[Node]:
@@ -102,59 +106,67 @@ def _list_nodes_of_body(nodes: Sequence[Node], body: Block) -> list[Node]:
     return [n for n in nodes if n.block is body]
 
 
-def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
-    """Return the numbers of a loop's body that follow only from the turn's number and from memory filled before.
+def _find_nodes_of_data(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
+    """Return the numbers of a loop's body that follow from the data of the iteration alone, and from no carried number.
 
-    They are computed from the rows that a turn reads, and from no carried number. `nodes` are the body's, in order.
+    The data are memory that was filled before the loop, such as the rows of an array of which an iteration reads one,
+    and the number of the iteration, `loop.counter`. `nodes` are the body's, in order.
     """
-    results, known = dict[Node, None](), {loop.counter}
+    data_nodes, known = dict[Node, None](), {loop.counter}
     for node in nodes:
-        is_load = node.op == "load"
-        reads_older_memory = not is_load or (
-            node.value[0].owner[0].kind != "carried" and node.value[0].block is not loop.body
-        )
-        refers_to_loop = not is_load and node.op in REFERRING  # a number that a loop or a guard carries
-        follows = known.issuperset(_list_nodes_of_body(node.args, loop.body))
-        if reads_older_memory and not refers_to_loop and follows:
+        if node.op == "load":
+            buffer = node.value[0]
+            # Memory that the loop carries, or that its body fills, is no data.
+            is_allowed = buffer.owner[0].kind != "carried" and buffer.block is not loop.body
+        else:
+            is_allowed = node.op not in REFERRING  # a carried number of a loop, or a result of a loop or guard
+        if is_allowed and known.issuperset(_list_nodes_of_body(node.args, loop.body)):
             known.add(node)
-            results[node] = None
-    return results
+            data_nodes[node] = None
+    return data_nodes
 
 
-def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, None]:
-    """Return those of the nodes `rows` that the tests are computed from, and the tests themselves, in order."""
+def _list_sources(nodes: Iterable[Node], tests: Iterable[Node]) -> dict[Node, None]:
+    """Return those of the `nodes` from which the tests are computed, and the tests themselves, in order."""
     wanted = set(tests)
     # Go backward, since a node comes after its arguments.
-    for n in reversed(list(rows)):
+    for n in reversed(list(nodes)):
         if n in wanted:
             wanted.update(n.args)
-    return {n: None for n in rows if n in wanted}
+    return {n: None for n in nodes if n in wanted}
 
 
-def _leave_fused_products_in_turn(needed: Iterable[Any], found: dict[Node, None]) -> None:
-    """Remove from `found` the products that will be fused with a sum that is not in `found`.
+def _remove_products_fused_outside(recurring: dict[Node, None], needed: Iterable[Any]) -> None:
+    """Remove from `recurring` the products that will be fused with a sum that is not in `recurring`.
 
-    A fused product and sum are rounded once. A product that is stored apart would be rounded itself, which changes
-    the bits of the result.
+    A fused product and sum, a b + c, are rounded once. If the product were stored for later iterations, it would be
+    rounded itself, which changes the bits of the sum. So such a product is computed in each iteration. `needed` are all
+    items that the outputs need, among which the one sum is that uses the product.
     """
     users: defaultdict[Node, list[Any]] = defaultdict(list)
     for item in needed:
         for node in list_used_nodes(item):
             users[node].append(item)
-    for product in [n for n in found if n.op == "mul" and n.type in REAL and len(users[n]) == 1]:
+    for product in [n for n in recurring if n.op == "mul" and n.type in REAL and len(users[n]) == 1]:
         user = users[product][0]
-        if isinstance(user, Node) and user.op in ("add", "sub") and user not in found:
-            del found[product]
+        if isinstance(user, Node) and user.op in ("add", "sub") and user not in recurring:
+            del recurring[product]
 
 
-def _list_needed_elsewhere(items: Iterable[Any], found: RecurringNodes) -> list[Node]:
-    """Return the numbers of S that something else needs, in order."""
-    used = {a for x in items if x not in found.nodes for a in list_used_nodes(x)}
-    return [n for n in found.nodes if n in used]
+def _list_needed_elsewhere(items: Iterable[Any], recurring: RecurringNodes) -> list[Node]:
+    """Return the recurring numbers that an item outside of them uses, in order: they must be stored.
+
+    `items` are all that the outputs need.
+    """
+    used = {a for x in items if x not in recurring.nodes for a in list_used_nodes(x)}
+    return [n for n in recurring.nodes if n in used]
 
 
 class RingBuffer:
-    """Memory for rows of some numbers of these types, one buffer for each type; filled in the turns of a loop."""
+    """Memory of some rows of numbers, filled in the iterations of a loop; a row has one number of each given type.
+
+    There is one buffer for each type. The loop fills row after row and, behind the last row, row 0 again.
+    """
 
     def __init__(self, graph: Graph, types: Sequence[Type], loop: Loop, rows: int = RING):
         """Allocate memory, in the block around a loop, for the newest `rows` rows of numbers.
@@ -178,49 +190,53 @@ class RingBuffer:
 
 
 class RingTurn(NamedTuple):
-    """The turn's row of the ring; whether the turn computes S for it, seeking a cycle, and whether one begins there."""
+    """What an iteration does with the ring of stored rows.
 
-    now: Node
-    seeks: Node
-    begins: Node
+    row: the row that it fills or reads. computes: whether it computes the recurring numbers and fills the row, since no
+    stored row is known to have them. restarts: whether it would fill row 0, from which a cycle is then sought.
+    """
+
+    row: Node
+    computes: Node
+    restarts: Node
 
 
-def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: RecurringNodes, kept: Sequence[Node]) -> None:
-    """Rewrite a loop so that S is computed only in turns that seek a cycle; all other turns read it from a ring.
+def _rewrite_loop(
+    graph: Graph, items: Iterable[Any], loop: Loop, recurring: RecurringNodes, stored: Sequence[Node]
+) -> None:
+    """Rewrite a loop so that an iteration computes the recurring numbers only if no stored row is known to have them.
 
-    S are the numbers that may come back, C the carried ones that they follow from (this file's beginning). The ring is
-    memory of RING rows, each with the numbers of one turn. The body becomes: the tests of rows; the choice of the
-    turn's row of the ring; a guarded block with S, which stores that row; the rest, which loads from it. The loop
-    carries in addition the last turn's row of the ring, and the period of the cycle, 0 where none is known.
+    The body becomes: the tests of the data; the choice of the iteration's row of the ring, a memory of RING rows; a
+    guarded block that computes the recurring numbers and stores them in that row; and the rest, which loads them from
+    it. The loop carries in addition the row of the last iteration, and the period of the cycle, 0 if none is known.
 
     Args:
         graph: the program.
         items: all that its outputs need.
         loop: the loop.
-        found: S, C and the tests.
-        kept: the numbers of S that something outside of S needs.
+        recurring: the recurring numbers, the carried numbers from which they follow, and the tests.
+        stored: the recurring numbers that the rest of the program needs.
     """
     body, enclosing = loop.body, graph.current
     # Nodes made here are not the program's own, and do not count: at most some for each number that a ring has.
-    graph.max_nodes += 8 * (len(found.nodes) + len(found.tests))
+    graph.max_nodes += 8 * (len(recurring.nodes) + len(recurring.tests))
     # The body begins anew with the tests alone; `rest` is put at its end.
-    rest = [x for x in body.items if x not in found.nodes and x not in found.rows]
-    body.items, body.seen, graph.current = [*found.rows], {}, body
-    test_ring, value_ring = (RingBuffer(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
-    # Before the first turn it is as if the ring were full, so that row 0 is next.
+    rest = [x for x in body.items if x not in recurring.nodes and x not in recurring.test_nodes]
+    body.items, body.seen, graph.current = [*recurring.test_nodes], {}, body
+    test_ring, value_ring = (RingBuffer(graph, [n.type for n in nodes], loop) for nodes in (recurring.tests, stored))
+    # Before the first iteration it is as if the ring were full, so that row 0 is next.
     last_row, period = _carry_integer(graph, loop, RING - 1), _carry_integer(graph, loop, 0)
-    turn = _choose_ring_row(graph, found.tests, test_ring, last_row, period)
-    # S, the stores of its row, and whether it closes a cycle.
-    closes = _move_to_guarded_block(graph, loop, found, kept, turn, (test_ring, value_ring))
+    turn = _choose_ring_row(graph, recurring.tests, test_ring, last_row, period)
+    closes_cycle = _move_to_guarded_block(graph, loop, recurring, stored, turn, (test_ring, value_ring))
     # A cycle that closes with row p - 1 has the period p.
     zero, one = graph.constant(0, "i64"), graph.constant(1, "i64")
-    found_period = select(graph, closes, graph.node("add", "i64", turn.now, one), zero)
-    # The rest of the program has the numbers of S from the turn's row.
-    from_ring = dict(zip(kept, value_ring.load(turn.now), strict=True))
+    new_period = select(graph, closes_cycle, graph.node("add", "i64", turn.row, one), zero)
+    # The rest of the program loads the recurring numbers from the iteration's row.
+    loaded = dict(zip(stored, value_ring.load(turn.row), strict=True))
     for x in items:
-        if x not in found.nodes:
-            _replace_uses(x, from_ring)
-    loop.following += [turn.now, select(graph, turn.seeks, found_period, period)]
+        if x not in recurring.nodes:
+            _replace_uses(x, loaded)
+    loop.following += [turn.row, select(graph, turn.computes, new_period, period)]
     body.items += rest
     graph.current = enclosing
 
@@ -228,69 +244,87 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
 def _move_to_guarded_block(
     graph: Graph,
     loop: Loop,
-    found: RecurringNodes,
-    kept: Sequence[Node],
+    recurring: RecurringNodes,
+    stored: Sequence[Node],
     turn: RingTurn,
     rings: tuple[RingBuffer, RingBuffer],
 ) -> Node:
-    """Move S to a guarded block, for turns that seek a cycle; return whether C has the bits with which it began.
+    """Move the recurring numbers to a guarded block of the loop's body; return whether a cycle closes there.
 
-    The block also stores the turn's row of the two rings, of tests and of the numbers that others need. The result is
-    False in turns that do not seek.
+    An iteration skips the block unless it has to compute the numbers. The block also stores the iteration's row in the
+    two rings: the outcomes of the tests, and the numbers that the rest of the program needs (`stored`). A cycle closes
+    if the next values of the carried numbers, from which the recurring ones follow, have the bits that they had before
+    row 0. In iterations that skip the block the result is False.
     """
-    guard = Guard(Block(loop.body, pinned=True), turn.seeks)
-    graph.current, guard.body.items = guard.body, [*found.nodes]
-    for n in found.nodes:
+    guard = Guard(Block(loop.body, pinned=True), turn.computes)
+    graph.current, guard.body.items = guard.body, [*recurring.nodes]
+    for n in recurring.nodes:
         n.block = guard.body
-    for ring, nodes in zip(rings, (found.tests, kept), strict=True):
-        ring.store(nodes, turn.now)
-    guard.values = [_compare_with_start(graph, loop, found.carried, turn.begins)]
+    test_ring, value_ring = rings
+    test_ring.store(recurring.tests, turn.row)
+    value_ring.store(stored, turn.row)
+    guard.values = [_compare_with_start(graph, loop, recurring.carried, turn.restarts)]
     graph.current = loop.body
     guard.results = [graph.make_fresh_node("guarded", "bool", (), loop.body, (guard, 0))]
     loop.body.items.append(guard)
     return guard.results[0]
 
 
-def _choose_ring_row(graph: Graph, now: Sequence[Node], tests: RingBuffer, row: Node, period: Node) -> RingTurn:
-    """Choose a turn's row of the ring, which holds the last turns' values in RING rows.
+def _choose_ring_row(
+    graph: Graph, outcomes: Sequence[Node], test_ring: RingBuffer, last_row: Node, period: Node
+) -> RingTurn:
+    """Choose the row of the ring that an iteration reads, or fills with numbers that it computes.
 
-    It is the next row of the cycle if the tests had the same outcomes there. Else the turn computes its values anew.
+    If a cycle is known, the next row of the cycle is read, provided that the tests had the same outcomes there. Else
+    the numbers are computed and fill the next row of the ring, or row 0 if a cycle was just left or the ring is full.
 
-    `now`: outcomes of this turn's tests. `tests`: the ring of earlier outcomes, by row. `row`: the last turn's row.
-    `period`: how many rows the cycle has, 0 where no cycle is known.
+    Args:
+        graph: the program.
+        outcomes: of the tests in this iteration.
+        test_ring: the ring of earlier outcomes.
+        last_row: row of the last iteration.
+        period: how many rows the known cycle has, 0 if none is known.
     """
     node, zero, one = graph.node, graph.constant(0, "i64"), graph.constant(1, "i64")
-    following = node("add", "i64", row, one)
-    of_cycle = select(graph, node("eq", "bool", following, period), zero, following)
-    unknown = node("eq", "bool", period, zero)
-    differing_tests = [node("xor", "bool", *pair) for pair in zip(now, tests.load(of_cycle), strict=True)]
-    seeks = reduce(partial(node, "or", "bool"), differing_tests, unknown)
-    # The ring begins anew at row 0 if a cycle was left or if the ring is full.
-    full = node("eq", "bool", row, graph.constant(RING - 1, "i64"))
-    begins = node("or", "bool", node("not", "bool", unknown), full)
-    sought = select(graph, begins, zero, following)
-    return RingTurn(now=select(graph, seeks, sought, of_cycle), seeks=seeks, begins=begins)
+    next_row = node("add", "i64", last_row, one)
+    next_in_cycle = select(graph, node("eq", "bool", next_row, period), zero, next_row)
+    knows_no_cycle = node("eq", "bool", period, zero)
+    differing_tests = [node("xor", "bool", *pair) for pair in zip(outcomes, test_ring.load(next_in_cycle), strict=True)]
+    computes = reduce(partial(node, "or", "bool"), differing_tests, knows_no_cycle)
+    is_full = node("eq", "bool", last_row, graph.constant(RING - 1, "i64"))
+    restarts = node("or", "bool", node("not", "bool", knows_no_cycle), is_full)
+    row_to_fill = select(graph, restarts, zero, next_row)
+    return RingTurn(row=select(graph, computes, row_to_fill, next_in_cycle), computes=computes, restarts=restarts)
 
 
-def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], begins: Node) -> Node:
-    """Return whether the next values of carried numbers have the bits that these had when the cycle began."""
+def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], restarts: Node) -> Node:
+    """Return whether the next values of carried numbers have the bits that these numbers had before row 0 of the ring.
+
+    Then the iterations since row 0 are a cycle. Bits are compared rather than numbers, so that NaN equals itself.
+
+    Args:
+        graph: the program; its open block is executed when the recurring numbers are computed.
+        loop: the loop.
+        carried: which of the numbers that it carries, by number in the carry.
+        restarts: whether this iteration fills row 0, so that its carried numbers must be stored.
+    """
     block, zero = graph.current, graph.constant(0, "i64")
-    # Their bits before row 0, stored in the turns in which a cycle begins.
-    reference = RingBuffer(
-        graph, [INTEGERS.get(loop.parameters[k].type, loop.parameters[k].type) for k in carried], loop, 1
-    )
-    guard = Guard(Block(block, pinned=True), begins)
+    # The bits before row 0: a ring of one row, which only such an iteration fills.
+    types = [INTEGERS.get(loop.parameters[k].type, loop.parameters[k].type) for k in carried]
+    start_bits = RingBuffer(graph, types, loop, rows=1)
+    guard = Guard(Block(block, pinned=True), restarts)
     block.items.append(guard)
     graph.current = guard.body
-    reference.store([_read_bits(graph, loop.parameters[k]) for k in carried], zero)
+    start_bits.store([_read_bits(graph, loop.parameters[k]) for k in carried], zero)
     graph.current = block
-    # The bits in which any number differs, of each type together.
+    # For each type, the bits in which any of its numbers differs.
     differing = dict[Type, Node]()
-    for k, old in zip(carried, reference.load(zero), strict=True):
-        bits = graph.node("xor", old.type, old, _read_bits(graph, loop.following[k]))
-        differing[old.type] = graph.node("or", old.type, differing[old.type], bits) if old.type in differing else bits
-    equal = [graph.node("eq", "bool", n, graph.constant(0, type)) for type, n in differing.items()]
-    return reduce(partial(graph.node, "and", "bool"), equal)
+    for k, start in zip(carried, start_bits.load(zero), strict=True):
+        bits = graph.node("xor", start.type, start, _read_bits(graph, loop.following[k]))
+        joined = graph.node("or", start.type, differing[start.type], bits) if start.type in differing else bits
+        differing[start.type] = joined
+    are_equal = [graph.node("eq", "bool", n, graph.constant(0, type)) for type, n in differing.items()]
+    return reduce(partial(graph.node, "and", "bool"), are_equal)
 
 
 def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:

@@ -27,11 +27,11 @@ class SummingProgram:
     """
 
     def __init__(self, program: Program, summed: SummedOutputs):
-        """Write the code of a program.
+        """Write the code of a program, of which the first call makes machine code.
 
         `summed` says which results are summed, and which argument (`number`) is the number of the run. Only that
-        argument differs between runs. `self.once` computes what all runs share (None if there is nothing), and
-        `self.blocks` everything else.
+        argument differs between runs. `self.once` is the code that computes what all runs share, None if there is
+        nothing. `self.blocks` is the code of everything else, for blocks of runs.
         """
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
@@ -40,6 +40,7 @@ class SummingProgram:
         self.code = write_module(program, differs, width=None, fuse=fuses, summed=summed)
         self.common, self.operations = self.code.common, self.code.operations
         self.width = self.code.width
+        # The pairs are the runs of a vector in code that is quickly made (LLVM's level 0) and in optimised code.
         self.blocks = TieredCode(self.code.blocks, (choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
 
@@ -118,23 +119,28 @@ class SummingProgramWithArguments:
     """A summing program whose shared arguments are given; `shared`: results that all runs share, None for others."""
 
     def __init__(self, program: SummingProgram, arguments: Sequence[Any], runs: int):
-        """Convert the arguments, compute what all runs share, and make code for about so many runs."""
+        """Convert the arguments, compute what all runs share, and choose machine code for blocks of runs.
+
+        `arguments` are all but the run's number. `runs` is about how many runs will follow: for many, the code is
+        optimised.
+        """
         self.program, self.summed = program, program.summed.outputs
         self.arguments = [convert_to_memory(x, t) for x, t in zip(arguments, program.types, strict=True)]
         self.memory = allocate_aligned(program.code.shared)
-        # Compute what all runs share; the number of the run and results of runs are not used.
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
+            # This code fills `self.memory`. It reads no number of a run and writes no result of one: both are dummies.
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
             pointers = self._list_pointers(number, results)
-            once = program.once.choose_machine(1)
-            once.run(pointers.ctypes.data, 0, 0, 1, 1)
+            machine = program.once.choose_machine(1)
+            machine.run(pointers.ctypes.data, 0, 0, 1, 1)
+        # The results that all runs share (`common`), from their bytes in `self.memory`.
         for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])
                 computed = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
-        blocks = divide_rounded_up(runs, program.width)
+        blocks = divide_rounded_up(runs, program.width)  # a block is as many runs as a vector has
         self._machine = None if all(program.common) else program.blocks.choose_machine(blocks)
 
     def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
@@ -200,9 +206,13 @@ class SummingProgramWithArguments:
         ]
 
     def _list_outputs(self) -> list[tuple[Any, bool]]:
-        """Return each output, and whether it is a sum over runs in memory: what all runs share is none."""
-        parts = zip(self.program.code.outputs, self.program.summed.outputs, self.program.common, strict=True)
-        return [(buffer, summed and not common) for buffer, summed, common in parts]
+        """Return each output of the code, and whether the code adds each run's number to sums in memory there.
+
+        It does for a summed output that differs between runs. The sum of an output that all runs share (`common`) is
+        its number times the number of runs, and needs no sums in memory.
+        """
+        outputs = zip(self.program.code.outputs, self.program.summed.outputs, self.program.common, strict=True)
+        return [(buffer, is_summed and not is_common) for buffer, is_summed, is_common in outputs]
 
     def _list_pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
         """Return the addresses (uint64) that the code expects: of inputs, tables, results and shared memory.

@@ -229,7 +229,7 @@ def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
     z = record.measurements.get(target.node)
     if z is None:  # a central filter
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
-    return z if target.outlook.filter.received else z[:, :0]
+    return z if target.predictor.filter.received else z[:, :0]
 
 
 class _ComparedForecasts(NamedTuple):
@@ -259,7 +259,7 @@ def _score_filter(
         first: first row from which a forecast counts.
     """
     _, target = segments[0]  # in names and claim all segments are alike
-    filter, node = target.outlook.filter, target.node
+    filter, node = target.predictor.filter, target.node
     if filter.claim == "none":  # no covariance, so no forecast of a law
         return []
     # Forecasts from each row, and what came.
@@ -290,7 +290,7 @@ def _roll_segments(
 
     `segments`: (first row, filter as it is from there on); z: measurements, u: inputs, both by row; `ahead`: horizons.
     """
-    rolled = [roll_forecasts(target.outlook, z, u, ahead) for _, target in segments]
+    rolled = [roll_forecasts(target.predictor, z, u, ahead) for _, target in segments]
     ends = [*(row for row, _ in segments[1:]), len(z)]
     begins = [0, *ends[:-1]]
 
@@ -340,7 +340,7 @@ def _score_number(
 
 
 def roll_forecasts(
-    outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
+    predictor: MultistepPredictor, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
 ) -> tuple[Moments, Moments | None]:
     """Return forecasts from each row at each horizon: of the states, and of what would arrive.
 
@@ -351,26 +351,26 @@ def roll_forecasts(
     padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
     # For each row, the inputs of the rows after it: (rows, longest, inputs).
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
-    arguments = outlook, z, u, windows, np.asarray(horizons) - 1
+    arguments = predictor, z, u, windows, np.asarray(horizons) - 1
     rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
     return rolled
 
 
 def _forecast_from_each_row(
-    outlook: MultistepPredictor, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
+    predictor: MultistepPredictor, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
 ) -> PyTree:
     """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 
     They are (rows, places, K, ...), of mixtures of K parts, with variances in the place of covariances.
 
     Args:
-        outlook: how the filter is read ahead.
+        predictor: predicts the filter's state step by step without data.
         z: measurements (rows, received).
         u: inputs (rows, inputs).
         windows: inputs of the rows ahead of each row (rows, ahead, inputs).
         places: which of the rows ahead are returned, from 0.
     """
-    filter, length = outlook.filter, windows.shape[1]
+    filter, length = predictor.filter, windows.shape[1]
 
     def select(moments: Moments | None) -> PyTree:
         """Return the moments at `places` (the horizons among all rows ahead), with variances instead of covariances."""
@@ -387,7 +387,7 @@ def _forecast_from_each_row(
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
         ahead = window, k + 1 + jnp.arange(length)
-        _, (states, _, received) = jax.lax.scan(lambda s, row: outlook.predict_step(s, *row), after, ahead)
+        _, (states, _, received) = jax.lax.scan(lambda s, row: predictor.predict_step(s, *row), after, ahead)
         moments_alone = states and states._replace(laws=None)  # states are scored by moments even if they have limits
         return after, (select(moments_alone), select(received))
 

@@ -9,9 +9,9 @@ import numpy as np
 from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
-from heliograph.forecasting.forecast_result import Forecast
+from heliograph.forecasting.forecast_result import Forecast, InputsAhead
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_inputs_ahead, find_rows_ahead
-from heliograph.forecasting.mixture_moments import make_prediction
+from heliograph.forecasting.mixture_moments import Moments, make_prediction
 from heliograph.forecasting.multistep_prediction import (
     MultistepPredictor,
     find_output_claim,
@@ -76,17 +76,22 @@ def forecast_from_origin(origin: Origin, horizons: Horizons, inputs: Inputs) -> 
     ahead = find_rows_ahead(origin, model.inputs, horizons, inputs)
     forecasts: Forecasts = {}
     for target in list_targets(origin):
-        check_steps_covered(target.outlook.filter, origin.step, ahead.u.shape[-2])
+        check_steps_covered(target.predictor.filter, origin.step, ahead.u.shape[-2])
         forecasts.setdefault(target.node, {})[target.filter] = _forecast_target(target, origin, ahead)
     return forecasts
 
 
 class ForecastTarget(NamedTuple):
-    """An estimate that is forecast: its node and filter, how it is read ahead, its state, the names of what arrives."""
+    """An estimate that is forecast.
+
+    node, filter: names of its node and filter. predictor: predicts the filter's state without data, and reads states,
+    outputs and received numbers from it. state: the filter's state where the data end. received: names of the numbers
+    that the filter receives.
+    """
 
     node: str
     filter: str
-    outlook: MultistepPredictor
+    predictor: MultistepPredictor
     state: PyTree
     received: tuple[str, ...]
 
@@ -113,49 +118,57 @@ def list_targets(origin: Origin) -> list[ForecastTarget]:
     """
     model = origin.model
     if isinstance(model, AbstractFilter):
-        outlook = make_multistep_predictor(model)
-        outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
+        predictor = make_multistep_predictor(model)
+        outputs = () if predictor.sensor is None else tuple(first(predictor.sensor).outputs)
         received = name_values(outputs, model.received)
-        return [ForecastTarget(node="", filter="", outlook=outlook, state=origin.state, received=received)]
+        return [ForecastTarget(node="", filter="", predictor=predictor, state=origin.state, received=received)]
     assert isinstance(model, Network)
     targets = []
     for node, filters in origin.estimates.items():
         for name, estimate in filters.items():
             filter, state = _find_filter(model, origin, node, name, estimate)
-            outlook = make_multistep_predictor(filter, _find_sensor(model, node), model.plant)
+            predictor = make_multistep_predictor(filter, _find_sensor(model, node), model.plant)
             received = _name_received(model, node)
-            targets.append(ForecastTarget(node=node, filter=name, outlook=outlook, state=state, received=received))
+            targets.append(ForecastTarget(node=node, filter=name, predictor=predictor, state=state, received=received))
     return targets
 
 
 def _find_filter(
     network: Network, origin: Origin, node: str, name: str, estimate: Estimate
 ) -> tuple[AbstractFilter, PyTree]:
-    """Return the filter that makes an estimate, and its state in the origin; of a fusion one that only predicts.
+    """Return the filter that makes an estimate, and its state where the data end.
+
+    A fusion rule has no state of its own to predict. For its estimate this is a filter that only predicts, and its
+    state is that of the fused mean and covariance.
 
     Args:
-        network: the origin's model.
-        origin: with states of the nodes' filters, those of one kind stacked, and of central filters by name.
-        node: of the estimate.
-        name: of its filter or fusion.
-        estimate: where the prediction of a fusion begins.
+        network: the model of the origin.
+        origin: where the data end. Its `state` holds the states of the nodes' filters, where filters that are computed
+            side by side (a kind) have one array, and the states of central filters by name.
+        node: node of the estimate.
+        name: name of the filter or fusion.
+        estimate: the estimate, where the prediction of a fusion begins.
     """
-    by_kind, central, *_ = origin.state
+    states_by_kind, states_of_central, *_ = origin.state
     if (node, name) in network.places:
-        # The states of a kind are stacked filter by filter, and for each over the nodes of its group.
+        # One after another: each filter of the kind, and for it each node of the kind's group of nodes.
         kind, filter_of_kind, node_of_group = network.places[node, name]
-        place = filter_of_kind * len(network.groups[network.kinds[kind].group]) + node_of_group
-        return network.nodes[node].filters[name], _take_stacked_state(by_kind[kind], place, origin.several)
-    if name in central:
+        nodes_in_group = len(network.groups[network.kinds[kind].group])
+        index = filter_of_kind * nodes_in_group + node_of_group
+        return network.nodes[node].filters[name], _take_stacked_state(states_by_kind[kind], index, origin.several)
+    if name in states_of_central:
         filter = network.fused[name]
         assert isinstance(filter, AbstractFilter)
-        return filter, central[name]
+        return filter, states_of_central[name]
     return _predict_without_nodes(network, estimate)
 
 
-def _take_stacked_state(stacked: PyTree, place: int, several: bool) -> PyTree:
-    """Return one of the states of filters that are stacked along the first axis, or if `several` plants the second."""
-    return jax.tree.map(lambda leaf: np.take(leaf, place, axis=int(several)), stacked)
+def _take_stacked_state(stacked: PyTree, index: int, several: bool) -> PyTree:
+    """Return one of the states that are stacked along the first axis, or along the second if the first is of plants.
+
+    `several` is True if there are several plants, which then have the first axis.
+    """
+    return jax.tree.map(lambda leaf: np.take(leaf, index, axis=int(several)), stacked)
 
 
 def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
@@ -210,26 +223,61 @@ def check_steps_covered(filter: AbstractFilter, step: int | np.ndarray, count: i
 
 
 def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -> Forecast:
-    """Return the forecast of one estimate at the horizons: states, and where they can be told outputs and what arrives.
+    """Return the forecast of one estimate at the horizons: of its states, of the sensor's outputs, and of what arrives.
 
-    `ahead`: inputs of the rows ahead, and the row of each horizon.
+    The last two are None if the filter does not know its sensor, or does not predict what it receives.
+
+    Args:
+        target: the estimate, with its filter's predictor and state.
+        origin: where the data end; `several` if there are several plants, whose arrays lead with an axis of plants.
+        ahead: inputs of the rows ahead, and the row of each horizon.
     """
-    outlook, filter = target.outlook, target.outlook.filter
+    predictor = target.predictor
+    filter = predictor.filter
     check_inputs_ahead(filter.inputs, ahead, filter, origin.step)
-    look = predict_moments_of_each if origin.several else predict_moments
-    moments = look(outlook, target.state, ahead.u, origin.step)
-    states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=int(origin.several)), moments)
-    assert states is not None
-    angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
-    measured = outputs and make_prediction(
-        outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
+    predict = predict_moments_of_each if origin.several else predict_moments
+    moments_of_rows = predict(predictor, target.state, ahead.u, origin.step)
+    axis_of_rows = int(origin.several)
+    states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=axis_of_rows), moments_of_rows)
+    return combine_predictions(
+        predictor, (states, outputs, received), target.received, ahead.steps, ahead.time, ahead.inputs
     )
-    arriving = received and make_prediction(received, target.received, find_received_claim(filter), angles.received)
+
+
+def combine_predictions(
+    predictor: MultistepPredictor,
+    moments: tuple[Moments | None, ...],
+    received_names: tuple[str, ...],
+    steps: np.ndarray,
+    time: np.ndarray,
+    inputs: InputsAhead,
+) -> Forecast:
+    """Return a forecast with the filter's claims, from moments of the states, the outputs and what arrives.
+
+    Args:
+        predictor: the filter's predictor.
+        moments: of the states, the outputs and what arrives, at each horizon; None where it is not predicted.
+        received_names: names of the numbers that arrive.
+        steps: how far ahead each horizon is.
+        time: of each horizon.
+        inputs: whether inputs were "given" or "held"; "none" of a plant without.
+    """
+    states, outputs, received = moments
+    assert states is not None  # a filter always predicts its states
+    filter, sensor = predictor.filter, first(predictor.sensor)
+    angles = filter.angles_used() or FilterAngles((), ())
+    predicted_outputs = predicted_received = None
+    if outputs is not None:
+        output_claim = find_output_claim(filter, predictor)
+        predicted_outputs = make_prediction(outputs, tuple(sensor.outputs), output_claim, sensor.angles)
+    if received is not None:
+        received_claim = find_received_claim(filter)
+        predicted_received = make_prediction(received, received_names, received_claim, angles.received)
     return Forecast(
-        steps=ahead.steps,
-        time=ahead.time,
-        states=make_prediction(states, filter.states, filter.claim, angles.states, outlook.limits),
-        outputs=measured,
-        received=arriving,
-        inputs=ahead.inputs,
+        steps=steps,
+        time=time,
+        states=make_prediction(states, filter.states, filter.claim, angles.states, predictor.limits),
+        outputs=predicted_outputs,
+        received=predicted_received,
+        inputs=inputs,
     )

@@ -69,10 +69,11 @@ class Prediction:
         means, deviations = self.part_means, np.sqrt(self.part_variances)
         low_end, high_end = np.transpose(self.limits)
         with np.errstate(invalid="ignore"):  # no median of what is unknown
-            below, above = self._find_part_probabilities(low_end), self._find_part_probabilities(high_end)
-            each = np.clip(means + ndtri(below + p * (above - below)) * deviations, low_end, high_end)
+            below_low, below_high = self._find_part_probabilities(low_end), self._find_part_probabilities(high_end)
+            probabilities = below_low + p * (below_high - below_low)
+            quantiles = np.clip(means + ndtri(probabilities) * deviations, low_end, high_end)  # of each part
         # The mixture's lies between the least and the greatest of its parts': halve that interval.
-        low, high = each.min(axis=-2), each.max(axis=-2)
+        low, high = quantiles.min(axis=-2), quantiles.max(axis=-2)
         for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
             middle = (low + high) / 2
             is_below = self._find_probability_below(middle) < p
@@ -119,20 +120,27 @@ class Prediction:
         )
 
     def _find_probability_below(self, values: np.ndarray) -> np.ndarray:
-        """Return P(number < value) (horizons, m), the sum of weight_k P(part k < value | part k within the limits)."""
+        """Return P(number < value) (horizons, m) = sum_k weight_k P(x_k < value | low <= x_k <= high), x_k Gaussian.
+
+        x_k are the parts of the mixture, and low and high are the limits of the number. `values` are (horizons, m).
+        """
         low, high = np.transpose(self.limits)
-        below, least, most = map(self._find_part_probabilities, (np.clip(values, low, high), low, high))
-        inside = most - least
-        share = np.where(inside > 0, (below - least) / np.where(inside > 0, inside, 1.0), below)
+        # P(x_k < value), P(x_k < low) and P(x_k < high), each (horizons, K, m).
+        below = self._find_part_probabilities(np.clip(values, low, high))
+        below_low, below_high = self._find_part_probabilities(low), self._find_part_probabilities(high)
+        inside = below_high - below_low
+        conditional = np.where(inside > 0, (below - below_low) / np.where(inside > 0, inside, 1.0), below)
         # No probability is beyond the limits, even if a part is almost certainly there.
-        share = np.where((values <= low)[..., None, :], 0.0, np.where((values > high)[..., None, :], 1.0, share))
-        total: np.ndarray = np.sum(self.weights * share, axis=-2)
+        is_at_low, is_beyond_high = (values <= low)[..., None, :], (values > high)[..., None, :]
+        conditional = np.where(is_at_low, 0.0, np.where(is_beyond_high, 1.0, conditional))
+        total: np.ndarray = np.sum(self.weights * conditional, axis=-2)
         return total
 
     def _find_part_probabilities(self, values: np.ndarray) -> np.ndarray:
-        """Return P(part k < value) (horizons, K, m), without regard to limits.
+        """Return P(x_k < value) (horizons, K, m) for each Gaussian x_k of the mixture, without regard to limits.
 
-        A part without variance is its mean, which counts half if it equals the value.
+        `values` are (m,) or (horizons, m). A Gaussian of variance 0 is its mean, which counts half if it equals the
+        value.
         """
         distance = values[..., None, :] - self.part_means
         deviation = np.sqrt(self.part_variances)

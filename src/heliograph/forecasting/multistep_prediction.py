@@ -1,6 +1,6 @@
 """Prediction several steps ahead without data: states, what the sensor would measure, and what would arrive.
 
-A filter's claim is what it says of its covariance: "exact", "upper", "nominal" or "none". Mixtures have K parts.
+A filter's claim is what it says of its covariance: "exact", "upper", "nominal" or "none". Mixtures have K Gaussians.
 """
 
 from dataclasses import replace
@@ -55,7 +55,11 @@ class HasComponents(Protocol):
 
 
 class MultistepPredictor(Module):
-    """How a filter's states are read ahead: by its plant and sensor (None: outputs are not), and its own correction."""
+    """Predicts a filter's state step by step without data, and reads moments from it.
+
+    plant, sensor: what is measured; without them no outputs are predicted. transform: takes moments through a nonlinear
+    sensor. receives: whether received numbers are predicted. received_noise: their noise if it has outliers, else None.
+    """
 
     filter: AbstractFilter
     plant: AnyPlant | None
@@ -65,26 +69,31 @@ class MultistepPredictor(Module):
     received_noise: ReceivedNoise | OverTime | None
 
     def compute_state_moments(self, state: PyTree) -> Moments:
-        """Return the moments of the states as a mixture: the filter's own if it has one, else with one part.
+        """Return the moments of the plant's states as a mixture of K Gaussians: K = 1 unless the filter has a mixture.
 
-        Covariances are zero if the filter claims nothing. For states with limits, the moments are those within the
-        limits.
+        Covariances are zero if the filter claims none. If states have limits, the moments are those given that all
+        limits hold.
         """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
             return self._read_moments(filter, state)
         moments = self._read_moments(filter.base, filter.condition_on_limits(state))
-        # The law of each limited state: Gaussians given the limits of other states, which are then cut to its own.
+        # The law of each limited state: Gaussians given the limits of the other states, later cut to its own limits.
         means, variances = moments.means, jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
-        for place, *_ in filter.limits:
-            beside = self._read_moments(filter.base, filter.condition_on_limits(filter.hold(state), without=place))
-            means = means.at[:, place].set(beside.means[:, place])
-            variances = variances.at[:, place].set(beside.covariances[:, place, place])
+        for i, *_ in filter.limits:
+            given_other_limits = filter.condition_on_limits(filter.hold(state), without=i)
+            moments_before_own_limit = self._read_moments(filter.base, given_other_limits)
+            means = means.at[:, i].set(moments_before_own_limit.means[:, i])
+            variances = variances.at[:, i].set(moments_before_own_limit.covariances[:, i, i])
         weights = jnp.broadcast_to(moments.weights[:, None], means.shape)
         return moments._replace(laws=MarginalLaws(weights=weights, means=means, variances=variances))
 
     def compute_moments_before_limits(self, state: PyTree) -> Moments:
-        """Return the moments of the states without regard to their limits, except for the weights of the parts."""
+        """Return the moments of the states before they are conditioned on their limits, for a sampler that cuts draws.
+
+        Only means beyond a limit are moved to it (`hold`), as in the filter's own correction. The weights of the K
+        Gaussians are those given that the limits hold: one that lies mostly beyond them is less probable.
+        """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
             return self._read_moments(filter, state)
@@ -92,16 +101,20 @@ class MultistepPredictor(Module):
         return self._read_moments(filter.base, filter.hold(state))._replace(weights=weights)
 
     def _read_moments(self, filter: AbstractFilter, state: PyTree) -> Moments:
-        """Return the moments of the states, as the filter's state holds them."""
+        """Return weights (K,), means (K, n) and covariances (K, n, n) of the plant's n states from a filter's state.
+
+        `filter` is self.filter, or the filter inside it that takes such a state. If self.filter claims no covariance
+        (claim "none"), zeros stand for it.
+        """
         if isinstance(state, HasComponents):
-            weights, parts = state.components
-            parts = take_leading(parts, len(self.filter.states))
-            covariances = jnp.asarray(jax.vmap(lambda part: part.covariance)(parts))
-            return Moments(weights=weights, means=parts.mean, covariances=covariances)
+            weights, components = state.components
+            components = take_leading(components, len(self.filter.states))  # the first numbers are the plant's states
+            covariances = jnp.asarray(jax.vmap(lambda component: component.covariance)(components))
+            return Moments(weights=weights, means=components.mean, covariances=covariances)
         estimate = filter.estimate(state)
         covariance = jnp.asarray(estimate.covariance)
-        claimed = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
-        return Moments(weights=jnp.ones(1), means=jnp.asarray(estimate.mean)[None], covariances=claimed[None])
+        covariance = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
+        return Moments(weights=jnp.ones(1), means=jnp.asarray(estimate.mean)[None], covariances=covariance[None])
 
     @property
     def limits(self) -> PlacedLimits:
@@ -109,7 +122,7 @@ class MultistepPredictor(Module):
         return self.filter.limits if isinstance(self.filter, LimitedFilter) else ()
 
     def moments(self, state: PyTree) -> Moments:
-        """Return the moments of the states as they are now, without regard to limits, as NumPy arrays."""
+        """Return the moments of the states of a filter's state, before they are conditioned on limits, in NumPy."""
         return _compute_moments_now(self, state)
 
     def predict_measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
@@ -126,9 +139,9 @@ class MultistepPredictor(Module):
         if self.sensor is None or self.plant is None:
             return None
         # Modes that change what is measured: the filter expects a signal in each.
-        filter, within = _condition_on_limits(self.filter, prior)
+        filter, prior_within_limits = _condition_on_limits(self.filter, prior)
         if isinstance(filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
-            return _measure_in_each_mode(filter, within, k)
+            return _measure_in_each_mode(filter, prior_within_limits, k)
         plant, initial_moments = at(self.plant, k), second_moments_at_start(self.plant)
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
@@ -136,8 +149,7 @@ class MultistepPredictor(Module):
             return _measure_unknown_state(prior, sensor)
 
         # The sensor's noise, as it was learned where the filter learns it.
-        deviations = None
-        learned_noise = None
+        deviations = learned_noise = None
         if isinstance(self.filter, AdaptiveFilter):
             deviations = jnp.asarray(self.filter.noise_deviations(prior, k))
             learned_noise = sensor.noise.columns.through(jnp.diag(deviations))
@@ -145,9 +157,7 @@ class MultistepPredictor(Module):
         def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return mean and covariance of the outputs from those of the states, for one component of the mixture.
 
-            They use the plant and the sensor of step k, and the rule by which moments pass a nonlinear function
-            (`self.transform`). `initial_moments`: second moments of the plant's initial law. `learned_noise`: the
-            sensor's noise as the filter has learned it, or None.
+            `learned_noise` is the sensor's noise as the filter has learned it, or None.
             """
             states_law = from_covariance(mean, covariance)
             signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_moments, learned_noise)
@@ -158,8 +168,8 @@ class MultistepPredictor(Module):
         laws = self._find_output_laws(states, outputs, sensor.noise, deviations)
         # Student's law of at most two degrees has no variance.
         if isinstance(sensor.noise, StudentT):
-            endless = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
-            covariances = jax.vmap(lambda covariance: mark_unknown(covariance, endless))(covariances)
+            has_no_variance = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
+            covariances = jax.vmap(lambda covariance: mark_unknown(covariance, has_no_variance))(covariances)
         return outputs._replace(covariances=covariances, laws=laws)
 
     def _find_output_laws(
@@ -176,33 +186,36 @@ class MultistepPredictor(Module):
         branches = noise.branches()
         if not has_branches(branches):
             return None
-        variance = noise.columns.diagonal
+        noise_variances = noise.columns.diagonal
         if deviations is not None:
-            variance = variance * deviations**2
-            wider = jnp.asarray(deviations)[:, None]
-            branches = branches._replace(mean=branches.mean * wider, variance=branches.variance * wider**2)
-        rest = jnp.maximum(jnp.diagonal(outputs.covariances, axis1=-2, axis2=-1) - variance, 0.0)
-        return spread_over_branches(states.weights, outputs.means, rest, branches)
+            noise_variances = noise_variances * deviations**2
+            factor = jnp.asarray(deviations)[:, None]
+            branches = branches._replace(mean=branches.mean * factor, variance=branches.variance * factor**2)
+        variances = jnp.diagonal(outputs.covariances, axis1=-2, axis2=-1)
+        variances_without_noise = jnp.maximum(variances - noise_variances, 0.0)
+        return spread_over_branches(states.weights, outputs.means, variances_without_noise, branches)
 
     def predict_received(self, prior: PyTree, outputs: Moments | None, k: jax.Array) -> Moments | None:
-        """Return the moments of what would arrive at step k, by the predicted state; None if the filter cannot tell.
+        """Return the moments of the numbers z that would arrive at step k; None if the filter does not predict them.
 
-        `outputs`: moments of what the sensor would measure; None where that is not known.
+        The filter's innovation z - E[z] at z = 0 has the value -E[z] and the covariance of z. Noise with outliers is a
+        mixture of Gaussians ("branches"), and so is then the law of each number of z (`laws`): a Gaussian with the
+        variance of z less that of the noise, plus this noise. `outputs`: moments of what the sensor would measure.
         """
         if not self.receives:
             return None
-        innovation = _expect(self.filter, prior, k)  # of z = 0
+        innovation = _find_innovation_of_zero(self.filter, prior, k)
         mean, covariance = -jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         moments = Moments(weights=jnp.ones(1), means=mean[None], covariances=covariance[None])
         noise = self.received_noise
         if noise is None or outputs is None:
             return moments
-        # The noise's variance, which is in the covariance, in branches.
         branches = at(noise, k).find_branches(outputs.weights @ outputs.means)
-        center, variance = branches.mean_and_variance()
-        rest = jnp.maximum(jnp.diagonal(covariance) - variance, 0.0)
+        noise_mean, noise_variance = branches.mean_and_variance()
+        variance_without_noise = jnp.maximum(jnp.diagonal(covariance) - noise_variance, 0.0)
         gaussians = GaussianBranches(branches.log_share, branches.mean, branches.variance)
-        laws = spread_over_branches(moments.weights, (mean - center)[None], rest[None], gaussians)
+        mean_without_noise = mean - noise_mean  # the branches have means of their own
+        laws = spread_over_branches(moments.weights, mean_without_noise[None], variance_without_noise[None], gaussians)
         return moments._replace(laws=laws)
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
@@ -235,85 +248,91 @@ def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
     return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
 
-def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
-    """Return the innovation of z = 0 at step k, which is minus the expected z, with the covariance of what arrives."""
+def _find_innovation_of_zero(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
+    """Return the innovation z - E[z] of z = 0, that is -E[z], with the covariance of z, for the predicted state."""
     filter, prior = _condition_on_limits(filter, prior)
     if isinstance(filter, FilterOfInputs):
-        return _expect(filter.make_filter_under(prior.u, k), prior.base, k)
-    if isinstance(filter, ToldFilter):  # part of z tells the law of noise, so that z = 0 would tell a wrong one
+        return _find_innovation_of_zero(filter.make_filter_under(prior.u, k), prior.base, k)
+    if isinstance(filter, ToldFilter):  # part of z reports the law of the noise, so that z = 0 would report a wrong one
         return filter.expect(prior, k)
     _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
-    if isinstance(filter, RobustFilter):  # its law of noise may have no variance
-        has_none = jnp.asarray(at(filter.noise, k).least_degrees) <= 2
-        return replace(innovation, covariance=mark_unknown(jnp.asarray(innovation.covariance), has_none))
+    if isinstance(filter, RobustFilter):  # Student's noise of at most 2 degrees of freedom has no variance
+        has_no_variance = jnp.asarray(at(filter.noise, k).least_degrees) <= 2
+        return replace(innovation, covariance=mark_unknown(jnp.asarray(innovation.covariance), has_no_variance))
     return innovation
 
 
 def make_multistep_predictor(
     filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None
 ) -> MultistepPredictor:
-    """Return the outlook of a filter, by the plant and sensor that it believes in, or by these if it does not say."""
-    premise = filter.premise
+    """Return what predicts a filter's states, the sensor's outputs and the received numbers several steps ahead.
+
+    It takes the plant and sensor for which the filter was made, or the arguments if the filter does not know them.
+    Received numbers are not predicted if the filter receives none, or if it also uses that nothing arrives. Nor are
+    they if z tells the mode: E[z] is found by a correction with zeros, which would stand for a mode.
+    """
+    premise = filter.premise  # the models for which the filter was made
     plant = plant if premise is None else premise.plant
-    believed = sensor if premise is None or premise.sensor is None else premise.sensor
-    # Such a filter is told the mode in z: the zeros by which `predict_received` asks what is expected would be a mode.
-    flagged = isinstance(filter, ModeObservedFilter) or (isinstance(filter, SideInformationFilter) and filter.flagged)
+    sensor = sensor if premise is None or premise.sensor is None else premise.sensor
+    has_flag_in_z = isinstance(filter, SideInformationFilter) and filter.flagged
+    receives_mode = isinstance(filter, ModeObservedFilter) or has_flag_in_z
     transform = getattr(filter, "transform", None)
     return MultistepPredictor(
         filter=filter,
         plant=plant,
-        sensor=believed if plant is not None else None,
+        sensor=sensor if plant is not None else None,
         transform=transform if isinstance(transform, AbstractTransform) else Cubature(),
-        receives=bool(filter.received) and not filter.silence_tells and not flagged,
+        receives=bool(filter.received) and not filter.silence_tells and not receives_mode,
         received_noise=_find_received_noise(filter),
     )
 
 
 def _find_received_noise(filter: AbstractFilter) -> ReceivedNoise | OverTime | None:
-    """Return the noise with outliers in what a filter receives, of sensor and last hop; None where there is none.
+    """Return the noise with outliers in what a filter receives: that of the sensor and of the channel's last hop.
 
-    Nor is there one to be told apart where the channel mixes the noises of several outputs, brings past ones, or
-    tells numbers.
+    Return None if neither has outliers, or if they cannot be separated from the rest of z: the sensor depends on modes
+    or inputs, or the channel mixes the noises of several outputs, delays them, or reports more numbers after them.
     """
-    premise = filter.premise
+    premise = filter.premise  # the models for which the filter was made
     sensor, channel = (None, None) if premise is None else (premise.sensor, premise.channel)
     if sensor is None or channel is None or memories(sensor):
         return None
-    link, law = first(channel), first(sensor).noise
-    is_described = isinstance(law, AbstractNoise) and not link.past and not first(sensor).inputs
-    if not is_described or not (law.has_outliers or link.detach_outliers()[1] is not None):
+    link, sensor_noise = first(channel), first(sensor).noise
+    if not isinstance(sensor_noise, AbstractNoise) or link.past or first(sensor).inputs:
+        return None
+    _, channel_noise = link.detach_outliers()  # the noise of the last hop if it has outliers
+    if not sensor_noise.has_outliers and channel_noise is None:
         return None
     try:
-        # A channel that loses, as it is given that what it sends arrives.
-        fresh = without_memory(channel)
-        arriving = at_each_step(lambda step: step.condition_on_arrival() if step.erases else step, fresh)
-        noise = separate_outlier_noise(sensor, arriving, independent=False)[1]
+        memoryless = without_memory(channel)
+        if_it_arrives = at_each_step(lambda step: step.condition_on_arrival() if step.erases else step, memoryless)
+        _, noise = separate_outlier_noise(sensor, if_it_arrives, independent=False)
     except ValueError:
         return None
     return noise if len(first(noise).center) == filter.received else None
 
 
 @compile_on_call
-def _compute_moments_now(outlook: MultistepPredictor, state: PyTree) -> Moments:
-    """Return the moments of the states at the row where the outlook begins."""
-    return outlook.compute_moments_before_limits(state)
+def _compute_moments_now(predictor: MultistepPredictor, state: PyTree) -> Moments:
+    """Return the moments of the plant's states in a filter's `state`, before they are conditioned on limits."""
+    return predictor.compute_moments_before_limits(state)
 
 
 def predict_moments(
-    outlook: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
+    predictor: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
 ) -> tuple[Moments | None, ...]:
     """Return the moments of states, outputs and what arrives at each row ahead (rows, K, ...).
 
     Native code computes them if it supports the filter. `state`: the filter's state at `step`. `u`: inputs
     (rows, inputs).
     """
-    arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
+    arguments = predictor, state, np.asarray(u, dtype=float), np.asarray(step)
     moments: tuple[Moments | None, ...] = compute_once(_predict_moments, _by_xla, arguments)
     return moments
 
 
 def predict_moments_of_each(
-    outlook: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
+    predictor: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
 ) -> tuple[Moments | None, ...]:
     """Return the moments of several plants at each row ahead (plants, rows, K, ...), computed side by side.
 
@@ -321,21 +340,21 @@ def predict_moments_of_each(
     """
     arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
     with jax.enable_x64(True):
-        choice = choose_code(_predict_moments, (outlook, *arguments), differs_by_run=[False, True, True, True])
+        choice = choose_code(_predict_moments, (predictor, *arguments), differs_by_run=[False, True, True, True])
         if choice.code is not None:
             found: tuple[Moments | None, ...] = choice.results()
             return found
         # By XLA in blocks of one size, the last filled up with its last plant.
         count = len(u)
         blocks = [
-            to_numpy(_each_by_xla(outlook, *jax.tree.map(lambda a, rows=rows: a[rows], arguments)))
+            to_numpy(_each_by_xla(predictor, *jax.tree.map(lambda a, rows=rows: a[rows], arguments)))
             for begin in range(0, count, BLOCK)
             for rows in (np.minimum(np.arange(begin, begin + BLOCK), count - 1),)
         ]
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)  # type: ignore[no-any-return]
 
 
-def _predict_moments(outlook: MultistepPredictor, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
+def _predict_moments(predictor: MultistepPredictor, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
     """Return the moments of states, outputs and what arrives at each step ahead (steps, K, ...).
 
     They start from a state at `step`, under inputs `u` (steps, inputs).
@@ -343,36 +362,33 @@ def _predict_moments(outlook: MultistepPredictor, state: PyTree, u: jax.Array, s
 
     def predict_row(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Return the state a row ahead, and the moments there."""
-        return outlook.predict_step(state, *row)
+        return predictor.predict_step(state, *row)
 
     rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
     _, moments = jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)
     return moments
 
 
-def _predict_moments_of_each(outlook: MultistepPredictor, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
+def _predict_moments_of_each(predictor: MultistepPredictor, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
     """Return the moments of each step ahead for several plants, whose states, inputs and steps have a leading axis."""
-    return jax.vmap(lambda *plant: _predict_moments(outlook, *plant))(states, u, steps)
+    return jax.vmap(lambda *plant: _predict_moments(predictor, *plant))(states, u, steps)
 
 
 _by_xla, _each_by_xla = quickly_compiled(_predict_moments), quickly_compiled(_predict_moments_of_each)
 
 
-def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Claim:
-    """Return the claim of predicted outputs: that of the states for a linear sensor, else "nominal" at most.
-
-    With a nonlinear sensor, or with angles, the covariance is approximate.
-    """
-    sensor = first(outlook.sensor)
+def find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:
+    """Return the claim of predicted outputs: the filter's, or "nominal" for angles and nonlinear sensors."""
+    sensor = first(predictor.sensor)
     is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])
 
 
 def find_received_claim(filter: AbstractFilter) -> Claim:
-    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if typical numbers stand for unknown.
+    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if example numbers stand for unknown.
 
-    A ToldFilter receives numbers that tell the law of noise. They are not known ahead, so typical ones replace them
-    unless their own law is known.
+    A `ToldFilter` receives numbers with each message that determine the link's law, such as a noise variance. They are
+    not known ahead. Unless their own law is known, an example of them is used, with which the covariance is nominal.
     """
     base = filter
     while isinstance(base, LimitedFilter | FilterOfInputs):

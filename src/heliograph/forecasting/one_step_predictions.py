@@ -8,18 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import scan_rows
-from heliograph.filters.base import AbstractFilter, FilterAngles
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.run_over_data import check_data
 from heliograph.forecasting.backtest import list_single_filters, select_measurements
-from heliograph.forecasting.forecast import Forecasts, list_targets
+from heliograph.forecasting.forecast import Forecasts, combine_predictions, list_targets
 from heliograph.forecasting.forecast_result import Forecast
-from heliograph.forecasting.mixture_moments import make_prediction
-from heliograph.forecasting.multistep_prediction import (
-    MultistepPredictor,
-    find_output_claim,
-    find_received_claim,
-    make_multistep_predictor,
-)
+from heliograph.forecasting.multistep_prediction import MultistepPredictor, make_multistep_predictor
 from heliograph.forecasting.start_states import find_origin
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
@@ -53,10 +47,10 @@ def predict_rows(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
-    outlook = make_multistep_predictor(filter)
-    sensor = first(outlook.sensor)
+    predictor = make_multistep_predictor(filter)
+    sensor = first(predictor.sensor)
     names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
-    return _make_forecast(outlook, np.asarray(rows), np.asarray(inputs), names)
+    return _make_forecast(predictor, np.asarray(rows), np.asarray(inputs), names)
 
 
 def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | None = None) -> Forecasts:
@@ -79,57 +73,56 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
     """
     network = find_origin(instance("record", record, Record, "a Record")).model
     assert isinstance(network, Network)  # nothing else makes a record with an origin
-    u, filtered = read_plant_inputs(network, inputs, len(record.time)), list_single_filters(network)
+    u = read_plant_inputs(network, inputs, len(record.time))
+    filters_with_state = list_single_filters(network)  # (node, filter), without fusion rules
     forecasts: Forecasts = {}
     for target in list_targets(find_origin(record)):
-        if (target.node, target.filter) in filtered:
-            predicted = _make_forecast(target.outlook, select_measurements(target, record), u, target.received)
-            forecasts.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
+        if (target.node, target.filter) in filters_with_state:
+            z = select_measurements(target, record)
+            forecast_of_rows = _make_forecast(target.predictor, z, u, target.received)
+            forecasts.setdefault(target.node, {})[target.filter] = replace(forecast_of_rows, time=record.time)
     return forecasts
 
 
-def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
-    """Return the forecast of each row from those before it; z: measurements, u: inputs (rows, ...).
+def _make_forecast(predictor: MultistepPredictor, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
+    """Return a forecast one step ahead whose horizons are the rows, each predicted from the rows before it.
 
-    `names`: of the numbers that arrive.
+    Args:
+        predictor: the filter's predictor.
+        z: measurements (rows, received), NaN for what did not arrive.
+        u: inputs (rows, inputs) that led to each row.
+        names: names of the numbers that arrive.
     """
-    filter, sensor = outlook.filter, first(outlook.sensor)
     rows = np.arange(len(z)), z, u
-    _, moments = scan_rows(_begin, _predict_and_correct, outlook, rows, lambda: _by_xla(outlook, rows))
-    states, outputs, received = moments
-    angles = filter.angles_used() or FilterAngles((), ())
-    measured = outputs and make_prediction(
-        outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
-    )
-    arriving = received and make_prediction(received, names, find_received_claim(filter), angles.received)
-    return Forecast(
+    _, moments = scan_rows(_begin, _predict_and_correct, predictor, rows, lambda: _by_xla(predictor, rows))
+    return combine_predictions(
+        predictor,
+        moments,
+        received_names=names,
         steps=np.ones(len(z), int),
         time=np.arange(float(len(z))),
-        states=make_prediction(states, filter.states, filter.claim, angles.states, outlook.limits),
-        outputs=measured,
-        received=arriving,
-        inputs="given" if filter.inputs else "none",
+        inputs="given" if predictor.filter.inputs else "none",
     )
 
 
-def _begin(outlook: MultistepPredictor) -> PyTree:
+def _begin(predictor: MultistepPredictor) -> PyTree:
     """Return the filter's state before the first row."""
-    return jax.tree.map(jnp.asarray, outlook.filter.init())
+    return jax.tree.map(jnp.asarray, predictor.filter.init())
 
 
 def _predict_and_correct(
-    outlook: MultistepPredictor, state: PyTree, row: tuple[jax.Array, ...]
+    predictor: MultistepPredictor, state: PyTree, row: tuple[jax.Array, ...]
 ) -> tuple[PyTree, PyTree]:
     """Return the state after a row, and the moments (K, ...) that were predicted for it from the earlier rows."""
     k, z, u = row
-    prior, moments = outlook.predict_step(state, u, k)
-    state_after, _ = outlook.filter.correct(prior, z, k)
+    prior, moments = predictor.predict_step(state, u, k)
+    state_after, _ = predictor.filter.correct(prior, z, k)
     return state_after, moments
 
 
-def _predict_each_row(outlook: MultistepPredictor, rows: PyTree) -> tuple[PyTree, PyTree]:
+def _predict_each_row(predictor: MultistepPredictor, rows: PyTree) -> tuple[PyTree, PyTree]:
     """Return the last state, and the moments (rows, K, ...) that a filter predicts for each row of a recording."""
-    return jax.lax.scan(partial(_predict_and_correct, outlook), _begin(outlook), rows)
+    return jax.lax.scan(partial(_predict_and_correct, predictor), _begin(predictor), rows)
 
 
 _by_xla = quickly_compiled(_predict_each_row)

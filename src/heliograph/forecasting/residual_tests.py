@@ -150,7 +150,7 @@ def record_residuals(
         prediction = predicted.get(target.node, {}).get(target.filter)
         if prediction is None:
             continue
-        angles = (target.outlook.filter.angles_used() or FilterAngles((), ())).received
+        angles = (target.predictor.filter.angles_used() or FilterAngles((), ())).received
         of_filter = _standardise(prediction, select_measurements(target, record), angles, LAGS)
         if of_filter is not None:
             found.setdefault(target.node, {})[target.filter] = of_filter
@@ -158,28 +158,33 @@ def record_residuals(
 
 
 def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: int) -> Residuals | None:
-    """Return the residuals of rows (steps, received) and their tests; None where nothing is claimed of what arrives.
+    """Return the standardised residuals e = (z - E z) / deviation of all rows, and tests of each received number.
 
-    `predicted`: one step ahead, of each row; `angles`: indices of the angles among the received numbers; `lags`: number
-    of autocorrelations.
+    Return None if the filter predicts no received numbers, or claims no covariance of them.
+
+    Args:
+        predicted: the forecast one step ahead whose horizons are the rows.
+        rows: measurements z (steps, received), NaN for what did not arrive.
+        angles: indices of the angles among the received numbers.
+        lags: number of autocorrelations.
     """
-    law = predicted.received
-    if law is None or law.claim == "none":
+    prediction = predicted.received
+    if prediction is None or prediction.claim == "none":
         return None
-    # Infinite deviations are those of numbers of which nothing was heard yet.
-    deviation = np.where(np.isfinite(law.deviation), law.deviation, np.nan)
-    values = (wrap_near(rows, law.mean, angles) - law.mean) / deviation
-    columns = [values[:, i] for i in range(values.shape[1])]
-    correlations, errors = zip(*(correlate_over_steps(_subtract_mean(e)[None], lags) for e in columns), strict=True)
+    # A deviation is infinite before the first measurement if nothing is known of the initial state.
+    deviation = np.where(np.isfinite(prediction.deviation), prediction.deviation, np.nan)
+    values = (wrap_near(rows, prediction.mean, angles) - prediction.mean) / deviation
+    by_number = list(values.T)  # residuals e (steps,) of each received number
+    correlations, errors = zip(*(correlate_over_steps(_subtract_mean(e)[None], lags) for e in by_number), strict=True)
     return Residuals(
-        names=law.names,
+        names=prediction.names,
         values=values,
         predicted=predicted,
         autocorrelation=np.stack(correlations, axis=1),
         band=NORMAL * np.array(errors),
-        ljung_box=np.array([_test_correlation(e, lags) for e in columns]),
-        normality=np.array([_test_normality(e) for e in columns]),
-        variance=np.array([_test_same_variance(e) for e in columns]),
+        ljung_box=np.array([_test_correlation(e, lags) for e in by_number]),
+        normality=np.array([_test_normality(e) for e in by_number]),
+        variance=np.array([_test_same_variance(e) for e in by_number]),
     )
 
 

@@ -107,26 +107,26 @@ def draw_paths(
     """
     origin = find_origin(source)
     target = find_target(origin, node, filter)
-    ahead = find_rows_ahead(origin, target.outlook.filter.inputs, horizons, inputs)
-    check_steps_covered(target.outlook.filter, origin.step, len(ahead.u))
-    check_inputs_ahead(target.outlook.filter.inputs, ahead, target.outlook.filter, origin.step)
-    plant, sensor = target.outlook.plant, target.outlook.sensor
+    ahead = find_rows_ahead(origin, target.predictor.filter.inputs, horizons, inputs)
+    check_steps_covered(target.predictor.filter, origin.step, len(ahead.u))
+    check_inputs_ahead(target.predictor.filter.inputs, ahead, target.predictor.filter, origin.step)
+    plant, sensor = target.predictor.plant, target.predictor.sensor
     if plant is None:
-        raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
+        raise fail("paths", "a filter that says what its plant is", type(target.predictor.filter).__name__)
     count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
     # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
     starts = _draw_initial_states(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
-    believer = target.outlook.filter
+    believer = target.predictor.filter
     learned = None
     if isinstance(believer, AdaptiveFilter):
         learned = np.asarray(believer.noise_deviations(target.state, origin.step))
-    limits, switching = StateLimits(target.outlook.limits), _find_switching(target)
+    limits, switching = StateLimits(target.predictor.limits), _find_switching(target)
     x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, switching, learned, limits)
     return Paths(
         steps=ahead.steps,
         time=ahead.time,
-        states=target.outlook.filter.states,
+        states=target.predictor.filter.states,
         outputs=() if sensor is None else tuple(first(sensor).outputs),
         x=np.asarray(x)[:, ahead.rows],
         y=np.asarray(y)[:, ahead.rows],
@@ -165,7 +165,7 @@ class ModeSwitching(NamedTuple):
 
 def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
     """Return how the modes of plant and sensor move, or None if these have no modes."""
-    filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
+    filter, plant, sensor = target.predictor.filter, target.predictor.plant, target.predictor.sensor
     if not memories((plant, sensor)):
         return None
     if isinstance(filter, LimitedFilter):
@@ -186,10 +186,10 @@ def _draw_initial_states(
     Raises:
         ValueError: a filter that claims no covariance, a state of which not all is known.
     """
-    filter = target.outlook.filter
+    filter = target.predictor.filter
     if filter.claim == "none":
         raise fail("paths", "a filter that claims a covariance", f"{type(filter).__name__}, which claims none")
-    weights, means, covariances = (np.asarray(part) for part in target.outlook.moments(target.state)[:3])
+    weights, means, covariances = (np.asarray(part) for part in target.predictor.moments(target.state)[:3])
     if not np.isfinite(covariances).all():
         raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
@@ -201,7 +201,7 @@ def _draw_initial_states(
         modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
     # States with limits first, then the others given these: the part's mean, plus a root of its covariance times
     # standard normal numbers. Attitudes are turned.
-    center, covariances = draw_limited_components(part, means, covariances, target.outlook.limits, generator)
+    center, covariances = draw_limited_components(part, means, covariances, target.predictor.limits, generator)
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))

@@ -45,7 +45,7 @@ from heliograph.random_affine.sum_of_maps import Superposed
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
 
-# A hop by itself; one with a delay; and one whose receiver is told the gain, which stands below z in a stack.
+# The result's type by the arguments. Without delay, z = amplification sqrt(power) g y + n is a `GainAndNoise`.
 @overload
 def hop(
     gain: LawLike,
@@ -55,6 +55,7 @@ def hop(
     dimension: int = 1,
     delay: None = None,
 ) -> GainAndNoise: ...
+# With a delay of d steps, z_k = amplification sqrt(power) g_k y_{k-d} + n_k is a `DelayedLink`.
 @overload
 def hop(
     gain: LawLike,
@@ -65,6 +66,7 @@ def hop(
     *,
     delay: Delay,
 ) -> DelayedLink: ...
+# With the gain g, or a pilot's reading of it, reported with each message, (z, g) is a `Stack`.
 @overload
 def hop(
     gain: LawLike,
@@ -151,12 +153,13 @@ def silent(
 def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Return the chain `hops` through relays that amplify what they receive, noise included: z = H_N ... H_2 H_1 y.
 
-    Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
-    be late, and the delays add up; a relay with a random delay may forward one value twice, with one noise m.
+    Two hops, sensor to relay r_k = sqrt(E_l) gamma y + m and relay to filter z = a sqrt(E_r) xi r + n, give
+    z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Here gamma and xi are the random gains, E_l and E_r the
+    transmitted powers, m and n the noises, and a is the relay's amplification. Each hop may be late, and the delays add
+    up; a relay with a random delay may forward one value twice, with one noise m.
 
     Args:
-        hops: in the order of the way, from the sensor to the filter; each takes as many components as the one before
-            sends.
+        hops: from the sensor's to the filter's; each takes as many components as the one before sends.
 
     Raises:
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
@@ -198,13 +201,13 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
 
-    def mix_with_silence(links: Sequence[AbstractRandomAffine]) -> Mixture:
-        """Return the only link with probability p, the arrival's, else silence."""
+    def mix_with_zero(links: Sequence[AbstractRandomAffine]) -> Mixture:
+        """Return the mixture of the one link in `links`, with the arrival probability p, and of z = 0."""
         (link,) = links
         return Mixture([link, silent(link.outputs, link.inputs)], library(p).stack([p, 1 - p]), radius)
 
-    # Numbers that the channel tells its receiver beside z are not lost with it.
-    return build_with_told_numbers(mix_with_silence, check_maps("dropout", [channel]))
+    # Numbers that the channel reports to its receiver after z are not lost with z.
+    return build_with_told_numbers(mix_with_zero, check_maps("dropout", [channel]))
 
 
 def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
@@ -232,8 +235,8 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    # A memory without a name (such as fading) that stands in both channels becomes two. Numbers that a channel tells
-    # its receiver follow its own outputs.
+    # A memory without a name (such as fading) that stands in both channels becomes two. Numbers that a channel reports
+    # to its receiver follow its own outputs.
     channels = separate_memories(check_maps("stack", [relayed, direct]))
     return stack_channels_with_told_numbers(_delay_all_like_latest, channels)
 
@@ -287,12 +290,18 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
             flags or time stamps, which would be added up.
     """
     separate = separate_memories(check_maps("links of a sum", links))  # one object given twice is two links
-    # Numbers that a link tells the receiver, such as its gain, arrive beside the sum.
+    # Numbers that a link reports to the receiver, such as its gain, arrive after the sum.
     return build_with_told_numbers(partial(_add_up_links, noise=noise, same=same), separate)
 
 
 def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool) -> Superposed:
-    """Check links without what is told of them, place each on the signal, and add them up."""
+    """Return the sum of links and a noise as one map of the delay line (y_k, ..., y_{k-past}), stacked.
+
+    Args:
+        links: the links, without the numbers that they report to the receiver.
+        noise: law, covariance or variance of the receiver's noise.
+        same: True if every link carries all of y, False if each carries its own part of y, one part after another.
+    """
     for i, link in enumerate(links, 1):
         _check_can_be_added(f"link {i} of a sum", link)
     sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]
@@ -301,12 +310,13 @@ def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same:
     if instance("same", same, bool, "True or False") and len(set(sent)) > 1:
         raise fail("links of a sum (same=True)", "links that all carry all of y", f"links of {sent} numbers")
     past, total = max(link.past for link in links), sent[0] if same else sum(sent)
-    starts = [0] * len(links) if same else np.cumsum([0, *sent[:-1]]).tolist()
-    places = [
-        tuple(t * total + start + i for t in range(link.past + 1) for i in range(size))
-        for link, start, size in zip(links, starts, sent, strict=True)
-    ]
-    return Superposed(links, as_noise("noise of a sum", noise, sizes[0]), places, (1 + past) * total)
+    starts = [0] * len(links) if same else np.cumsum([0, *sent[:-1]]).tolist()  # of each link's part in y
+    components_by_link = []
+    for link, start, size in zip(links, starts, sent, strict=True):
+        # y_{k-t} begins at t * total in the delay line. A link takes its part of y_k, ..., y_{k-link.past}.
+        part_starts = [t * total + start for t in range(link.past + 1)]
+        components_by_link.append(tuple(part_start + i for part_start in part_starts for i in range(size)))
+    return Superposed(links, as_noise("noise of a sum", noise, sizes[0]), components_by_link, (1 + past) * total)
 
 
 def _check_can_be_added(name: str, link: AbstractRandomAffine) -> None:

@@ -1,6 +1,6 @@
-"""Channel side information: gains, pilots' readings of gains, and numbers of quality that come with each message.
+"""Channel side information: gains, pilots' readings of gains, or noise variances that are reported with each message.
 
-A channel that tells delivers z, and then the told numbers, of which the law of its link is a function.
+Such a channel delivers z, and then the reported ("told") numbers, on which the law of its link depends.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,8 +16,6 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
-    FreshNumbers,
-    FreshReading,
     PilotedHop,
     ToldGainHop,
     ToldMap,
@@ -28,6 +26,7 @@ from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 from heliograph.random_affine.series_and_stack import Stack
 
 M = TypeVar("M", bound=AbstractRandomAffine)
@@ -131,35 +130,41 @@ KnownGain = TypeAliasType("KnownGain", bool | Pilot)  # of a hop: told, by a pil
 
 
 def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
-    """Return a hop that delivers its gain, or a pilot's reading of it, after z; for `known` False the hop itself.
+    """Return a hop z = g A y + n with a reported number after z: the gain g, or a pilot's reading a = g + e of it.
 
-    `known`: True for the gain itself, or a Pilot, whose reading is the gain plus noise.
+    `known` is True if messages report g itself, a `Pilot`, which has the variance of e, if they report a, and False if
+    they report nothing: then the hop is returned unchanged.
     """
     if known is False:
         return hop
     if isinstance(known, Pilot):
-        reading = FreshReading(hop.law, known.noise)
-        return append_told_numbers(PilotedHop(reading, hop.matrix, hop.noise, known.fresh))
+        gain_and_reading = FreshReading(hop.law, variance=known.noise)
+        piloted_hop = PilotedHop(gain_and_reading, hop.matrix, hop.noise, fresh=known.fresh)
+        return append_told_numbers(piloted_hop)
     instance("known", known, bool, "True, False or a Pilot")
-    gain, hop_of_known_gain = FreshNumbers(hop.law, 1), ToldGainHop(hop.matrix, hop.noise)
-    mean_gain = np.asarray([hop.law.moment(1)])
-    return append_told_numbers(ToldMap(gain, hop_of_known_gain, mean_gain, ("gain",)))
+    told_hop = ToldMap(
+        memory=FreshNumbers(hop.law, count=1),
+        make=ToldGainHop(hop.matrix, hop.noise),
+        typical=np.asarray([hop.law.moment(1)]),
+        names=("gain",),
+    )
+    return append_told_numbers(told_hop)
 
 
 def append_told_numbers(link: AbstractRandomAffine) -> Stack:
-    """Return a link with the numbers that are told of its maps after z."""
+    """Return a link that delivers, after z, the numbers that each message reports of the maps inside the link."""
     return Stack([link, *_list_told_outputs(link, link.inputs)])
 
 
 def _list_told_outputs(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
-    """Return the outputs that tell what each told map of a link tells, beside `sent` numbers."""
+    """Return a map to the reported numbers of each told map in a link; each takes the `sent` numbers with gain 0."""
     return [ModeOutput(affine.memory, sent) for affine in list_told_maps(link)]
 
 
 class SeparatedToldNumbers(NamedTuple):
-    """A channel taken apart: the link of the values, and the rows of z in which values and told numbers stand.
+    """A channel taken apart: its link without reported numbers, and the rows of z with the link's values and with them.
 
-    Numbers are in the order of the link's `list_told_maps`, each once.
+    Reported numbers are in the order of the link's `list_told_maps`, each once.
     """
 
     link: AbstractRandomAffine
@@ -168,82 +173,86 @@ class SeparatedToldNumbers(NamedTuple):
 
 
 def separate_told_numbers(channel: AbstractRandomAffine) -> SeparatedToldNumbers:
-    """Take a channel apart into its link, the rows of its outputs, and the rows of the numbers told about it.
+    """Return a channel's link without reported numbers, the rows of z of the link, and those of the reported numbers.
 
-    A channel that tells nothing is its own link, and all its rows are outputs.
+    A stack delivers reported numbers by maps of their own (`ModeOutput`), which are taken out. They belong to a map in
+    the link that depends on the same memory. A channel that reports nothing is its own link, with all rows.
     """
-    maps = channel.maps if isinstance(channel, Stack) else (channel,)
-    told_of = {affine.memory.identity for affine in list_told_maps(channel)}
-    rows, links, at_row = dict[str, tuple[int, ...]](), list[AbstractRandomAffine](), 0
-    values: tuple[int, ...] = ()
-    for part in maps:
-        places = tuple(range(at_row, at_row + part.outputs))
-        at_row += part.outputs
-        if isinstance(part, ModeOutput) and part.memory.identity in told_of:
-            rows.setdefault(part.memory.identity, places)
+    stacked_maps = channel.maps if isinstance(channel, Stack) else (channel,)
+    memories_of_told_maps = {affine.memory.identity for affine in list_told_maps(channel)}
+    rows_of_numbers, links = dict[str, tuple[int, ...]](), list[AbstractRandomAffine]()  # rows by memory
+    rows_of_values: tuple[int, ...] = ()
+    start = 0  # first row of the map
+    for affine in stacked_maps:
+        rows = tuple(range(start, start + affine.outputs))
+        start += affine.outputs
+        if isinstance(affine, ModeOutput) and affine.memory.identity in memories_of_told_maps:
+            rows_of_numbers.setdefault(affine.memory.identity, rows)
         else:
-            links.append(part)
-            values += places
-    if not rows:
-        return SeparatedToldNumbers(channel, values, ())
+            links.append(affine)
+            rows_of_values += rows
+    if not rows_of_numbers:
+        return SeparatedToldNumbers(channel, values=rows_of_values, numbers=())
     link = links[0] if len(links) == 1 else Stack(links)
-    numbers = [row for affine in list_told_maps(link) for row in rows[affine.memory.identity]]
-    return SeparatedToldNumbers(link, values, tuple(numbers))
+    numbers = [row for told_map in list_told_maps(link) for row in rows_of_numbers[told_map.memory.identity]]
+    return SeparatedToldNumbers(link, values=rows_of_values, numbers=tuple(numbers))
 
 
 def build_with_told_numbers(
     build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]
 ) -> M:
-    """Return what `build` makes of the channels, with all numbers that the channels tell after its outputs.
+    """Return a channel that `build` makes of the channels' links, followed by all numbers that the channels report.
 
-    A channel may tell its receiver numbers about itself, such as its present gain. These do not go through what is
-    built: `build` gets the links without them, and they are delivered unchanged.
+    A channel may report to its receiver numbers about itself, such as its present gain, after its outputs. These must
+    not pass through what is built, such as a relay. So `build` gets the links without reported numbers, and the result
+    delivers them unchanged after its own outputs.
     """
     links = [separate_told_numbers(channel).link for channel in channels]
     built = build(links)
-    # A channel that tells its receiver nothing is its own link.
-    have_told_numbers = any(link is not channel for link, channel in zip(links, channels, strict=True))
-    return cast(M, append_told_numbers(built)) if have_told_numbers else built
+    # A channel that reports nothing is its own link.
+    report_numbers = any(link is not channel for link, channel in zip(links, channels, strict=True))
+    return cast(M, append_told_numbers(built)) if report_numbers else built
 
 
 def stack_channels_with_told_numbers(
-    place: Callable[[list[AbstractRandomAffine]], list[AbstractRandomAffine]], channels: Sequence[AbstractRandomAffine]
+    widen: Callable[[list[AbstractRandomAffine]], list[AbstractRandomAffine]], channels: Sequence[AbstractRandomAffine]
 ) -> Stack:
-    """Return channels side by side, each with the numbers that it tells after its own outputs.
-
-    Told numbers come with a message and say what the link did to it, such as its gain.
+    """Return channels side by side, each followed by the numbers that it reports to its receiver, such as its gain.
 
     Args:
-        place: takes the channels' links, each of its own signal, and returns as many links of the joined signal.
+        widen: function that takes the channels' links without reported numbers, each a map of its own signal, and
+            returns as many maps of the whole signal, from which each selects its own.
         channels: the channels.
     """
     links, maps = [separate_told_numbers(channel).link for channel in channels], list[AbstractRandomAffine]()
-    for link, channel, placed_link in zip(links, channels, place(links), strict=True):
-        maps.append(placed_link)
-        # A channel that tells nothing is its own link. For any other channel, append what it tells.
+    for link, channel, widened_link in zip(links, channels, widen(links), strict=True):
+        maps.append(widened_link)
+        # A channel that reports nothing is its own link. For any other, append maps to the reported numbers.
         if link is not channel:
-            maps += _list_told_outputs(placed_link, placed_link.inputs)
+            maps += _list_told_outputs(widened_link, widened_link.inputs)
     return Stack(maps)
 
 
 def name_received_values(outputs: tuple[str, ...], channel: AbstractRandomAffine, more: int = 0) -> tuple[str, ...]:
-    """Return names of what is received: of values those of the outputs where these are as many, else z0, z1, ...
+    """Return the names of all received numbers, in the order of rows of z.
+
+    Values have the names of the sensor's outputs if there are as many, else z0, z1, ... Numbers that the channel
+    reports about itself have their maps' names for them, such as "gain"; equal names get _1, _2, ... behind them.
 
     Args:
         outputs: names of the sensor's outputs.
-        channel: from the sensor to the receiver; told numbers have names of their own.
-        more: how many numbers are received beside what the channel delivers.
+        channel: from the sensor to the receiver.
+        more: number of values that are received in addition to those of the channel, such as flags of lost messages.
     """
-    link, rows_of_values, rows_of_told_numbers = separate_told_numbers(channel)
-    count = len(rows_of_values) + more
-    names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
-    told_names = [name for affine in list_told_maps(link) for name in affine.names] if rows_of_told_numbers else []
-    # Of several told numbers of one name each has a number behind it.
-    distinct = [
+    link, rows_of_values, rows_of_numbers = separate_told_numbers(channel)
+    value_count = len(rows_of_values) + more
+    names = list(outputs if len(outputs) == value_count else (f"z{i}" for i in range(value_count)))
+    told_names = [name for affine in list_told_maps(link) for name in affine.names] if rows_of_numbers else []
+    distinct_names = [
         f"{name}_{told_names[:i].count(name) + 1}" if told_names.count(name) > 1 else name
         for i, name in enumerate(told_names)
     ]
-    # From the first row to the last, so that each name is inserted at the place that it has in the end.
-    for row, name in sorted(zip(rows_of_told_numbers, distinct, strict=True)):
+    # In the order of rows, so that each name is inserted at the index that it has in the end.
+    for row, name in sorted(zip(rows_of_numbers, distinct_names, strict=True)):
         names.insert(row, name)
     return tuple(names)

@@ -213,7 +213,10 @@ def without_memory(channel: Channel) -> Channel:
 def memory_matters(channel: Channel) -> bool:
     """Return whether mean gains are correlated over time, so that a linear filter without memory claims too much.
 
-    Memory in only the variance of noise does not matter to such a filter. An uncertain chain always may matter.
+    A linear filter without memory assumes Cov(E[H_k | mode], E[H_l | mode]) = 0 for steps k and l. A sum of links may
+    have independent fadings: this is tested for each group of links that share a fading, on its joint modes. Memory in
+    only the variance of noise does not matter. A chain with uncertain transitions counts as one that matters, since
+    some possible law may be correlated.
 
     Args:
         channel: the channel of a node; it may vary over time.
@@ -225,12 +228,12 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    # Split the channel into a sum of terms without common memory; a term is the list of its maps over all steps.
-    terms = zip(*(split_terms_without_common_memory(step) for step in unstack(channel)), strict=True)
+    # The channel is a sum of independent terms. A term is the list of its maps over all steps.
+    terms_by_step = [split_terms_without_common_memory(step) for step in unstack(channel)]
     is_constant = not isinstance(channel, OverTime)
-    for maps_of_term in terms:
-        modes = [joint_modes(step) for step in maps_of_term]
-        if not is_memory_irrelevant_for_linear_filter(modes, is_constant):
+    for maps_of_term in zip(*terms_by_step, strict=True):
+        modes_by_step = [joint_modes(step) for step in maps_of_term]
+        if not is_memory_irrelevant_for_linear_filter(modes_by_step, is_constant):
             return True
     return False
 

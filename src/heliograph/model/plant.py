@@ -95,7 +95,7 @@ class AbstractPlant(Module):
 
     @property
     def manifold(self) -> Manifold:
-        """Which states are angles and attitudes: what a change of a state, and a difference of two, is."""
+        """The indices of the states that are angles or attitudes, with the addition and subtraction of such states."""
         return Manifold(self.angles, tuple(self.states.index(name) for name in self.attitude))
 
     def difference(self, x: A, other: A) -> A:

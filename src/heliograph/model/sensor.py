@@ -76,17 +76,16 @@ class AbstractSensor(Module):
         return self
 
     def under(self, names: Sequence[str], u: Array) -> "AbstractSensor":
-        """Return the sensor under inputs u of a plant, called `names`; it takes those that it depends on."""
+        """Return the sensor under the inputs u of a plant, whose names are `names`: a sensor that depends on none."""
         if not self.inputs:
             return self
         places = np.array([list(names).index(name) for name in self.inputs])
         return _sensor_under_inputs(self, u[places])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
-        """Return the sensor under typical inputs; raise ValueError if the plant lacks an input of the sensor.
+        """Return the sensor under example inputs; raise ValueError if the plant, with inputs `names`, lacks one of its.
 
-        Typical inputs are not whole numbers, so that an angle times one is no full turn. `names`: of the plant's
-        inputs.
+        The examples are not whole numbers. Else h(x) = u * angle would seem unchanged by a full turn of the angle.
         """
         lacking = [name for name in self.inputs if name not in names]
         if lacking:

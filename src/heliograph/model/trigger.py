@@ -74,7 +74,11 @@ class AbstractTrigger(Module):
         return self.reference in ("sent", "acknowledged")
 
     def side_information(self, outputs: int) -> int:
-        """Return how many numbers about lost transmissions arrive after z: none, one, or one for each component."""
+        """Return how many numbers about lost transmissions arrive after z.
+
+        There are none if the receiver does not learn of losses ("unknown"). Else there is one, or one for each of the
+        `outputs` if components of y are sent in messages of their own (region "each").
+        """
         if self.losses == "unknown":
             return 0
         return outputs if self.region == "each" else 1
@@ -128,22 +132,24 @@ class AbstractTrigger(Module):
     def receive_if_sent(
         self, sender: SenderState, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[SenderState, jax.Array]:
-        """Return the sender after the step, and what the receiver gets, NaN where the rule does not send.
+        """Return the sender after the step, and what the receiver gets: z with NaN where the rule does not send.
+
+        After z come the numbers about lost transmissions, of length `side_information`, if the receiver learns of them.
 
         Args:
             sender: the sender before the step.
-            y: the measurement; the rule decides which components of it are sent.
+            y: the measurement (m,); the rule decides which components of it are sent.
             z: what the channel would deliver of y, NaN where it would lose it.
             key: random key, for rules that draw.
             k: number of the step.
         """
-        # A component is sent if its reason is above 0, and present if the channel would not lose it.
-        reason, is_present = self.reasons(sender, y, key, k), ~jnp.isnan(z)
-        # Components are sent one by one, or all in one message.
-        one_by_one = self.region == "each"
-        arrived = is_present if one_by_one else jnp.full(len(y), jnp.any(is_present))
-        sent = reason > 0 if one_by_one else jnp.any(reason > 0)
-        received = jnp.concatenate([jnp.where(sent, z, jnp.nan), self.known_losses(sender, reason, arrived)])
+        reason, would_arrive = self.reasons(sender, y, key, k), ~jnp.isnan(z)  # a reason above 0: it is sent
+        # In region "each" every component is a message of its own. Else all components are one message.
+        has_messages_by_component = self.region == "each"
+        arrived = would_arrive if has_messages_by_component else jnp.full(len(y), jnp.any(would_arrive))
+        sent = reason > 0 if has_messages_by_component else jnp.any(reason > 0)
+        numbers_about_losses = self.known_losses(sender, reason, arrived)
+        received = jnp.concatenate([jnp.where(sent, z, jnp.nan), numbers_about_losses])
         return self.after(sender, y, reason, arrived), received
 
     def known_losses(self, sender: SenderState, reason: jax.Array, arrived: jax.Array) -> jax.Array:
@@ -289,12 +295,15 @@ class StochasticTrigger(AbstractTrigger):
         return weight * jnp.eye(outputs) if weight.ndim == 0 else weight
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """Return a draw that exceeds exp(-e' W e / 2)."""
-        silent = jnp.exp(-error @ self.matrix(len(error)) @ error / 2)
-        return jnp.full(len(error), jax.random.uniform(key, dtype=float) > silent)
+        """Return (m,) True with probability 1 - exp(-e' W e / 2), e = `error`, by one draw for all components."""
+        probability_of_silence = jnp.exp(-error @ self.matrix(len(error)) @ error / 2)
+        return jnp.full(len(error), jax.random.uniform(key, dtype=float) > probability_of_silence)
 
     def known_losses(self, sender: SenderState, reason: jax.Array, arrived: jax.Array) -> jax.Array:
-        """Return the link's state, 1 where it is down, whether anything is sent or not: so silence stays Gaussian."""
+        """Return 1 if the link is down, else 0, whether anything is sent or not.
+
+        So the receiver can tell a lost transmission from none. That none was sent then has a Gaussian likelihood.
+        """
         return (~arrived).astype(float)[: self.side_information(len(arrived))]
 
     def check_outputs(self, outputs: int) -> None:
@@ -326,7 +335,7 @@ class Periodic(AbstractTrigger):
         self.reference, self.losses, self.region, self.heartbeat = "zero", "unknown", "box", None
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """Return k = phase (mod period)."""
+        """Return (m,) whether y is sent at step k: k = phase modulo the period."""
         return jnp.full(len(error), k % self.period == self.phase)
 
     def _event_reason(self) -> int:

@@ -1,6 +1,7 @@
 """Whether a function of states returns the same after a full turn (2 pi) of an angle, or of an attitude."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,16 @@ SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave 
 SOME_TURN = (0.3, -0.2, 0.5)  # radians, about the three axes or of any states: no attitude is at rest there
 SOME_INPUTS = (0.6, 0.9, 0.7)  # above 0, as a time is; not whole, lest a full turn times one is full turns
 
-Turned = tuple[np.ndarray, Sequence[np.ndarray] | np.ndarray, tuple[np.ndarray, ...]]  # a state, its forms, the rest
+
+class EqualStates(NamedTuple):
+    """A state x, other vectors that are the same state by full turns of angles or attitudes, and f's other arguments.
+
+    f(x, *rest) is then compared with f(x', *rest) for each x' among `turned`.
+    """
+
+    state: np.ndarray
+    turned: Sequence[np.ndarray] | np.ndarray
+    rest: tuple[np.ndarray, ...]
 
 
 def check_turn_invariance(
@@ -47,60 +57,65 @@ def check_turn_invariance(
     # A state that is no special case, with rates that are not 0: at 0 sin(angle / 2) and angle * rate hide.
     center = np.asarray(center)
     general_state = given.plus(center, np.resize(SOME_TURN, len(center)))
-    some = tuple(np.resize(SOME_INPUTS, len(values)) for values in rest)
+    example_rest = tuple(np.resize(SOME_INPUTS, len(values)) for values in rest)
     # Angles: a full turn more in each of them, at the center too.
     turns = TURN * np.eye(len(center))[list(given.angles)]
     if len(turns):
-        at_both = [(center, center + turns, rest), (general_state, general_state + turns, some)]
-        _compare_turned(f"{name} with circular states", function, at_both, results)
+        cases = [
+            EqualStates(center, center + turns, rest),
+            EqualStates(general_state, general_state + turns, example_rest),
+        ]
+        _compare_turned(f"{name} with circular states", function, cases, results)
     # Attitudes: by the other rotation vector of each.
     attitudes = [given.rotations[i : i + 3] for i in range(0, len(given.rotations), 3)]
-    others = [_turn_attitude_long_way_round(general_state, places) for places in attitudes]
-    if others:
+    turned = [_turn_attitude_long_way_round(general_state, components) for components in attitudes]
+    if turned:
         kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
-        _compare_turned(kind, function, [(general_state, others, some)], results)
+        _compare_turned(kind, function, [EqualStates(general_state, turned, example_rest)], results)
 
 
-def _compare_turned(name: str, function: Callable[..., jax.Array], places: Sequence[Turned], results: Manifold) -> None:
+def _compare_turned(
+    name: str, function: Callable[..., jax.Array], cases: Sequence[EqualStates], results: Manifold
+) -> None:
     """Raise ValueError where f differs, by more than full turns of its results, at states that are one and the same.
 
     Args:
         name: of what has the function, for the error.
         function: f.
-        places: states, other forms of each, and what else f takes there.
+        cases: a state x, the same state with full turns, and the other arguments of f for these.
         results: which components of f(x) are angles and attitudes.
     """
-    # f at every state and at each of its other forms, by one compiled program.
-    points = np.concatenate([np.stack([state, *turned]) for state, turned, _ in places])
-    counts = [1 + len(turned) for _, turned, _ in places]
-    by_point = [rest for (*_, rest), count in zip(places, counts, strict=True) for _ in range(count)]
-    rests = tuple(np.stack(values) for values in zip(*by_point, strict=True))
+    # One compiled program evaluates f at all points: x and the turned states of every case.
+    points = np.concatenate([np.stack([case.state, *case.turned]) for case in cases])
+    counts = [1 + len(case.turned) for case in cases]
+    rest_by_point = [case.rest for case, count in zip(cases, counts, strict=True) for _ in range(count)]
+    rests = tuple(np.stack(values) for values in zip(*rest_by_point, strict=True))  # (points, ...) of each argument
     try:
-        found = np.asarray(compute_once(_evaluate_at_points, _values_by_xla, (function, points, rests)))
+        values_at_points = np.asarray(compute_once(_evaluate_at_points, _values_by_xla, (function, points, rests)))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number
         return
     # Differences but for full turns, beyond the rounding of 2 pi in a steep function.
-    for (state, turned, _), values in zip(places, np.split(found, np.cumsum(counts)[:-1]), strict=True):
-        for value, other in zip(values[1:], turned, strict=True):
-            change = np.abs(results.difference(value, values[0]))
-            if np.any(change > SAME * (1 + np.abs(values[0]))):
-                numbers = np.flatnonzero(other != state).tolist()
-                words = f"state {numbers[0]}" if len(numbers) == 1 else f"states {numbers}"
-                got = f"a change of {change.max():.3g} by a turn of {words}"
+    for case, (value, *turned_values) in zip(cases, np.split(values_at_points, np.cumsum(counts)[:-1]), strict=True):
+        for turned_value, turned in zip(turned_values, case.turned, strict=True):
+            change = np.abs(results.difference(turned_value, value))
+            if np.any(change > SAME * (1 + np.abs(value))):
+                numbers = np.flatnonzero(turned != case.state).tolist()
+                states = f"state {numbers[0]}" if len(numbers) == 1 else f"states {numbers}"
+                got = f"a change of {change.max():.3g} by a turn of {states}"
                 raise fail(name, "one that a full turn does not change", got)
 
 
-def _turn_attitude_long_way_round(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
+def _turn_attitude_long_way_round(x: np.ndarray, components: Sequence[int]) -> np.ndarray:
     """Return the state with the other rotation vector of the same attitude, r (1 - 2 pi / |r|): the turn the other way.
 
     Args:
         x: the state.
-        places: places of the rotation vector's three components in the state.
+        components: indices of the three components of the rotation vector r in the state.
     """
-    r = x[list(places)]
-    other: np.ndarray = x.copy()
-    other[list(places)] = r * (1 - TURN / np.linalg.norm(r))
-    return other
+    r = x[list(components)]
+    turned: np.ndarray = x.copy()
+    turned[list(components)] = r * (1 - TURN / np.linalg.norm(r))
+    return turned
 
 
 def _evaluate_at_points(

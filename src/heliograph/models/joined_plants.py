@@ -109,27 +109,34 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
 
 
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
-    """Return centre and law of the initial state of plants side by side; where some is unknown, of the others.
+    """Return initial mean and initial law of several plants' joint state, the arguments of the joint plant.
+
+    If all starts are known, x_0 = center + d: the joint law is that of the independent deviations d, and the center is
+    E[x_0] - E[d], since a law may have a mean of its own. If the start of some states is unknown (a diffuse prior),
+    the law is their names with the covariance of the other states.
 
     Raises:
-        ValueError: a law of x_0 that is not Gaussian beside a start that nobody knows.
+        ValueError: some start is unknown, and another plant's law of x_0 is not Gaussian.
     """
-    spreads = [plant.initial_covariance for plant in parts]
-    if not any(isinstance(spread, UnknownStart) for spread in spreads):
-        laws = [plant.deviation or Gaussian(spread) for plant, spread in zip(parts, spreads, strict=True)]
+    covariances = [plant.initial_covariance for plant in parts]
+    if not any(isinstance(covariance, UnknownStart) for covariance in covariances):
+        laws = [plant.deviation or Gaussian(covariance) for plant, covariance in zip(parts, covariances, strict=True)]
         centers = [plant.initial_mean - law.mean for plant, law in zip(parts, laws, strict=True)]
         return library(*centers).concatenate(centers), Independent(laws)
     for plant in parts:
         if plant.deviation is not None:
             expected = "a Gaussian one (a covariance) beside a start that nobody knows"
             raise fail("law of x_0 of a joined plant", expected, type(plant.deviation).__name__)
-    names, known = list[str](), []
-    for plant, spread in zip(parts, spreads, strict=True):
-        unknown = spread.unknown if isinstance(spread, UnknownStart) else ()
-        names += [name for name, nobody_knows in zip(plant.states, unknown, strict=False) if nobody_knows]
-        known.append(spread.known if isinstance(spread, UnknownStart) else spread)
+    unknown_states, known_covariances = list[str](), []
+    for plant, covariance in zip(parts, covariances, strict=True):
+        if isinstance(covariance, UnknownStart):
+            unknown_states += [name for name, unknown in zip(plant.states, covariance.unknown, strict=False) if unknown]
+            known_covariances.append(covariance.known)
+        else:
+            known_covariances.append(covariance)
     means = [plant.initial_mean for plant in parts]
-    return library(*means).concatenate(means), DiffuseStart()(names, block_diagonal(known))
+    diffuse_start = DiffuseStart()(unknown_states, block_diagonal(known_covariances))
+    return library(*means).concatenate(means), diffuse_start
 
 
 def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:

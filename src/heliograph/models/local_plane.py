@@ -225,22 +225,33 @@ def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray,
 def _subtract_on_meridian(
     origin: float, height: float, phi: np.ndarray, rise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return r - r_0 and z - z_0 of a point, its latitude and height given by their differences to the origin's.
+    """Return r - r_0 and z - z_0, in metres, of a point on the ellipsoid's meridian relative to the origin.
 
-    Differences of sines, cosines and N as products: nothing large is subtracted.
+    r = (N + h) cos lat is the distance from the earth's axis, z = (N (1 - e^2) + h) sin lat the height above the
+    plane of the equator, and N = a / w, w = sqrt(1 - e^2 sin^2 lat), the radius of curvature across the meridian. All
+    differences are written as products, so that no large numbers are subtracted, which would lose digits.
+
+    Args:
+        origin: latitude lat_0 of the origin in radians.
+        height: height h_0 of the origin in metres.
+        phi: lat - lat_0 in radians.
+        rise: h - h_0 in metres.
     """
-    latitude = origin + phi
-    half, middle = np.sin(phi / 2), origin + phi / 2
-    sine, cosine = 2 * np.cos(middle) * half, -2 * np.sin(middle) * half  # sin lat - sin lat_0, cos lat - cos lat_0
+    latitude, middle = origin + phi, origin + phi / 2
+    sine_change = 2 * np.cos(middle) * np.sin(phi / 2)  # sin lat - sin lat_0
+    cosine_change = -2 * np.sin(middle) * np.sin(phi / 2)  # cos lat - cos lat_0
     w_0 = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(origin) ** 2)
     w = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
-    normal = SEMI_MAJOR / w_0
-    squares = SQUARED_ECCENTRICITY * np.sin(2 * middle) * np.sin(phi)  # w_0^2 - w^2
-    growth = SEMI_MAJOR * squares / (w * w_0 * (w + w_0))  # N - N_0
-    r = (growth + rise) * np.cos(latitude) + (normal + height) * cosine
-    flat = 1 - SQUARED_ECCENTRICITY
-    z = (growth * flat + rise) * np.sin(latitude) + (normal * flat + height) * sine
-    return r, z
+    N_0 = SEMI_MAJOR / w_0
+    # w_0^2 - w^2 = e^2 (sin^2 lat - sin^2 lat_0), so N - N_0 = a (w_0^2 - w^2) / (w w_0 (w + w_0)).
+    squares_change = SQUARED_ECCENTRICITY * np.sin(2 * middle) * np.sin(phi)
+    N_change = SEMI_MAJOR * squares_change / (w * w_0 * (w + w_0))
+    # Products change by (change of the first) (second) + (first)_0 (change of the second).
+    r_change = (N_change + rise) * np.cos(latitude) + (N_0 + height) * cosine_change
+    squared_axis_ratio = 1 - SQUARED_ECCENTRICITY
+    z_change = (N_change * squared_axis_ratio + rise) * np.sin(latitude)
+    z_change = z_change + (N_0 * squared_axis_ratio + height) * sine_change
+    return r_change, z_change
 
 
 def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:

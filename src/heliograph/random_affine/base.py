@@ -43,13 +43,11 @@ class AbstractRandomAffine(Module):
     Laws: `sample` and `moments` describe one distribution (heliograph.testing.check_random_affine compares them);
     (G, n) are independent of y, but not of each other: a shared hop makes them dependent.
 
-    A map that forgets is drawn independently at each step: it defines `sample`. A map that remembers has a state, of
+    A map that forgets is drawn independently at each step: it defines `sample`. A map that remembers has a state, on
     which the next draw depends: it defines `init` and `draw`, and says so by `remembers`. A map that holds others
-    remembers where one of them does, and then must pass their states on; but not those of modes (`AbstractModal`),
-    which are known here: a map is drawn given the states of the memories inside, one for each however often it is held.
-
-    A class says its sizes, how it is drawn, and its moments. Whatever else may be asked of it is a method below, with
-    an answer that holds for any map, or a refusal in one line; a class says more where it knows more.
+    passes their states on; but not those of modes (`AbstractModal`), each of which is drawn once here, however many
+    maps inside share it. A class says its sizes, how it is drawn, and its moments, and whatever else it knows: the
+    methods below answer for any map, or refuse.
     """
 
     formulas = "moments", "mean_gain", "list_atoms", "extremes", "list_outcomes"
@@ -193,20 +191,23 @@ class AbstractRandomAffine(Module):
         return np.zeros(self.outputs, dtype=bool)
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the indices of outputs that are angles, from those of the inputs.
+        """Return the indices of the components of z that are angles, from `sent`, the indices of the angles in y.
 
         Raises:
-            ValueError: angles that are no angles behind this map, as behind a gain but 1; in this default, any angles.
+            ValueError: an angle of y is multiplied by a gain other than 1; in this default, any angle is sent.
         """
         if sent:
             raise refuse_gain_on_angles(type(self).__name__)
         return ()
 
     def carry_signal(self, signal: SignalMoment) -> SignalMoment:
-        """Return E (z, 1)(z, 1)' of what arrives behind the map and the probability that it does, from those of y.
+        """Return the second moment E[(z, 1) (z, 1)'] of the output given that it arrives, and P(it arrives).
+
+        `signal` holds the same of y. This default is for maps without losses: E[Sym^2(H)] gives the moment, and the
+        probability stays. A relay behind this map transmits with a power that follows from the moment.
 
         Raises:
-            ValueError: a map that erases, in this default, which does not know the probability.
+            ValueError: the map erases, so that this default does not know with which probability z arrives.
         """
         if self.erases:
             raise fail("transmitter behind a loss", "a chain that erases", type(self).__name__)
@@ -229,10 +230,7 @@ class AbstractRandomAffine(Module):
         return self
 
     def list_outcomes(self) -> list["ArrivalOutcome"]:
-        """Return every set of losses of a map without memory: its probability, the map given it, and what arrives.
-
-        Sets of probability 0 are left out.
-        """
+        """Return each set of losses that may happen to a map without memory, with its probability, map and arrivals."""
         check_forgets("channel with erasures", self)
         if not self.erases:
             return [ArrivalOutcome(1.0, self, np.ones(self.outputs, dtype=bool))]
@@ -247,18 +245,19 @@ class AbstractRandomAffine(Module):
         raise fail("mixture filter", "maps made of hops, series, stacks, sums and mixtures", type(self).__name__)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return the joint moments of the gain and of the gains of the noise sources, in the order of the signal's way.
+        """Return E[H_ab] and E[H_ab H_ij] of H = [G, N], with which z = G y + N d for a disturbance d.
 
-        A noise of covariance R counts as rank(R) sources of unit size, and its mean as their disturbance: a mean that
-        they cannot make is refused. Uncertain probabilities count as nominal.
+        An H-infinity design treats the noise n as N d, where d is any disturbance of finite energy. N is a root of the
+        noise's covariance, R = N N', with rank(R) columns. Noises stand in the order in which the signal meets them.
+        Uncertain probabilities count as nominal.
 
         Raises:
-            ValueError: a map that does not know them, as by default.
+            ValueError: no d gives the noise's mean, N d = E[n]; or the moments are not known, as by default.
         """
         raise fail("channel", "hops, series, mixtures, stacks and sums of them", type(self).__name__)
 
     def detach_outliers(self) -> tuple["AbstractRandomAffine", AbstractNoise | None]:
-        """Replace the last noise by its mean where its law has outliers; return the map left, and that noise if any."""
+        """Return the map with the mean for its last noise, and that noise, if it has outliers; else itself and None."""
         return self, None
 
     # How it is written: words, series, hops, and another map beside it.
@@ -277,24 +276,23 @@ class AbstractRandomAffine(Module):
         """The maps whose outputs stand one after another in this one, at any depth; itself alone if it is no stack."""
         return [self]
 
-    def covers(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """Return whether another map is built like this one, with laws that this one believes possible.
+    def covers(self, actual: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
+        """Return whether a filter that assumes this map is right for the `actual` map, through which signals pass.
 
-        Args:
-            own: the other map.
-            same_noise: tests whether two noises agree.
+        Both must be built alike, and all laws that the actual map may have must be possible under this one.
+        `same_noise` tests whether two noises agree.
         """
-        if are_same(self, own):
+        if are_same(self, actual):
             return True
-        own_series, other_series = self.in_series, own.in_series
-        if len(own_series) == 1 == len(other_series):
-            return own_series[0].covers_kind(other_series[0], same_noise)
-        pairs = zip(own_series, other_series, strict=False)
-        return len(own_series) == len(other_series) and all(x.covers(y, same_noise) for x, y in pairs)
+        assumed_series, actual_series = self.in_series, actual.in_series
+        if len(assumed_series) == 1 == len(actual_series):
+            return assumed_series[0].covers_kind(actual_series[0], same_noise)
+        pairs = zip(assumed_series, actual_series, strict=False)
+        return len(assumed_series) == len(actual_series) and all(x.covers(y, same_noise) for x, y in pairs)
 
-    def covers_kind(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """Return whether `own`, no series, is covered as `covers` says; by default only an equal one is."""
-        return are_same(self, own)
+    def covers_kind(self, actual: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
+        """Return `covers(actual)` where neither map is a series; by default, whether they are equal."""
+        return are_same(self, actual)
 
     @property
     def is_silent(self) -> bool:
@@ -302,11 +300,13 @@ class AbstractRandomAffine(Module):
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple["AbstractRandomAffine", ChannelPosition]:
-        """Return the map with each hop replaced by visit(name, hop, signal), and the position behind it.
+        """Return the map with visit(name, hop, signal) in place of each hop, and the position behind the map.
+
+        A hop is a transmitter with its link; a visit may list it or change its power.
 
         Args:
-            visit: function of a hop's name, the hop and what it receives, which returns a hop.
-            position: prefix of names, number of hops before, and the signal, which a series sets by `carry_signal`.
+            visit: function of a hop's name, the hop and the second moment of what it receives, which returns a hop.
+            position: where the map begins: prefix of names, number of hops before, second moment of the signal there.
 
         Raises:
             ValueError: a map whose transmitters are not known; in this default, every map.
@@ -379,7 +379,7 @@ class AbstractModal(AbstractWithMemory, AbstractRandomAffine):
         return "" if self.memory.name is None else f"{self.memory.name!r}: "
 
     def degree_in(self, identity: str) -> int:
-        """Return one in its own memory."""
+        """Return the degree of H in the state of the memory of this `identity`: 1 for its own memory, else 0."""
         return int(self.memory.identity == identity)
 
 

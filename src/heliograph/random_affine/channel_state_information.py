@@ -1,7 +1,7 @@
-"""Maps whose law depends on numbers told to the receiver with each message: gains, readings of gains, quality.
+"""Maps with channel side information: numbers reported to the receiver with each message, such as a gain.
 
-The world draws the numbers from a memory (`FreshNumbers`, a chain of modes); a told map is given them, and its receiver
-is told them, or readings of them.
+The simulation draws the numbers from a memory (`FreshNumbers`, a chain of modes). A "told map" has a law that depends
+on them, and each message tells its receiver the numbers, or readings of them with an error.
 """
 
 from abc import abstractmethod
@@ -14,109 +14,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.covariance_factors import eliminate
-from heliograph.numerics.check import fail, scalar, show_value
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.numpy_or_jax import library
-from heliograph.numerics.types import Array, Bool, Float
+from heliograph.numerics.types import Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
-from heliograph.random_affine.laws.gain_given_reading import gain_given_reading, require_density
-from heliograph.random_affine.laws.law import AbstractLaw, CertainDiscrete, Constant, Discrete
+from heliograph.random_affine.laws.gain_given_reading import gain_given_reading
+from heliograph.random_affine.laws.law import CertainDiscrete, Constant, Discrete
 from heliograph.random_affine.markov_chain_and_autoregression import (
     AbstractMemory,
     CertainChain,
     MarkovChain,
-    MemoryStates,
-    identify_memory,
 )
 from heliograph.random_affine.noise import FACTOR_TOLERANCE, AbstractNoise, Matrix
+from heliograph.random_affine.reported_numbers import FreshReading
 
 T = TypeVar("T")
 Numbers = Float[jax.Array | np.ndarray, " told"]
 
 
-class AbstractFreshDraw(AbstractMemory):
-    """What is drawn anew at each step and told to the receiver, so that nothing is left to remember."""
-
-    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
-        """Draw the next state, whatever the last one was."""
-        return self.begin(key)
-
-    def nodes(self, degree: int) -> MemoryStates:
-        """Raise ValueError: what a message tells is no hidden mode, whose states a filter would weigh."""
-        expected = "a filter that takes what a message tells, such as linear_filter or extended_filter"
-        raise fail("link whose gain or noise is told", expected, "what takes it for a mode that nobody is told")
-
-
-class FreshNumbers(AbstractFreshDraw):
-    """Numbers that are drawn anew at each step; a receiver is told all of them.
-
-    Args:
-        law: law of the numbers, of a gain for one of them; None where nobody knows it, and nothing can be simulated.
-        count: how many.
-        name: name by which links share the numbers; None for numbers of one link.
-    """
-
-    law: AbstractLaw | AbstractNoise | None
-    count: int = eqx.field(static=True)
-    name: str | None = eqx.field(static=True)
-    identity: str = eqx.field(static=True)
-
-    def __init__(self, law: AbstractLaw | AbstractNoise | None, count: int, name: str | None = None):
-        """Hold the joint law of `count` numbers and the name under which links share them."""
-        self.law, self.count, self.name, self.identity = law, count, name, identify_memory(name)
-
-    @property
-    def announced(self) -> int:
-        """Count of the numbers that are told: all of them."""
-        return self.count
-
-    def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-        """Return the numbers."""
-        return jnp.asarray(state)
-
-    def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the first numbers (count,) from their law; raise ValueError if there is none."""
-        if self.law is None:
-            raise fail("simulating what a message tells", "a law of the numbers: told(..., law=...)", "none")
-        return jnp.reshape(self.law.sample(key), (self.count,))
-
-
-class FreshReading(AbstractFreshDraw):
-    """A gain that is drawn anew at each step, and its reading a = g + e, which alone the receiver is told.
-
-    Args:
-        law: law of the gain g.
-        variance: of the error e of the reading, positive.
-    """
-
-    law: AbstractLaw
-    variance: Float[Array, ""]
-    name: str | None = eqx.field(static=True)
-    identity: str = eqx.field(static=True)
-
-    def __init__(self, law: AbstractLaw, variance: Float[Array, ""]):
-        """Hold the law of the gain g and the variance of the reading error e."""
-        self.law = require_density(law)
-        self.variance = scalar("noise of a pilot", variance, np.finfo(float).tiny)
-        self.name, self.identity = None, identify_memory(name=None)
-
-    def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-        """Return the reading."""
-        return jnp.asarray(state)[1:]
-
-    def begin(self, key: jax.Array) -> jax.Array:
-        """Draw (g, a) (2,), a gain g and its reading a = g + e, where the error e has the variance `variance`."""
-        gain_key, error_key = jax.random.split(key)
-        gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
-        return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])
-
-
 class AbstractToldMap(AbstractModal):
-    """A map of which the receiver is told numbers with each message: `given` is the world's, `believed` the receiver's.
+    """A map whose law depends on numbers that each message reports to the receiver (channel side information).
 
-    names: names of the numbers. exogenous: whether they are independent of the state, so that they tell of the link
-    alone. fresh: whether what they leave open is drawn anew with each message, whatever is lost.
+    `given` returns the map as it is, from the drawn state of the memory. `believed` returns the map as the receiver
+    knows it, from the reported numbers.
+
+    names: names of the numbers. exogenous: whether they are independent of the plant's state, so that they say nothing
+    about it. fresh: whether the map, given the numbers, is drawn independently with each message, whatever is lost.
     """
 
     names: eqx.AbstractVar[tuple[str, ...]]
@@ -125,47 +50,55 @@ class AbstractToldMap(AbstractModal):
 
     @property
     def reason_for_no_claim(self) -> str:
-        """Why no covariance is claimed from the told numbers ("depends on the state"); "" if one is claimed."""
-        of_state = [] if self.exogenous else ["depends on the state"]
-        of_past = [] if self.fresh else ["leaves open what is not drawn anew with each message"]
-        return " and ".join(of_state + of_past)
+        """Why a filter may not claim its covariance given the reported numbers; "" if it may.
+
+        It may not if the numbers depend on the plant's state (not `exogenous`), since the filter takes them to say
+        nothing about it. Nor may it if the unknown rest of the map is not drawn anew with each message (not `fresh`),
+        since the filter takes messages to be independent given the state.
+        """
+        state_dependence = [] if self.exogenous else ["depends on the state"]
+        time_dependence = [] if self.fresh else ["leaves open what is not drawn anew with each message"]
+        return " and ".join(state_dependence + time_dependence)
 
     def _describe_told_numbers(self, what: str) -> str:
-        """Return in brackets what is told, and what is not promised of it."""
+        """Return a text in brackets: what each message reports, and whether it is not exogenous or not fresh."""
         return f"(told {what}{', not exogenous' * (not self.exogenous)}{', not fresh' * (not self.fresh)})"
 
     @property
     def optional(self) -> bool:
-        """True if z means something where the numbers are missing."""
+        """True if a filter can use z also where the reported numbers are missing (NaN); by default it cannot."""
         return False
 
     @property
     @abstractmethod
     def typical(self) -> Numbers:
-        """Numbers as they may come, for sizes and claims."""
+        """An example of the numbers that a message reports.
+
+        The map of these numbers, believed(typical), tells the shapes of the map, and what kind of law it has.
+        """
 
     @abstractmethod
     def believed(self, numbers: Numbers) -> AbstractRandomAffine:
-        """Return the map without memory, as the receiver knows it given the numbers."""
+        """Return the law of the map given the reported numbers, a map without memory: what the receiver knows."""
 
     def numbers_give_law(self, numbers: Numbers) -> jax.Array:
-        """Decide whether numbers give a law; by default all that are finite do."""
+        """Return whether `believed` has a law for these numbers, a traced boolean; by default for all finite ones."""
         return jnp.all(jnp.isfinite(numbers))
 
 
 class ToldMap(AbstractToldMap):
-    """A map that is a function of the numbers that are told.
+    """A map that is a function of the numbers that each message reports.
 
     Args:
         memory: draws the numbers.
         make: function of the numbers (count,) that returns a map, of the same sizes for all numbers.
-        typical: numbers as they may come.
+        typical: an example of the numbers (count,).
         names: names of the numbers.
-        exogenous: whether they are independent of the state.
-        fresh: whether what they leave open is drawn anew with each message.
+        exogenous: whether the numbers are independent of the plant's state.
+        fresh: whether the map, given the numbers, is drawn independently with each message.
 
     Raises:
-        ValueError: a function that returns no map, or one that remembers, is late, or loses what the receiver sees.
+        ValueError: `make` returns no map, or a map with memory, delay or erasures.
     """
 
     memory: AbstractMemory
@@ -185,7 +118,12 @@ class ToldMap(AbstractToldMap):
         exogenous: bool = True,
         fresh: bool = True,
     ):
-        """Hold the memory that draws the numbers and the function `make(numbers)`; check `make(typical)`."""
+        """Hold the memory that draws the numbers, and the function `make` from numbers (count,) to a map.
+
+        make(typical), the map of an example, is checked and gives the sizes. `names` are those of the numbers.
+        `exogenous`: the numbers are independent of the plant's state. `fresh`: given the numbers, the map is drawn
+        independently with each message. Delays and erasures belong outside: delay(told map), not told map of a delay.
+        """
         self.memory, self.make, self.example, self.names = memory, make, typical, names
         self.exogenous, self.fresh = exogenous, fresh
         link = in_float64(make)(typical)
@@ -209,22 +147,22 @@ class ToldMap(AbstractToldMap):
 
     @property
     def typical(self) -> Numbers:
-        """The numbers of a typical message: the example that was given."""
+        """The example of reported numbers (count,) that the constructor got."""
         return self.example
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map of the numbers that belong to this state."""
+        """Return make(numbers) for the numbers of this state of the memory."""
         return self.believed(self.memory.announce(state))
 
     def believed(self, numbers: Numbers) -> AbstractRandomAffine:
-        """Return the map of these numbers."""
+        """Return make(numbers): the reported numbers determine the map, so that the receiver knows its law."""
         return self.make(numbers)
 
     def numbers_give_law(self, numbers: Numbers) -> jax.Array:
-        """Decide whether the map of these numbers has finite entries only, and noises with valid covariances.
+        """Return whether make(numbers) has finite entries only, and noises with valid covariances.
 
-        A variance of zero is valid only if it is zero for typical numbers too. Else it means that the variance is not
-        known. A told gain has no effect on the noise.
+        A variance of zero is valid only if it is zero for the example numbers too. Else it means that the variance is
+        not known. A reported gain has no effect on the noise: it need only be finite.
         """
         if isinstance(self.make, ToldGainHop):
             return super().numbers_give_law(numbers)
@@ -235,29 +173,29 @@ class ToldMap(AbstractToldMap):
         return jnp.all(jnp.stack([*finite, *valid]))
 
     def in_words(self) -> str:
-        """Return the map of typical numbers in words, and what is told."""
+        """Return the map of the example numbers in words, and the names of the reported numbers."""
         return f"{self.believed(self.typical).in_words()} {self._describe_told_numbers(', '.join(self.names))}"
 
 
 class ToldGainHop(eqx.Module):
-    """The hop z = g A y + n of a gain g that is told."""
+    """Function from a reported gain g to the hop z = g A y + n."""
 
     matrix: Matrix
     noise: AbstractNoise
 
     def __call__(self, numbers: Numbers) -> GainAndNoise:
-        """Return the hop of this gain."""
+        """Return the hop z = g A y + n, g = numbers[0], `matrix` A, and `noise` the law of n."""
         return GainAndNoise(Constant(numbers[0]), self.matrix, self.noise)
 
 
 class PilotedHop(AbstractHop, AbstractToldMap):
-    """Hop z = g A y + n whose receiver is told a reading of its gain, as by a pilot: a = g + e.
+    """Hop z = g A y + n whose messages report a noisy reading of the gain g, as from a pilot signal: a = g + e.
 
     Args:
-        memory: draws gain and reading.
+        memory: draws gain g and reading a.
         matrix: A (m, p).
         noise: law of n with m components.
-        fresh: whether what a reading leaves open of the gain is drawn anew with each message.
+        fresh: whether the gain, given its reading, is drawn independently with each message.
     """
 
     memory: FreshReading
@@ -268,42 +206,53 @@ class PilotedHop(AbstractHop, AbstractToldMap):
     fresh: bool = eqx.field(static=True)
 
     def __init__(self, memory: FreshReading, matrix: Matrix, noise: AbstractNoise, fresh: bool = True):
-        """Hold the drawn gain with its reading, the matrix A and the law of the noise n."""
+        """Hold the memory, which draws the gain g and its reading a = g + e, the matrix A and the law of the noise n.
+
+        The one reported number is named "pilot". It is exogenous: link and plant are independent. `fresh`: given its
+        reading, the gain is drawn independently with each message.
+        """
         self.memory, self.matrix, self.noise, self.names = memory, matrix, noise, ("pilot",)
         self.exogenous, self.fresh = True, fresh
 
     @property
     def optional(self) -> bool:
-        """Always True: without a reading the gain has its own law."""
+        """Always True: a filter can use z without the reading, by the law of the gain before any reading."""
         return True
 
     @property
     def typical(self) -> Numbers:
-        """The number that is told in a typical message: the mean gain."""
+        """An example of the reported reading (1,): the mean gain E[g]."""
         numbers: Numbers = library(self.memory.law).stack([self.memory.law.moment(1)])
         return numbers
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """Return the hop of the gain that was drawn."""
+        """Return the hop with the gain g that was drawn, from the state (g, a) of the memory."""
         return GainAndNoise(Constant(jnp.asarray(state)[0]), self.matrix, self.noise)
 
     def numbers_give_law(self, numbers: Numbers) -> jax.Array:
-        """Return True: without a reading the gain has its own law."""
+        """Return True: with no finite reading the gain has the law that it has before any reading."""
         return jnp.asarray(True)
 
     def believed(self, numbers: Numbers) -> GainAndNoise:
-        """Return the hop of the gain's law given the reading; its own law where none came."""
-        law = gain_given_reading(self.memory.law, numbers[0], self.memory.variance)
+        """Return the hop with the law p(g | a) of the gain given its reading a = g + e, or p(g) where a is NaN.
+
+        `numbers` (1,) is the reading a, and `memory.variance` the variance of its error e.
+        """
+        reading, error_variance = numbers[0], self.memory.variance
+        law = gain_given_reading(self.memory.law, reading, error_variance)
         return GainAndNoise(law, self.matrix, self.noise)
 
     def in_words(self) -> str:
-        """Return the hop in words, and what is told."""
+        """Return the hop in words, and that a reading of its gain is reported."""
         plain = GainAndNoise(self.memory.law, self.matrix, self.noise)
         return f"{plain.in_words()} {self._describe_told_numbers('a reading of its gain')}"
 
 
 def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
-    """Return the maps in a channel whose numbers are told by messages, one map for each memory that draws numbers."""
+    """Return the maps in a channel of which messages report numbers, in order of appearance.
+
+    Maps that share a memory, and so the numbers that it draws, are counted once: the first of them is returned.
+    """
     by_identity: dict[str, AbstractToldMap] = {}
     for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map):
         if _is_told_map(leaf):
@@ -312,26 +261,36 @@ def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
 
 
 def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarray, "outputs told"]:
-    """Return for each output of a channel on which told numbers it depends: those that its own maps draw."""
-    identities = [affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)]
+    """Return at (i, j) whether the law of output i of a channel depends on reported number j.
+
+    It does if number j belongs to a map inside the one of the channel's parallel maps that has output i. Numbers are in
+    the order of `list_told_maps`.
+    """
+    # The identity of the memory from which each reported number comes.
+    memory_of_number = [
+        affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)
+    ]
     rows = list[list[bool]]()
     for parallel_map in channel.in_parallel:
-        identities_of_map = {affine.memory.identity for affine in list_told_maps(parallel_map)}
-        rows += [[identity in identities_of_map for identity in identities]] * parallel_map.outputs
+        memories_of_map = {affine.memory.identity for affine in list_told_maps(parallel_map)}
+        rows += [[identity in memories_of_map for identity in memory_of_number]] * parallel_map.outputs
     return np.array(rows)
 
 
 def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
-    """Return the channel as a receiver knows it that was told these numbers.
+    """Return the channel's law given the numbers that a message reported.
+
+    Each map with reported numbers becomes the map that its receiver knows given them. All else stays, memories of modes
+    too.
 
     Args:
-        channel: a channel, whose other memories stay.
-        numbers: the told numbers of all its maps, in the order of `list_told_maps`.
+        channel: a channel.
+        numbers: the reported numbers of all its maps, concatenated in the order of `list_told_maps`.
     """
     numbers_by_memory = _share_numbers_by_map(channel, numbers)
 
     def believe(leaf: object) -> object:
-        """Return a told map as its receiver knows it given its numbers; return anything else unchanged."""
+        """Return the law of a map with reported numbers given them; return anything else unchanged."""
         return leaf.believed(numbers_by_memory[leaf.memory.identity]) if isinstance(leaf, AbstractToldMap) else leaf
 
     conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
@@ -339,18 +298,18 @@ def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
 
 
 def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
-    """Return whether the told numbers give a law of each of the channel's maps: finite numbers and valid covariances.
+    """Return whether the reported numbers give each of the channel's maps a law: finite, with valid covariances.
 
     Args:
         channel: a channel.
-        numbers: the told numbers of all its maps, in the order of `list_told_maps`.
+        numbers: the reported numbers of all its maps, concatenated in the order of `list_told_maps`.
     """
     by_memory, told_maps = _share_numbers_by_map(channel, numbers), list_told_maps(channel)
     return jnp.all(jnp.stack([affine.numbers_give_law(by_memory[affine.memory.identity]) for affine in told_maps]))
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
-    """Split the told numbers by map, and return them by the identity of each map's memory."""
+    """Split the reported numbers of all maps, and return those of each map by the identity of its memory."""
     assert isinstance(channel, AbstractRandomAffine)
     numbers_by_memory, start = dict[str, Numbers](), 0
     for affine in list_told_maps(channel):
@@ -394,5 +353,5 @@ def make_laws_certain(link: T) -> T:
 
 
 def _is_told_map(leaf: object) -> bool:
-    """Return whether an object is a map of which numbers are told."""
+    """Return whether an object is a map of which messages report numbers."""
     return isinstance(leaf, AbstractToldMap)

@@ -35,24 +35,24 @@ class AbstractDelayLine(AbstractMapWrapper):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """Return the same map as one without delay, whose input is the whole line."""
+        """The same map without delay: its input is the stacked delay line (y_k, y_{k-1}, ..., y_{k-past})."""
         raise unwritten(self, "line")
 
     @property
     def parts(self) -> Sequence[AbstractRandomAffine]:
-        """Maps that this one is made of: that of the line alone."""
+        """The one map inside: `line`, the map of the stacked signals."""
         return (self.line,)
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return a delay line of the same length with another map."""
+        """Return a delay line of the same length with parts[0] as the map of the stacked signals."""
         return DelayLine(parts[0], self.past)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the map of the line."""
+        """Return the next state and H of `line`, the map of the stacked signals."""
         return self.line.draw(state, key)
 
     def moments(self, order: int) -> JointMoments:
-        """Return the moments of the map of the line."""
+        """Return E[Sym^order(H)] of `line`, the map of the stacked signals."""
         return self.line.moments(order)
 
 
@@ -82,12 +82,12 @@ class DelayLine(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The map that was given, whose input is the whole line."""
+        """The map of the stacked delay line (y_k, ..., y_{k-past}): the constructor's `link` takes just this input."""
         return self.link
 
     @property
     def past(self) -> int:
-        """Steps back that the line reaches."""
+        """Number of past signals in the delay line (y_k, ..., y_{k-past})."""
         return self.steps
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -100,7 +100,7 @@ class DelayLine(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, of the last {self.steps + 1} signals"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of the map, to which the line of past signals goes."""
+        """Return the map with visit(name, hop, signal) in place of each hop of the link, which receives the line."""
         plain, position = self.link.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
         return replace_inner_maps(self, [plain]), position
 
@@ -141,9 +141,9 @@ class DelayedLink(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The map from the line of past signals to what arrives: `delay` selects a signal, and the link transmits it.
+        """The map from the delay line (y_k, ..., y_{k-past}): `delay` selects y_{k-d}, and the link transmits it.
 
-        With time stamps the delay is one more number, which does not pass through the link.
+        With time stamps the delay d is one more output, which does not pass through the link.
         """
         if not self.timestamped:
             return Series([self.delay, self.link])
@@ -171,12 +171,12 @@ class DelayedLink(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, {late}"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of the link; return it as they became, and the place after them."""
+        """Return the map with visit(name, hop, signal) in place of each hop of the link, and the position behind it."""
         link, position = self.link.visit_hops(visit, position)
         return replace_inner_maps(self, [link, self.delay]), position
 
     def carry_signal(self, signal: SignalMoment) -> SignalMoment:
-        """Return the signal behind the link, as if it were not late."""
+        """Return E[(z, 1) (z, 1)'] behind the link, taking y_{k-d} to have the same moment `signal` as y_k."""
         return self.link.carry_signal(signal)
 
     def given(self, d: int) -> AbstractRandomAffine:
@@ -243,10 +243,10 @@ def place_channel_of_part(channel: AbstractRandomAffine, total: int, start: int,
 
 
 class RelayStorage(AbstractMapWrapper):
-    """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
+    """Storage of a relay: the signals r that it received now and in the last `steps` steps, (r_k, ..., r_{k-steps}).
 
-    A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.
-    Before the first step it holds zeros.
+    r_k = H_k (y_k, ..., y_{k-q}), H_k drawn from `base`. So the storage is a map of the line (y_k, ..., y_{k-q-steps}).
+    The draws are stored: a value that is forwarded twice has one gain and noise. Zeros are stored before the first.
     """
 
     base: AbstractRandomAffine
@@ -255,36 +255,36 @@ class RelayStorage(AbstractMapWrapper):
 
     @property
     def past(self) -> int:
-        """Steps back that the line reaches."""
+        """Number q + `steps` of past signals in the line (y_k, ..., y_{k-q-steps}); `base` takes 1 + q signals."""
         return self.base.inputs // self.size - 1 + self.steps
 
     @property
     def outputs(self) -> int:
-        """Number of values that are stored."""
+        """Length of z = (r_k, ..., r_{k-steps}): the outputs of `base` for each of the 1 + `steps` receptions."""
         return self.base.outputs * (1 + self.steps)
 
     @property
     def inputs(self) -> int:
-        """Length of the line."""
+        """Length of the stacked line (y_k, ..., y_{k-q-steps}): the input of `base`, and `steps` signals more."""
         return self.base.inputs + self.size * self.steps
 
     @property
     def remembers(self) -> bool:
-        """Always True."""
+        """Always True: the gains and noises of past receptions are stored."""
         return True
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the state of the map, with zeros received before."""
+        """Draw the state of `base`; the stored rows [G, n] of past receptions are zero."""
         return self.base.init(key), jnp.zeros((self.steps, self.base.outputs, self.base.inputs + 1))
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the present reception; return the state, and H of it and of all stored receptions, the newest first.
+        """Draw [G_k, n_k] of the present reception r_k; return the next state, and H of (r_k, ..., r_{k-steps}).
 
-        The state holds the state of the link `base`, and the `steps` stored receptions: gain and noise as drawn.
+        The state holds the state of `base`, and the rows [G, n] of the last `steps` receptions, the newest first.
         """
         base_state, stored = state
         base_state, matrix = self.base.draw(base_state, key)
-        # The reception of t steps ago takes the part of the line that begins t signals later.
+        # r_{k-t} = G_{k-t} (y_{k-t}, ..., y_{k-t-q}) + n_{k-t}: its gain stands t signals to the right in H.
         receptions = jnp.concatenate([matrix[None, :-1], stored])
         blocks = [
             jnp.pad(reception[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
@@ -306,9 +306,9 @@ class RelayedLinks(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """Return the stages in series as a map of the line of past signals.
+        """The stages in series as one map of the delay line (y_k, y_{k-1}, ...).
 
-        A stage that delays takes past outputs of the stage before it, which are therefore stored for `past` steps.
+        A stage that delays takes past outputs of the stage before it, stored for stage.past steps.
         """
         size, line_map = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
@@ -316,8 +316,8 @@ class RelayedLinks(AbstractDelayLine):
         return line_map
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the outputs that are angles behind each stage in turn."""
-        return reduce(lambda before, stage: stage.carry_angles(before), self.stages, sent)
+        """Return the indices of the outputs that are angles: those of each stage's outputs go into the next stage."""
+        return reduce(lambda angles, stage: stage.carry_angles(angles), self.stages, sent)
 
     @property
     def past(self) -> int:

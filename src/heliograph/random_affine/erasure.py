@@ -39,7 +39,7 @@ class Erasure(AbstractMapWrapper):
         return state, matrix.at[:-1].set(jnp.where(is_lost, jnp.nan, matrix[:-1]))
 
     def condition_on_arrival(self) -> AbstractRandomAffine:
-        """Return what arrives through the map."""
+        """Return the map inside, given that everything arrives."""
         return self.base.condition_on_arrival()
 
     def _outcomes(self) -> list[ArrivalOutcome]:
@@ -55,7 +55,7 @@ class Erasure(AbstractMapWrapper):
         return [*outcomes, ArrivalOutcome(1 - arrival, zero_map, none_arrives)]
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the angles of the map: what is lost is none."""
+        """Return the indices of the outputs of the map inside that are angles; a lost output is NaN in any case."""
         return self.base.carry_angles(sent)
 
     def in_words(self) -> str:
@@ -63,14 +63,21 @@ class Erasure(AbstractMapWrapper):
         return f"{self.base.in_words() or DIRECT}, {write_percentage(1 - self.arrival)} lost"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of the map, which send whether they are received or not."""
+        """Return the erasure with visit(name, hop, signal) in place of each hop inside, and the position behind it.
+
+        Hops send whether they are received or not, so that they receive the same signal as without the erasure.
+        """
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
 
     def carry_signal(self, signal: SignalMoment) -> SignalMoment:
-        """Return the signal behind the map, of what arrives."""
-        signal = self.base.carry_signal(signal)
-        return signal._replace(arrives=signal.arrives * plain(self.arrival))
+        """Return E[(z, 1) (z, 1)'] given that z arrives, and the probability that it does.
+
+        The loss is independent of z, so that the moment is that behind the map inside; the probability is multiplied by
+        `arrival`.
+        """
+        signal_behind = self.base.carry_signal(signal)
+        return signal_behind._replace(arrives=signal_behind.arrives * plain(self.arrival))
 
     def moments(self, order: int) -> JointMoments:
         """Refuse: a filter skips lost packets, and asks for the moments of the channel inside."""

@@ -57,12 +57,17 @@ class AbstractHop(AbstractRandomAffine):
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return visit(name, hop, signal) and the position behind it, or both unchanged if it does not transmit."""
+        """Return what visit(name, hop, signal) puts in place of this hop, and the position one hop further.
+
+        The name is the position's prefix and "hop" with the hop's number in the chain; the signal is the second moment
+        of what the hop receives. A wire, which does not transmit, is returned unchanged, with the same position.
+        """
         if not self.transmits:
             return self, position
-        after = position._replace(hops=position.hops + 1)
-        visited: AbstractRandomAffine = visit(f"{position.prefix}hop{after.hops}", self, position.signal)
-        return visited, after
+        position_behind = position._replace(hops=position.hops + 1)
+        name = f"{position.prefix}hop{position_behind.hops}"
+        visited: AbstractRandomAffine = visit(name, self, position.signal)
+        return visited, position_behind
 
 
 class GainAndNoise(AbstractHop):
@@ -138,7 +143,11 @@ class GainAndNoise(AbstractHop):
         return len(self.law.corner_moments(0))
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
-        """Return E[Sym^order(H)] = sum_k E[g^k] B_k at each corner, an extreme law of the gain g that is possible."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k under each extreme law ("corner") of the gain g.
+
+        Sym^order(H) takes the monomials of (y, 1) of this degree to those of (z, 1), and the B_k are the
+        `gain_coefficients`. An extreme law is a vertex of the polytope of possible probabilities of g.
+        """
         gains, coefficients = self.law.corner_moments(order), self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, coefficients).tensordot(gains, coefficients, axes=1)
         return moment_map
@@ -157,11 +166,11 @@ class GainAndNoise(AbstractHop):
             highs.append(xp.maximum(b * low, b * high))
         return sum(lows), sum(highs)
 
-    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a hop with this matrix and noise, and a law of the gain that is possible here."""
-        if not isinstance(own, GainAndNoise) or not self.law.covers(own.law):
+    def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether `actual` is a hop with this matrix and noise, and a law of the gain that is possible here."""
+        if not isinstance(actual, GainAndNoise) or not self.law.covers(actual.law):
             return False
-        return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)
+        return equal_to_rounding(self.matrix, actual.matrix) and same_noise(self.noise, actual.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Return which outputs have a known gain: those that use only `known` inputs, by a constant gain."""
@@ -190,14 +199,21 @@ class GainAndNoise(AbstractHop):
         return tuple(int(i) for i in taking)
 
     def list_atoms(self) -> list[AffineComponent]:
-        """Combine every gain with every noise."""
+        """Return every combination of a value g of the gain with an atom n = c + N(0, R) of the noise.
+
+        A combination has the product of both probabilities, and is the map y -> g A y + c + N(0, R).
+        """
         gains, noises = self.law.list_atoms(), self.noise.list_atoms()
-        return [AffineComponent(p * q, g * self.matrix, c, r) for p, g in gains for q, c, r in noises]
+        return [AffineComponent(p * q, g * self.matrix, c, R) for p, g in gains for q, c, R in noises]
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return the joint moments of [g A, N], N a root of the noise's covariance."""
-        root = noise_gain(np.asarray(self.noise.mean), np.asarray(self.noise.covariance))
-        return disturb_hop(np.asarray(self.matrix), (float(self.law.moment(1)), float(self.law.moment(2))), root)
+        """Return E[H_ab] and E[H_ab H_ij] of H = [g A, N], where N N' is the covariance of the noise.
+
+        In an H-infinity design z = g A y + N d, with a disturbance d of finite energy in place of the noise n.
+        """
+        noise_root = noise_gain(np.asarray(self.noise.mean), np.asarray(self.noise.covariance))
+        gain_moments = float(self.law.moment(1)), float(self.law.moment(2))
+        return disturb_hop(np.asarray(self.matrix), gain_moments, noise_root)
 
     def in_words(self) -> str:
         """Return the hop in words, such as "Rician hop", "hop 1.1" or "known gain 1.1"; "" if it passes y as it is."""
@@ -220,8 +236,8 @@ class GainAndNoise(AbstractHop):
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
         """Return the hop with only the mean of its noise, and the noise, if the noise's law has outliers.
 
-        The noise's `branches` are about its mean, which is so not counted twice. Without outliers, return the hop
-        unchanged and None.
+        The noise's `branches` are deviations from its mean, so that the mean, which stays in the hop, is not counted
+        twice. Without outliers, return the hop unchanged and None.
         """
         if not self.noise.has_outliers:
             return self, None
@@ -230,7 +246,7 @@ class GainAndNoise(AbstractHop):
 
     @property
     def is_silent(self) -> bool:
-        """True if A is zero and the gain is one, so that it says no more."""
+        """True if the hop is z = n: A is zero, and the gain is the constant 1, as in a packet loss or an off state."""
         return is_zero(self.matrix) and self._gain_is_one
 
     @property

@@ -86,11 +86,11 @@ class AbstractMemory(Module):
 
     @property
     def announced(self) -> int:
-        """How many numbers a receiver that is told of the state gets; one unless said otherwise."""
+        """Number of values that a message reports of the state, where it reports the state; by default one."""
         return 1
 
     def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-        """Return the numbers that a receiver gets which is told of the state (announced,): by default the state."""
+        """Return the values (announced,) that a message reports of the state; by default the state itself."""
         numbers: jax.Array | np.ndarray = library(state).stack([state])
         return numbers
 
@@ -166,14 +166,14 @@ class MarkovChain(AbstractMemory):
         """True if some transition has a radius."""
         return bool(np.any(self.radius > 0))
 
-    def covers(self, own: "MarkovChain") -> bool:
-        """Return whether another chain is the same memory, with all its possible transitions possible for this one.
+    def covers(self, actual: "MarkovChain") -> bool:
+        """Return whether `actual` is the same memory, and all transitions that it may have are possible for this chain.
 
         The radius is how far each probability of a transition may be off.
         """
-        if own.identity != self.identity or not equal_to_rounding(self.initial, own.initial):
+        if actual.identity != self.identity or not equal_to_rounding(self.initial, actual.initial):
             return False
-        return within(own.transition, own.radius, self.transition, self.radius)
+        return within(actual.transition, actual.radius, self.transition, self.radius)
 
     @property
     def modes(self) -> int:

@@ -74,12 +74,12 @@ def memories(channel: PyTree) -> dict[str, AbstractMemory]:
 
 
 def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
-    """Return the map without memory that a map is for these states of its `memories`, put together in the same way."""
+    """Return the map given the `states` of its `memories`, in their order: a map without memory of modes."""
     return condition_on_states(channel, dict(zip(memories(channel), states, strict=True)))
 
 
 def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.Array | np.ndarray]) -> T:
-    """Return the map, or tree of maps, given the states of its memories; it has no memory then.
+    """Return the map, or tree of maps, given the states of its memories: a map without memory of modes.
 
     `by_identity` holds the state of each memory by its identity, and may hold states of other memories too.
     """
@@ -99,8 +99,9 @@ def is_memory_dependent(leaf: object) -> bool:
 
 def drop_names(channel: T) -> T:
     """Return a map whose memories are called 0, 1, ... in order, so that maps that differ in names alone look alike."""
-    held = memories(channel)
-    return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
+    by_identity = memories(channel)
+    renamed = {identity: memory.labelled(str(i)) for i, (identity, memory) in enumerate(by_identity.items())}
+    return replace_memories(channel, renamed)
 
 
 def number_unnamed_memories(model: T) -> T:
@@ -131,10 +132,11 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
-    """Return the maps of all steps, with unnamed memories that are identified as those of the first step.
+    """Return the maps of all steps, where each unnamed memory has the identity of its counterpart in the first step.
 
-    Memories are matched in order of appearance, so that they go on from step to step. If the first map has no memory,
-    or if steps have different numbers of memories, the maps are returned unchanged.
+    Maps with memories of equal identity share one state, so that it then goes on from step to step. Memories are
+    matched in order of appearance. If the first map has no memory, or if steps have different numbers of memories, the
+    maps are returned unchanged.
     """
     memories_by_map = [memories(affine) for affine in maps]
     if not memories_by_map[0] or len({len(memories_of_map) for memories_of_map in memories_by_map}) > 1:

@@ -72,10 +72,11 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] at each corner: an extreme law of the weights with a corner of each map.
+        """Return E[Sym^order(H)] = sum_i w_i E[Sym^order(H_i)] under each extreme law ("corner") of the mixture.
 
-        `weights` (corner, map) are the extreme laws of the choice. `corner_numbers` (map, combination) lists all
-        combinations of one corner of each map.
+        Sym^order(H) takes the monomials of (y, 1) of this degree to those of (z, 1). A corner combines an extreme law
+        w of the choice with one extreme law of each map i. `weights` (corner, map) has the laws w. `corner_numbers`
+        (map, combination) lists all combinations of one extreme law of each map.
         """
         corners_by_map = [affine.corner_moments(order) for affine in self.maps]
         weights = self.choice.corners()
@@ -93,22 +94,32 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """Return the extreme weights times the product of the maps' counts."""
         return len(self.choice.corners()) * super().corner_count()
 
-    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a mixture by a law that this one's covers, of maps that are covered one by one."""
-        return isinstance(own, Mixture) and self.choice.covers(own.choice) and self.covers_maps(own, same_noise)
+    def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether `actual` is a mixture whose choice and maps are possible under those of this one."""
+        if not isinstance(actual, Mixture) or not self.choice.covers(actual.choice):
+            return False
+        return self.covers_maps(actual, same_noise)
 
     def list_atoms(self) -> list[AffineComponent]:
-        """Return the atoms of each map, times its probability."""
-        parts = zip(self.choice.probabilities, self.maps, strict=True)
-        return [c._replace(weight=p * c.weight) for p, affine in parts for c in affine.list_atoms()]
+        """Return the atoms of all maps; the probability of each is multiplied by that of its map."""
+        probabilities_and_maps = zip(self.choice.probabilities, self.maps, strict=True)
+        return [
+            atom._replace(weight=p * atom.weight)
+            for p, affine in probabilities_and_maps
+            for atom in affine.list_atoms()
+        ]
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return the joint moments of one of the maps, drawn."""
-        parts = [affine.disturb_gain() for affine in self.maps]
-        return mix_gains(parts, np.asarray(self.choice.probabilities), self.inputs)
+        """Return E[H_ab] and E[H_ab H_ij] of H = [G, N], the mixture's gain G and the noise roots N of all maps.
+
+        In an H-infinity design z = G y + N d: with probability p_i, z = G_i y + N_i d_i, where N_i N_i' is the noise
+        covariance of map i, and d_i a disturbance in place of its noise.
+        """
+        gains_of_maps = [affine.disturb_gain() for affine in self.maps]
+        return mix_gains(gains_of_maps, np.asarray(self.choice.probabilities), self.inputs)
 
     def in_words(self) -> str:
-        """Return the maps in words with their shares; a choice between a map and silence is an unnoticed loss."""
+        """Return the maps in words with their shares; a choice between a map and noise alone is an unnoticed loss."""
         maps_in_words, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
         if len(maps_in_words) == 2 and maps_in_words[1] == NOTHING_SENT:
             return f"{maps_in_words[0]}, {write_percentage(shares[1])} lost unnoticed"
@@ -116,14 +127,16 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return f"({' or '.join(choices)})"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of each map, which has transmitters of its own; return the new map, and the position.
+        """Return the mixture with visit(name, hop, signal) in place of each hop, and the position behind it.
 
-        If all maps but one deliver only noise, the mixture is a hop or its loss. The hop is then one transmitter of the
-        chain, and is visited as such.
+        If several maps can deliver a signal, each has transmitters of its own, and names of its hops begin with
+        "choice" and its number. If all maps but one deliver only noise, the mixture is one link that may lose its
+        signal, and its hops are hops of the chain like others.
         """
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)
-        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "choice")]
+        maps_and_positions = position.number_maps(self.maps, "choice")
+        visited = [affine.visit_hops(visit, position_of_map)[0] for affine, position_of_map in maps_and_positions]
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:

@@ -71,12 +71,17 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
         present = select_model_of_equal_structure(self.maps, jnp.asarray(state))
         return _MapOfTracedIndex(self.maps, jnp.asarray(state)) if present is None else present
 
-    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is possible under this map: its chain and each of its maps must be possible here."""
-        if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
+    def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether all laws that `actual` may have are possible here: those of its chain and of each mode's map.
+
+        `same_noise` tests whether two noises agree.
+        """
+        if not isinstance(actual, Modes) or len(actual.maps) != len(self.maps):
             return False
-        pairs = zip(self.maps, own.maps, strict=True)
-        return all(believed.covers(actual, same_noise) for believed, actual in pairs)
+        if not self.memory.covers(actual.memory):
+            return False
+        pairs = zip(self.maps, actual.maps, strict=True)
+        return all(assumed_map.covers(actual_map, same_noise) for assumed_map, actual_map in pairs)
 
     def in_words(self) -> str:
         """Return the maps in words, and the name of the memory."""
@@ -100,14 +105,14 @@ class _MapOfTracedIndex(AbstractOneOfSeveralMaps):
 
 
 class ModeOutput(AbstractModal):
-    """Side information z = what a receiver is told of the state of a memory; what is sent does not enter."""
+    """Side information: z are the values that a message reports of a memory's state, such as the mode; y has gain 0."""
 
     memory: AbstractMemory
     sent: int = eqx.field(static=True)
 
     @property
     def outputs(self) -> int:
-        """How many numbers are told; one of a mode."""
+        """Length of z, the number of values that a message reports of the memory's state; one for a mode's number."""
         return self.memory.announced
 
     @property
@@ -116,15 +121,15 @@ class ModeOutput(AbstractModal):
         return self.sent
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return none: the output is the number of a mode, whatever is sent."""
+        """Return no index: z is the number of a mode, and no angle, whatever is sent."""
         return ()
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map as it is, and the place as it was: it has no transmitter."""
+        """Return the map and the position unchanged: side information is read off the receiver, and no hop sends it."""
         return self, position
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """Return the constant map to what is told of this state."""
+        """Return the map z = 0 y + b, b the values that a message reports of this state."""
         return known(np.zeros((self.outputs, self.sent)), self.memory.announce(state))
 
 
@@ -135,16 +140,16 @@ class OneStepLate(AbstractMapWrapper):
 
     @property
     def erases(self) -> bool:
-        """Always True, because of the first step."""
+        """Always True: nothing was drawn before the first step, whose z is NaN."""
         return True
 
     @property
     def remembers(self) -> bool:
-        """Always True."""
+        """Always True: the [G, n] drawn last is the map of the next step."""
         return True
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Return the state of the map, and nothing drawn yet."""
+        """Return the first state of `base`, and rows [G, n] of NaN, since nothing is drawn yet."""
         return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
@@ -158,11 +163,11 @@ class OneStepLate(AbstractMapWrapper):
         return (base_state, rows), jnp.concatenate([rows_before, last_row])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the angles of the map."""
+        """Return the indices of the outputs of `base` that are angles: a step of delay changes none."""
         return self.base.carry_angles(sent)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of the map; return it as they became, and the place after them."""
+        """Return the map with visit(name, hop, signal) in place of each hop of `base`, and the position behind it."""
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
 
@@ -225,7 +230,7 @@ class JointModes(Module):
         transition: law of the next mode by present mode (modes, modes).
         radius: how far each transition may be off, differently at each step (modes, modes).
         maps: the map in each mode.
-        beside: other models with the same memories, such as plant and sensor, in each of the modes.
+        beside: other models that depend on the same memories, such as plant and sensor, given each mode (modes,).
     """
 
     initial: Law
@@ -261,8 +266,11 @@ def joint_modes(
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     # Each memory as finitely many states.
-    held = memories((beside, channel))
-    chains = [_represent_memory_by_nodes(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
+    by_identity = memories((beside, channel))
+    chains = [
+        _represent_memory_by_nodes(memory, order * channel.degree_in(identity), nodes)
+        for identity, memory in by_identity.items()
+    ]
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -273,11 +281,11 @@ def joint_modes(
     # The largest that each joint transition may be: the product of the largest ones.
     largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
     # The state of each memory in each joint mode, and the maps given these.
-    by_mode = [
-        dict(zip(held, [state.item() for state in states], strict=True))
+    states_by_mode = [
+        dict(zip(by_identity, [state.item() for state in states], strict=True))
         for states in product(*(chain.states for chain in chains))
     ]
-    maps = tuple(condition_on_states(channel, states) for states in by_mode)
+    maps = tuple(condition_on_states(channel, states) for states in states_by_mode)
     for m in maps:
         check_forgets("channel of a filter", m)
     return JointModes(
@@ -285,7 +293,7 @@ def joint_modes(
         transition=transition,
         radius=largest - transition,
         maps=maps,
-        beside=tuple(condition_on_states(beside, states) for states in by_mode),
+        beside=tuple(condition_on_states(beside, states) for states in states_by_mode),
     )
 
 

@@ -93,7 +93,10 @@ class AbstractNoise(Module):
         return y
 
     def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
-        """Return the noise beside a signal of this mean and these variances without it; by default the same by any."""
+        """Return the noise added to a signal y of this mean and these variances (dimension,), without the noise.
+
+        The noise of a rounded measurement depends on the signal. By default the noise does not.
+        """
         return SignalNoise(self.columns, self.covariance)
 
     def list_atoms(self) -> list[NoiseAtom]:
@@ -282,12 +285,12 @@ class Independent(AbstractNoise):
 
     @property
     def has_outliers(self) -> bool:
-        """True if one of the parts has."""
+        """True if the law of one of the independent parts has outliers."""
         return any(component.has_outliers for component in self.parts)
 
     @property
     def is_symmetric(self) -> bool:
-        """True if all parts are."""
+        """True if the laws of all independent parts are known to be symmetric about their means."""
         return all(component.is_symmetric for component in self.parts)
 
     def branches(self) -> GaussianBranches:
@@ -295,19 +298,31 @@ class Independent(AbstractNoise):
         return stack_branches([component.branches() for component in self.parts])
 
     def branches_through(self, matrix: Matrix) -> GaussianBranches:
-        """Return the branches of each component of B n: all combinations of one branch of each part."""
+        """Return each component of B n, `matrix` B (rows, dimension), as a mixture of Gaussian branches about its mean.
+
+        n = (n_1, n_2, ...) are the independent parts. A branch of row i of B n is a combination of one branch of each
+        number B_ip n_p, B_ip the entries of B for part p.
+        """
         ends = np.cumsum([component.dimension for component in self.parts])[:-1]
         blocks = library(matrix).split(matrix, ends, axis=1)
         return stack_branches([self._add_branches([block[[i]] for block in blocks]) for i in range(len(matrix))])
 
     def _add_branches(self, rows: Sequence[Matrix]) -> GaussianBranches:
-        """Return the branches of the number sum_p rows_p n_p; parts n_p with a row (1, size) of zeros are left out."""
-        total = GaussianBranches(*np.zeros((3, 1, 1)))
+        """Return the number sum_p row_p n_p, of independent noises n_p, as a mixture of Gaussian branches.
+
+        A branch of a sum has the product of the probabilities of two branches, and the sums of their means and of their
+        variances. So all three arrays of `GaussianBranches`, the first of logarithms, are added in pairs.
+
+        Args:
+            rows: row_p (1, size of part p) for each part. Parts with a row of zeros are left out.
+        """
+        zero = np.zeros((1, 1))
+        total = GaussianBranches(log_share=zero, mean=zero, variance=zero)  # of the sum of no noise: 0 for certain
         for component, row in zip(self.parts, rows, strict=True):
             if not is_zero(row):
-                of_part = component.branches_through(row)
-                sums = (a[:, :, None] + b[:, None] for a, b in zip(total, of_part, strict=True))
-                total = GaussianBranches(*(pairs.reshape(1, -1) for pairs in sums))
+                branches = component.branches_through(row)
+                sums_of_pairs = (a[:, :, None] + b[:, None] for a, b in zip(total, branches, strict=True))
+                total = GaussianBranches(*(pairs.reshape(1, -1) for pairs in sums_of_pairs))
         return total
 
     def without_outliers(self) -> NoiseWithoutOutliers:
@@ -317,7 +332,7 @@ class Independent(AbstractNoise):
         return NoiseWithoutOutliers(mean, block_diagonal([inlier.covariance for inlier in inliers]))
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Return every atom of each part with every one of the others."""
+        """Return all combinations of one atom of each part, with the product of their probabilities."""
         return combine_atoms([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
@@ -331,7 +346,7 @@ class Independent(AbstractNoise):
         return [Independent(noises) for noises in noises_by_group] if are_whole else None
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw each part."""
+        """Draw each independent part, and return them one after another (dimension,)."""
         keys = jax.random.split(key, len(self.parts))
         return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
 

@@ -57,20 +57,24 @@ class AbstractCombination(AbstractComposite):
         return self.maps[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Return the first states of the maps, one for each; none of maps that forget."""
+        """Return the tuple of the maps' initial states; () if all maps forget, so that their draws are independent."""
         keys = jax.random.split(key, len(self.maps))
         return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
 
     def degree_in(self, identity: str) -> int:
-        """Return the largest degree of a map, since they stand side by side."""
+        """Return the degree of H in a memory's state: the largest of any map, since their H are not multiplied."""
         return max(affine.degree_in(identity) for affine in self.maps)
 
-    def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether another map has the same class, and maps that are possible under those in their places."""
-        if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
+    def covers_maps(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether `actual` is of this class, and each map inside it is possible under its counterpart here.
+
+        A filter assumes the maps here; signals pass through those of `actual`. `same_noise` compares two noises.
+        """
+        if not isinstance(actual, AbstractCombination) or type(actual) is not type(self):
             return False
-        pairs = zip(self.maps, own.maps, strict=True)
-        return all(believed.covers(actual, same_noise) for believed, actual in pairs)
+        pairs = list(zip(self.maps, actual.maps, strict=False))
+        are_as_many = len(actual.maps) == len(self.maps)
+        return are_as_many and all(assumed.covers(actual_map, same_noise) for assumed, actual_map in pairs)
 
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
@@ -133,7 +137,7 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^k(H)] of the series, k = `order`: E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]; Sym^k(H) maps monomials of (y, 1) to those of (z, 1)."""
         check_forgets("moments of a map", self)
         first_map, *later_maps = self.maps
         matrix = first_map.moments(order).matrix
@@ -143,20 +147,20 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] at each combination of the maps' corners: the product of their matrices.
+        """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)] for each combination of one extreme law of each map.
 
-        A corner is an extreme law of those possible. Those of the first map vary slowest.
+        k is `order`. The extreme law ("corner") of the first map varies slowest.
         """
-        joint_corners, *corners_of_later_maps = (affine.corner_moments(order) for affine in self.maps)
+        joint, *corners_of_later_maps = (affine.corner_moments(order) for affine in self.maps)
         for corners_of_map in corners_of_later_maps:
-            products = corners_of_map @ joint_corners[:, None]  # (corner before, corner, row, column)
-            joint_corners = products.reshape(-1, *products.shape[2:])
-        return joint_corners
+            products = corners_of_map @ joint[:, None]  # (joint corner of the maps before, corner, row, column)
+            joint = products.reshape(-1, *products.shape[2:])
+        return joint
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the interval of E[Sym^order(H)]: the matrix product of the intervals of all maps."""
+        """Return an interval of each entry of E[Sym^k(H2 H1)], from those of E[Sym^k(H2)] and E[Sym^k(H1)]."""
         intervals = [m.moment_interval(order) for m in self.maps]
-        return reduce(lambda before, after: multiply_matrices(after, before), intervals)
+        return reduce(lambda product, factor: multiply_matrices(factor, product), intervals)
 
     @property
     def in_series(self) -> list[AbstractRandomAffine]:
@@ -165,14 +169,14 @@ class Series(AbstractCombination):
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Return for each output whether its gain is known behind all maps in turn, from the same of each input."""
-        return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
+        return reduce(lambda known_so_far, affine: affine.carry_known_gains(known_so_far), self.maps, known)
 
     def carry_angles(self, sent: Angles) -> Angles:
         """Return the outputs that are angles behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_angles(before), self.maps, sent)
 
     def degree_in(self, identity: str) -> int:
-        """Return the sum of the maps' degrees, since they are multiplied."""
+        """Return the degree of H in a memory's state: the sum of the maps' degrees, since their H are multiplied."""
         return sum(affine.degree_in(identity) for affine in self.maps)
 
     def condition_on_arrival(self) -> AbstractRandomAffine:
@@ -184,11 +188,11 @@ class Series(AbstractCombination):
         return reduce(partial(_join_outcomes, join=_join_outcomes_in_series), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[AffineComponent]:
-        """Return every atom of each map, one after another."""
+        """Return all combinations of one atom of each map, each as the series of these atoms."""
         return combine_atoms([affine.list_atoms() for affine in self.maps], AffineComponent.then)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return the joint moments of each map, then of the next."""
+        """Return E[H_ab] and E[H_ab H_ij] of H = [G, N], z = G y + N d with a disturbance d in place of the noises."""
         return reduce(DisturbedGain.then, (affine.disturb_gain() for affine in self.maps))
 
     def in_words(self) -> str:
@@ -215,8 +219,8 @@ class Series(AbstractCombination):
         return self.rebuilt(*visited), position
 
     def carry_signal(self, signal: SignalMoment) -> SignalMoment:
-        """Return the signal behind each map in turn."""
-        return reduce(lambda before, affine: affine.carry_signal(before), self.maps, signal)
+        """Return E[(z, 1) (z, 1)'] behind the last map and the probability that z arrives, from map to map."""
+        return reduce(lambda signal_before, affine: affine.carry_signal(signal_before), self.maps, signal)
 
 
 def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
@@ -262,31 +266,31 @@ class Stack(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
+        """Return E[Sym^order(H)]: row a has the coefficients of E[z^a | y] as a polynomial in (y, 1).
+
+        z = (z1, z2, ...) are the outputs of the maps, independent given y, so that the polynomials are multiplied:
+        E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y].
+        """
         check_forgets("moments of a map", self)
-        refuse_if_too_large(
-            count_monomials(self.outputs + 1, order),
-            count_monomials(self.inputs + 1, order),
-            f"moments of order {order}",
-        )
-        items = [m.moments(order) for m in self.maps]
-        tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
-        return JointMoments(
-            stack_parts(multiply_moments_of_parts(self, order, tables, multiply_polynomials)),
-            self.outputs,
-            self.inputs,
-            order,
-        )
+        rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
+        refuse_if_too_large(rows, columns, f"moments of order {order}")
+        # For each map, the matrices E[Sym^k(H)] by degree k; that of degree 0 is not used.
+        matrices_by_map = []
+        for moments in [affine.moments(order) for affine in self.maps]:
+            matrices_by_map.append([None, *(moments.lower(k) for k in range(1, order + 1))])
+        matrix = stack_parts(multiply_moments_of_parts(self, order, matrices_by_map, multiply_polynomials))
+        return JointMoments(matrix, self.outputs, self.inputs, order)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
+        """Return an interval of each entry of E[Sym^order(H)]; row a has the coefficients of E[z^a | y].
 
-        Each row is a product of polynomials in (y, 1), one for each independent map, computed with intervals.
+        This polynomial in (y, 1) is the product of one for each map, multiplied with intervals of coefficients.
         """
+        # For each map, the intervals of E[Sym^k(H)] by degree k (2, rows, columns); that of degree 0 is not used.
         intervals_by_map = []
         for affine in self.maps:
-            by_order = [stack_parts(affine.moment_interval(k)) for k in range(1, order + 1)]
-            intervals_by_map.append([None, *by_order])
+            intervals = [stack_parts(affine.moment_interval(k)) for k in range(1, order + 1)]
+            intervals_by_map.append([None, *intervals])
         rows = stack_parts(multiply_moments_of_parts(self, order, intervals_by_map, multiply_interval_polynomials))
         lowest, highest = rows[:, 0], rows[:, 1]
         return lowest, highest
@@ -296,9 +300,9 @@ class Stack(AbstractCombination):
         """Its maps, those of stacks within it too."""
         return [m for affine in self.maps for m in affine.in_parallel]
 
-    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a stack of maps that this one's cover one by one."""
-        return self.covers_maps(own, same_noise)
+    def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether `actual` is a stack whose maps are possible under those of this one, one by one."""
+        return self.covers_maps(actual, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Return for each output whether its gain is known, map after map, from the same of each input."""
@@ -315,15 +319,15 @@ class Stack(AbstractCombination):
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
     def _outcomes(self) -> list[ArrivalOutcome]:
-        """Return every set of losses of each map with every one of the others."""
+        """Return all combinations of one set of losses of each map; probabilities are multiplied."""
         return reduce(partial(_join_outcomes, join=_join_outcomes_in_stack), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[AffineComponent]:
-        """Return every atom of each map, one above another."""
+        """Return all combinations of one atom of each map, stacked one above another."""
         return combine_atoms([affine.list_atoms() for affine in self.maps], AffineComponent.above)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return the joint moments of the maps, one above another."""
+        """Return E[H_ab] and E[H_ab H_ij] of H = [G, N], z = G y + N d with a disturbance d in place of the noises."""
         return stack_on_shared_inputs([affine.disturb_gain() for affine in self.maps], self.inputs)
 
     def in_words(self) -> str:
@@ -343,8 +347,12 @@ class Stack(AbstractCombination):
         return Stack(maps), Independent(noises)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit each map as one part; return the whole as they became, and the place after it."""
-        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "part")]
+        """Return the stack with visit(name, hop, signal) in place of each hop, and the position unchanged.
+
+        Names of the hops in a map begin with "part" and its number. Hops side by side do not lengthen the chain.
+        """
+        maps_and_positions = position.number_maps(self.maps, "part")
+        visited = [affine.visit_hops(visit, position_of_map)[0] for affine, position_of_map in maps_and_positions]
         return self.rebuilt(*visited), position
 
 
@@ -354,30 +362,34 @@ def _join_outcomes_in_stack(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[Abstr
 
 
 def multiply_moments_of_parts(
-    channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]
+    channel: Stack, order: int, matrices_by_map: list[list[Any]], multiply: Callable[..., Any]
 ) -> list[Any]:
-    """Return E[z^a | y] = prod_parts E[z_part^(a_part) | y] for each power a, as polynomials in y.
+    """Return for each monomial z^a of (z, 1) the coefficients of E[z^a | y] as a polynomial in (y, 1).
+
+    z = (z_1, z_2, ...) are the outputs of the maps, independent given y: E[z^a | y] = prod_m E[z_m^(a_m) | y].
 
     Args:
-        channel: the stack.
-        order: degree of the monomials of (z, 1).
-        tables: of each part and degree its polynomials (..., rows, columns); None of degree 0.
-        times: product of two polynomials, from (a, degree of a, b, degree of b, number of variables).
+        channel: the stack of these maps.
+        order: degree of the monomials of (z, 1), and of all polynomials that are returned.
+        matrices_by_map: for map m and degree k the matrix E[Sym^k(H_m)] (..., rows, columns). Its row a has the
+            coefficients of E[z_m^a | y], |a| = k. Entry 0 is not used, since the polynomial of degree 0 is 1.
+        multiply: function of (coefficients a, degree of a, coefficients b, degree of b, number of variables), which
+            returns the coefficients of the product.
     """
     variables, rows = channel.inputs + 1, []
     for powers in list_exponents(channel.outputs + 1, order):
         polynomial, degree = np.ones(1), 0
-        start = 0  # first output of the part
-        for part, table in zip(channel.maps, tables, strict=True):
-            # The powers of this part's outputs, their sum, and the part's polynomial of them; 1 where all are 0.
-            a = powers[start : start + part.outputs]
-            start, degree_of_part = start + part.outputs, sum(a)
-            if degree_of_part:
-                factor = table[degree_of_part][..., position(part.outputs + 1, degree_of_part)[(*a, 0)], :]
-                polynomial = times(polynomial, degree, factor, degree_of_part, variables)
-                degree += degree_of_part
-        # Times 1^(order - |a|), so that all rows have the degree `order`.
+        start = 0  # first output of map m
+        for affine, matrices in zip(channel.maps, matrices_by_map, strict=True):
+            powers_of_map = powers[start : start + affine.outputs]  # a_m
+            start, degree_of_map = start + affine.outputs, sum(powers_of_map)
+            if degree_of_map:
+                row = position(affine.outputs + 1, degree_of_map)[(*powers_of_map, 0)]
+                polynomial_of_map = matrices[degree_of_map][..., row, :]
+                polynomial = multiply(polynomial, degree, polynomial_of_map, degree_of_map, variables)
+                degree += degree_of_map
+        # Times 1^(order - |a|), whose only coefficient is that of the last monomial: all rows get the degree `order`.
         power_of_one = np.zeros(count_monomials(variables, powers[-1]))
         power_of_one[-1] = 1.0
-        rows.append(times(polynomial, degree, power_of_one, powers[-1], variables))
+        rows.append(multiply(polynomial, degree, power_of_one, powers[-1], variables))
     return rows

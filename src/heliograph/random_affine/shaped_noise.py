@@ -34,17 +34,17 @@ class Shaped(AbstractNoise):
 
     @property
     def columns(self) -> WeightedColumns:
-        """Covariance B W diag(w) (B W)' as columns B W with weights w."""
+        """Covariance of n = B u as columns B W with weights w, where W diag(w) W' is the covariance of the source u."""
         return self.source.columns.through(self.matrix)
 
     @property
     def has_outliers(self) -> bool:
-        """True if u has."""
+        """True if the law of the source u has outliers: then so has n = B u."""
         return self.source.has_outliers
 
     @property
     def is_symmetric(self) -> bool:
-        """True if u is."""
+        """True if the law of the source u is known to be symmetric about its mean: then so is that of n = B u."""
         return self.source.is_symmetric
 
     def branches(self) -> GaussianBranches:
@@ -52,21 +52,21 @@ class Shaped(AbstractNoise):
         return self.source.branches_through(self.matrix)
 
     def branches_through(self, matrix: Matrix) -> GaussianBranches:
-        """Return the branches of A B u, `matrix` A."""
+        """Return each component of A n = A B u, `matrix` A, as a mixture of Gaussian branches about its mean."""
         return self.source.branches_through(matrix @ self.matrix)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return mean and covariance of B u, u without its outliers."""
+        """Return mean, relative to that of n, and covariance of n = B u, if the source u has no outlier."""
         mean, covariance = self.source.without_outliers()
         return NoiseWithoutOutliers(self.matrix @ mean, self.matrix @ covariance @ self.matrix.T)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Return every atom of u mapped, B c and B R B'."""
-        b = self.matrix
-        return [NoiseAtom(p, b @ c, b @ r @ b.T) for p, c, r in self.source.list_atoms()]
+        """Return the atoms of n = B u: for an atom u = c + N(0, R) of probability p, n = B c + N(0, B R B')."""
+        B = self.matrix
+        return [NoiseAtom(p, B @ c, B @ R @ B.T) for p, c, R in self.source.list_atoms()]
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw B u."""
+        """Draw n = B u from a draw of the source u."""
         return jnp.asarray(self.matrix) @ self.source.sample(key)
 
     def moment(self, powers: Exponents) -> Number:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.caching import cache_arrays, cache_by_object
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import check_count, fail, instance, items, show_value
 from heliograph.numerics.numpy_or_jax import library, scatter
 from heliograph.numerics.types import PyTree
@@ -20,17 +20,13 @@ from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain
 from heliograph.random_affine.moments.interval_products import Interval
 from heliograph.random_affine.moments.mixture_components import AffineComponent
-from heliograph.random_affine.moments.monomials import (
-    JointMoments,
-    count_monomials,
-    factor_variables,
-    list_exponents,
-    place_monomials,
-    plan_binomial_sums,
-    position,
-    refuse_if_too_large,
-    times_one,
+from heliograph.random_affine.moments.moments_of_sum import (
+    add_independent_moments,
+    assemble_moments,
+    expand_map_moments,
+    sum_moments_by_halves,
 )
+from heliograph.random_affine.moments.monomials import JointMoments, count_monomials, refuse_if_too_large
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_moment_vector
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners, Series, Stack
@@ -88,8 +84,9 @@ class Superposed(AbstractCombination):
 
     @property
     def selection(self) -> np.ndarray:
-        """Matrix from y to (y_1, y_2, ...)."""
-        rows: np.ndarray = np.eye(self.inputs)[[i for chosen in self.places for i in chosen]]
+        """Matrix S of zeros and ones with S y = (y_1, y_2, ...), y_i the components of y that map i takes."""
+        indices = [i for indices_of_map in self.places for i in indices_of_map]
+        rows: np.ndarray = np.eye(self.inputs)[indices]
         return rows
 
     @property
@@ -103,24 +100,29 @@ class Superposed(AbstractCombination):
         sum_matrix = np.tile(np.eye(self.outputs), (1, len(self.maps)))
         return Series([Stack(maps_of_y), GainAndNoise(Constant(1.0), sum_matrix, self.noise)])
 
-    def sum_in_places(self, parts: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
-        """Return the sum of arrays of some of the maps, each put at the places in (y, 1) of what its map takes.
+    def sum_in_places(self, arrays: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
+        """Return the sum of arrays T_i of some of the maps, where index a of (y_i, 1) becomes its index in (y, 1).
 
-        parts: arrays by number of the map, whose last `axes` (1 or 2) have the length of (y_i, 1).
+        y_i are the components of y that map i takes. With one axis T_i (..., a) is such as E[(G_i, n_i)], with two
+        T_i (..., a, b) is such as the covariances of its entries. Entries that no map has are zero.
+
+        Args:
+            arrays: T_i by the number i of the map.
+            axes: number of last axes of T_i that have the length of (y_i, 1): 1 or 2.
         """
-        size = self.inputs + 1
-        # Places of each part's entries in the flat axis or axes of (y, 1).
-        where = [np.array([*self.places[i], self.inputs]) for i in parts]
-        if axes == 2:
-            where = [(size * of_part[:, None] + of_part).reshape(-1) for of_part in where]
-        if not parts:
+        size = self.inputs + 1  # of (y, 1)
+        if not arrays:
             return np.zeros((self.outputs,) * axes + (size,) * axes)
-        flat = [part.reshape(*part.shape[:-axes], -1) for part in parts.values()]
+        # For each entry of the last axes of T_i, flattened, its index a, or size a + b, in the result's, flattened.
+        indices = [np.array([*self.places[i], self.inputs]) for i in arrays]
+        if axes == 2:
+            indices = [(size * of_map[:, None] + of_map).reshape(-1) for of_map in indices]
+        flat = [array.reshape(*array.shape[:-axes], -1) for array in arrays.values()]
         values = library(flat).concatenate(flat, axis=-1)
-        whole = scatter(
-            (size**axes, *values.shape[:-1]), np.concatenate(where), values.transpose(-1, *range(values.ndim - 1))
-        )
-        return whole.transpose(*range(1, whole.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
+        # `scatter` adds along the first axis, so that the flattened axis is first there, and then last again.
+        values_by_index = values.transpose(-1, *range(values.ndim - 1))
+        total = scatter((size**axes, *values.shape[:-1]), np.concatenate(indices), values_by_index)
+        return total.transpose(*range(1, total.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y."""
@@ -135,7 +137,7 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)] of the sum, from those of the maps and the noise."""
+        """Return E[Sym^order(H)] of the sum, which takes monomials of (y, 1) to means of those of (z, 1)."""
         check_forgets("moments of a map", self)
         matrices = [affine.moments(order).matrix[None] for affine in self.maps]  # the nominal law counts as one corner
         (matrix,) = self._add_moments(matrices, order)
@@ -143,18 +145,21 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] at every combination of the maps' corners."""
+        """Return E[Sym^order(H)] for each combination of one extreme law ("corner") of each map."""
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the interval of E[Sym^order(H)], that of the same map written as the sum of a stack."""
+        """Return an interval of each entry of E[Sym^order(H)], from those of the equal map [I ... I] after a stack."""
         return self.as_stack.moment_interval(order)
 
-    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a sum with the same places and noise, and with maps that are possible here."""
-        if not isinstance(own, Superposed) or own.places != self.places or not same_noise(self.noise, own.noise):
+    def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether `actual` is a sum whose maps take the same components of y and are possible under those here.
+
+        `same_noise` tests whether the noises of both sums agree.
+        """
+        if not isinstance(actual, Superposed) or actual.places != self.places:
             return False
-        return self.covers_maps(own, same_noise)
+        return same_noise(self.noise, actual.noise) and self.covers_maps(actual, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Return for each output whether its gain is known, which must hold in every summand.
@@ -167,11 +172,11 @@ class Superposed(AbstractCombination):
         return known_in_all
 
     def list_atoms(self) -> list[AffineComponent]:
-        """Return the atoms of the sum of a stack."""
+        """Return the atoms of the equal map `as_stack`: all combinations of one atom of each map and of the noise."""
         return self.as_stack.list_atoms()
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return the joint moments of the sum of a stack."""
+        """Return E[H_ab] and E[H_ab H_ij] of H = [G, N], z = G y + N d with a disturbance d in place of the noises."""
         return self.as_stack.disturb_gain()
 
     def in_words(self) -> str:
@@ -189,157 +194,38 @@ class Superposed(AbstractCombination):
         return Superposed(self.maps, mean_alone, self.places, self.inputs), self.noise
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the sum with its hops visited; each map is a link with the components of y that it takes.
+        """Return the sum with visit(name, hop, signal) in place of each hop, and the position unchanged.
 
-        The position does not change, since links side by side are not hops of the chain.
+        Each map is a link that takes some components of y, and names of its hops begin with "link" and its number.
+        Links side by side are not hops of the chain, so that the position does not change.
         """
-        maps_with_places = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
-        visited = [affine.visit_hops(visit, at.select_components(place))[0] for (affine, at), place in maps_with_places]
+        maps_and_positions = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
+        visited = [
+            affine.visit_hops(visit, position_of_map.select_components(components))[0]
+            for (affine, position_of_map), components in maps_and_positions
+        ]
         return self.rebuilt(*visited), position
 
-    def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
-        """Return E[Sym^order(H)] of the sum from those of its maps in `parts`, each (corners, rows, columns).
+    def _add_moments(self, moments_by_map: Sequence[Corners], order: int) -> Corners:
+        """Return E[Sym^order(H)] of z = sum_i H_i y_i + n for each combination of one extreme law of each map.
 
-        A corner of the sum is a combination of corners (extreme laws) of the maps.
+        Sym^order(H) takes the monomials of (y, 1) of this degree to those of (z, 1).
+
+        Args:
+            moments_by_map: E[Sym^order(H_i)] under each extreme law ("corner") of map i (corners, rows, columns).
+            order: degree of the monomials.
         """
         columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
-        terms = [
-            _expand_map_moments(matrix, affine.outputs, taken, order)
-            for matrix, affine, taken in zip(parts, self.maps, self.places, strict=True)
+        summands = [
+            expand_map_moments(matrix, self.outputs, components, order)
+            for matrix, components in zip(moments_by_map, self.places, strict=True)
         ]
-        # The noise is a map without inputs.
+        # The noise is a summand that takes no component of y.
         noise_moments = noise_moment_vector(self.noise, order)[None, :, None]
-        noise = _expand_map_moments(noise_moments, self.outputs, places=(), order=order)
-        moments = _add_independent_moments(_sum_maps_by_halves(terms, self.outputs), noise, self.outputs)
-        return _assemble_moments(moments, self.outputs, self.inputs, order)
-
-
-class _SumMoments(NamedTuple):
-    """Powers of a sum t of maps: E[t^a | y] at each corner, by degree |a|, homogeneous polynomials in (y, 1).
-
-    places: of the components of y on which t depends, in order; by_degree: each (corners, monomials of t, monomials).
-    """
-
-    places: Places
-    by_degree: list[Corners]
-
-
-def _expand_map_moments(matrix: Corners, outputs: int, places: Places, order: int) -> _SumMoments:
-    """Return the polynomials E[t^a | y] of one map t = H y from its E[Sym^order(H)] at each corner (extreme law).
-
-    Args:
-        matrix: E[Sym^order(H)] of the map (corners, rows, columns).
-        outputs: number of its outputs.
-        places: places of its inputs among all of y, in any order; polynomials have them sorted.
-        order: order of the moments.
-    """
-    ordered, variables = tuple(sorted(places)), len(places) + 1
-    # The place of each variable of the map in the sorted order; the constant 1 is last.
-    sorted_place = np.array([ordered.index(i) for i in places] + [len(places)])
-    by_degree = [library(matrix).ones((len(matrix), 1, 1))]
-    for degree in range(1, order + 1):
-        rows, columns = _find_monomials_of_degree(outputs, degree, order), times_one(variables, degree, order)
-        # Places of monomials among those of the sorted variables. argsort gives the monomial that has each place.
-        place_in_sorted = place_monomials(sorted_place[factor_variables(variables, degree)], variables)
-        by_degree.append(matrix[:, rows[:, None], columns[np.argsort(place_in_sorted)]])
-    return _SumMoments(ordered, by_degree)
-
-
-@cache_arrays
-def _find_monomials_of_degree(outputs: int, degree: int, order: int) -> np.ndarray:
-    """Return the positions at `order` of the monomials of z alone of this degree, times powers of 1."""
-    alone = factor_variables(outputs, degree)
-    return place_monomials(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
-
-
-def _sum_maps_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
-    """Return the moments E[t^a | y] of a sum t of independent terms, from those of its halves.
-
-    Polynomials of few variables are so multiplied first, which is fastest.
-    """
-    if len(terms) == 1:
-        return terms[0]
-    middle = len(terms) // 2
-    first_half = _sum_maps_by_halves(terms[:middle], outputs)
-    second_half = _sum_maps_by_halves(terms[middle:], outputs)
-    return _add_independent_moments(first_half, second_half, outputs)
-
-
-def _add_independent_moments(a: _SumMoments, b: _SumMoments, outputs: int) -> _SumMoments:
-    """Return the powers of a sum t + r of independent maps at each pair of corners, those of t slowest.
-
-    E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y].
-    """
-    places = tuple(sorted({*a.places, *b.places}))
-    size, corners = len(places) + 1, len(a.by_degree[0]) * len(b.by_degree[0])
-    left_variables, right_variables = ((*(places.index(i) for i in part.places), size - 1) for part in (a, b))
-    by_degree = [library(a.by_degree[0], b.by_degree[0]).ones((corners, 1, 1))]
-    for degree in range(1, len(a.by_degree)):
-        total: Corners = np.zeros((count_monomials(size, degree), count_monomials(outputs, degree), corners))
-        # Terms with |b| = first: the places of c, b and c - b, and C(c, b).
-        for first, (row, of_t, of_r, ways) in enumerate(_list_binomial_terms(outputs, degree)):
-            left = a.by_degree[first][:, None, of_t, :, None] * ways[:, None, None]
-            right = b.by_degree[degree - first][None, :, of_r, None, :]
-            products = (left * right).reshape(corners, len(row), -1)
-            where = _place_products(left_variables, right_variables, first, degree - first, size).reshape(-1)
-            rows = scatter((count_monomials(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
-            total = total + scatter((count_monomials(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
-        by_degree.append(total.transpose(2, 1, 0))
-    return _SumMoments(places, by_degree)
-
-
-@cache_arrays
-def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Return terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b) with |c| = degree, for |b| = 0, 1, ..., degree.
-
-    For each |b| there are four columns: the places of c, of b and of c - b, each among monomials of its own degree, and
-    C(c, b).
-    """
-    exponents = list_exponents(outputs + 1, degree)
-    by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
-    for c, b, remainder, binomial in zip(*plan_binomial_sums(outputs, degree), strict=True):
-        if not exponents[c][-1]:  # |c| = degree: no power of 1
-            powers = [exponents[i][:-1] for i in (c, b, remainder)]
-            places = [position(outputs, sum(power))[power] for power in powers]
-            by_degree_of_b[sum(exponents[b][:-1])].append((*places, binomial))
-    return tuple(tuple(np.array(column) for column in zip(*terms, strict=True)) for terms in by_degree_of_b)
-
-
-@cache_arrays
-def _place_products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
-    """Return the positions of products of monomials of degree `first` in variables a and of degree `second` in b.
-
-    Entry (i, j) is the position of monomial i times monomial j among those of degree first + second in all `size`
-    variables.
-    """
-    variables_a = np.array(a)[factor_variables(len(a), first)]
-    variables_b = np.array(b)[factor_variables(len(b), second)]
-    shape = len(variables_a), len(variables_b)
-    of_a = np.broadcast_to(variables_a[:, None], (*shape, first))
-    of_b = np.broadcast_to(variables_b, (*shape, second))
-    return place_monomials(np.concatenate([of_a, of_b], axis=-1), size)
-
-
-def _assemble_moments(powers: _SumMoments, outputs: int, inputs: int, order: int) -> Corners:
-    """Return E[Sym^order(H)] at each corner (extreme law) from the polynomials of each degree.
-
-    `powers`: of z, by degree |a| the polynomials E[z^a | y] in the components of y at their places, and 1.
-    """
-    size, corners = len(powers.places) + 1, len(powers.by_degree[0])
-    names = np.array([*powers.places, inputs])
-    xp = library(powers.by_degree)
-    matrix: Corners = xp.zeros((corners, count_monomials(outputs + 1, order), count_monomials(inputs + 1, order)))
-    for degree, polynomials in enumerate(powers.by_degree):
-        rows = _find_monomials_of_degree(outputs, degree, order)
-        # A row is z^a times powers of 1, a column a monomial of y times powers of 1: each of degree `order`.
-        chosen = np.pad(names[factor_variables(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
-        columns = place_monomials(chosen, inputs + 1)
-        if xp is np:
-            matrix[:, rows[:, None], columns] = polynomials
-        else:
-            matrix = jnp.asarray(matrix).at[:, rows[:, None], columns].set(polynomials)
-    return matrix
+        noise = expand_map_moments(noise_moments, self.outputs, components=(), order=order)
+        moments = add_independent_moments(sum_moments_by_halves(summands, self.outputs), noise, self.outputs)
+        return assemble_moments(moments, self.outputs, self.inputs, order)
 
 
 def move_sensor_into_links(
@@ -354,8 +240,8 @@ def move_sensor_into_links(
     if not isinstance(first, Superposed) or (noises_of_links := noise.split(first.places)) is None:
         return None
     links = []
-    for taken, noise_of_link, link in zip(first.places, noises_of_links, first.maps, strict=True):
-        sensor_of_link = GainAndNoise(Constant(1.0), np.asarray(matrix)[list(taken)], noise_of_link)
+    for components, noise_of_link, link in zip(first.places, noises_of_links, first.maps, strict=True):
+        sensor_of_link = GainAndNoise(Constant(1.0), np.asarray(matrix)[list(components)], noise_of_link)
         links.append(Series([sensor_of_link, link]))
     n = np.shape(matrix)[1]
     all_of_x = tuple(range(n))
@@ -363,7 +249,7 @@ def move_sensor_into_links(
 
 
 class _MapsWithMemories(NamedTuple):
-    """Maps of a sum, by their numbers, and the names of the memories that they have."""
+    """Some maps of a sum, by their numbers, and the identities of all memories inside them."""
 
     memories: set[str]
     maps: list[int]
@@ -377,14 +263,14 @@ def split_terms_without_common_memory(channel: AbstractRandomAffine) -> list[Abs
     """
     if not isinstance(channel, Superposed):
         return [channel]
-    # Map after map: the groups that share a memory with it, or have none like it, are joined by it.
+    # Map after map: the groups that share a memory with it are joined, and so are groups without any memory.
     groups: list[_MapsWithMemories] = []
     for i, affine in enumerate(channel.maps):
-        held, members = set(memories(affine)), [i]
-        for group in [group for group in groups if group.memories & held or not (group.memories or held)]:
+        identities, numbers = set(memories(affine)), [i]
+        for group in [group for group in groups if group.memories & identities or not (group.memories or identities)]:
             groups.remove(group)
-            held, members = held | group.memories, group.maps + members
-        groups.append(_MapsWithMemories(held, members))
+            identities, numbers = identities | group.memories, group.maps + numbers
+        groups.append(_MapsWithMemories(identities, numbers))
     no_noise = as_noise("noise of a term", 0.0, channel.outputs)
     return [
         Superposed(

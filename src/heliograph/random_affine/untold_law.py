@@ -1,4 +1,4 @@
-"""Links whose messages tell numbers of their law, as they are known before a message, when nothing is told yet."""
+"""Law of links with channel side information before a message arrives, so that no number is reported yet."""
 
 from collections import Counter
 from typing import TypeVar
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
     AbstractToldMap,
-    FreshNumbers,
     PilotedHop,
     ToldGainHop,
     ToldMap,
@@ -18,57 +17,66 @@ from heliograph.random_affine.channel_state_information import (
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import AbstractLaw, Discrete
 from heliograph.random_affine.mixture import Mixture
+from heliograph.random_affine.reported_numbers import FreshNumbers
 
 T = TypeVar("T")
 
 
 def believe_untold(channel: T) -> T:
-    """Return the channel as a receiver knows it before a message: each told map by the law of its numbers.
+    """Return the law of the channel before a message, which is not conditioned on the numbers that it will report.
 
-    A told map has numbers that a message tells, such as a gain. If the law of its numbers is not known, or gives no map
-    that can be written, the map of typical numbers is taken.
+    A told map, `AbstractToldMap`, is a map of which each message reports numbers, such as its gain. It is replaced by
+    its law with random numbers. If their law is not known, or that map is of no known kind, it is replaced by the map
+    of an example of the numbers (`typical`).
     """
 
-    def believe(leaf: object) -> object:
-        """Return a told map by the law of its numbers, or by typical numbers; return anything else unchanged."""
+    def average(leaf: object) -> object:
+        """Return a told map with random or example numbers; return anything else unchanged."""
         if not isinstance(leaf, AbstractToldMap):
             return leaf
-        map_of_law = _find_untold(leaf)
-        return leaf.believed(leaf.typical) if map_of_law is None else map_of_law
+        law_before_message = _find_law_before_message(leaf)
+        return leaf.believed(leaf.typical) if law_before_message is None else law_before_message
 
-    believed: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
-    return believed
+    averaged: T = jax.tree.map(average, channel, is_leaf=_is_told_map)
+    return averaged
 
 
 def has_untold_law(channel: AbstractRandomAffine) -> bool:
-    """Return whether `believe_untold` gives the exact law of all that arrives, before a message tells numbers.
+    """Return whether `believe_untold` returns the exact law of the channel before a message reports numbers.
 
-    It does not if it takes typical numbers for a map, or if two maps have the same told numbers and so are dependent.
+    It is not exact if example numbers stand for a law that is not known, or if two maps have the same reported numbers:
+    these maps are dependent, but would be replaced by independent ones.
     """
-    maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map) if isinstance(leaf, AbstractToldMap)]
-    counts = Counter(affine.memory.identity for affine in maps)
-    have_laws = all(_find_untold(affine) is not None for affine in maps)
-    return have_laws and max(counts.values(), default=0) <= 1
+    told_maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map) if isinstance(leaf, AbstractToldMap)]
+    maps_by_memory = Counter(affine.memory.identity for affine in told_maps)
+    have_laws = all(_find_law_before_message(affine) is not None for affine in told_maps)
+    are_independent = max(maps_by_memory.values(), default=0) <= 1
+    return have_laws and are_independent
 
 
 def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
-    """Draw the numbers that a message tells of all maps of a channel, in the order of `list_told_maps`.
+    """Draw the numbers that one message reports of all maps of a channel (told,), in the order of `list_told_maps`.
+
+    Each map has a memory, whose first state is drawn, `memory.begin`. `memory.announce` returns the part of the state
+    that the message reports, such as the reading of a gain without the gain itself.
 
     Raises:
         ValueError: numbers whose law nobody knows.
     """
     memories = [affine.memory for affine in list_told_maps(channel)]
     keys = jax.random.split(key, len(memories))
-    numbers_by_map = [memory.announce(memory.begin(key)) for memory, key in zip(memories, keys, strict=True)]
+    states = [memory.begin(memory_key) for memory, memory_key in zip(memories, keys, strict=True)]
+    numbers_by_map = [memory.announce(state) for memory, state in zip(memories, states, strict=True)]
     return jnp.concatenate([jnp.ravel(jnp.asarray(numbers, dtype=float)) for numbers in numbers_by_map])
 
 
-def _find_untold(affine: AbstractToldMap) -> AbstractRandomAffine | None:
-    """Return a map by the law of the numbers that a message would tell, or None if that law gives no known map.
+def _find_law_before_message(affine: AbstractToldMap) -> AbstractRandomAffine | None:
+    """Return the law of a map not conditioned on the numbers that a message will report, or None if it is not known.
 
-    A gain may have any law. Other numbers must have finitely many values, each of which gives a map of a mixture.
+    A reported gain, or a gain of which a reading is reported (`PilotedHop`), may have any law: the map is then a hop
+    with this law. Other numbers (`ToldMap`) must have finitely many values: the map is a mixture of one map for each.
     """
-    if isinstance(affine, PilotedHop):  # before the reading only the law of its gain is known
+    if isinstance(affine, PilotedHop):
         return GainAndNoise(affine.memory.law, affine.matrix, affine.noise)
     if not isinstance(affine, ToldMap) or not isinstance(affine.memory, FreshNumbers):
         return None
@@ -82,5 +90,5 @@ def _find_untold(affine: AbstractToldMap) -> AbstractRandomAffine | None:
 
 
 def _is_told_map(leaf: object) -> bool:
-    """Return whether an object is a map of which numbers are told."""
+    """Return whether an object is a map of which messages report numbers."""
     return isinstance(leaf, AbstractToldMap)

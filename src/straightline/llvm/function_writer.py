@@ -17,6 +17,7 @@ from straightline.llvm.operations import (
     write_splat,
 )
 from straightline.llvm.prefetch import PrefetchedRows, write_prefetch_requests
+from straightline.llvm.shared_slots import SharedSlots
 from straightline.llvm.vector_types_and_gathers import WIDTH, gather_name
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
 from straightline.program import find_fused_product
@@ -25,56 +26,29 @@ from straightline.size_limits import ANY_LENGTH, LONGEST_BASIC_BLOCK
 Scope = dict[Any, str]
 
 
-class SharedSlots:
-    """Layout of numbers that all runs share, which one function computes and the other reads; all turns of a loop's."""
-
-    def __init__(self, size: int):
-        """Begin the layout at byte `size` of the shared memory: the bytes before it are taken already."""
-        self.size = size  # bytes that are taken so far
-        self.places: dict[Node, int] = {}  # the first byte of each number
-        self.base = ""  # name of the pointer to the memory, in LLVM's text
-
-    def offset_of(self, node: Node) -> int:
-        """Return the offset of a shared number in bytes, assigned at its first use; each turn of its loops takes 8."""
-        if node not in self.places:
-            self.places[node] = self.size
-            self.size += 8 * node.block.count_turns()
-        return self.places[node]
-
-    def load(self, writer: "FunctionWriter", node: Node) -> str:
-        """Write the load of a shared number, and return the name of the scalar; a flag is stored as a byte."""
-        address = self._write_address(writer, node)
-        if node.type == "bool":
-            return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
-        return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
-
-    def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
-        """Write the store of a shared number, named `name`, for the function of blocks to load; a flag is a byte."""
-        kind = vector_type(node.type)
-        address = self._write_address(writer, node)
-        if node.type == "bool":
-            name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
-        writer.line(f"store {kind} {name}, ptr {address}, align 1")
-
-    def _write_address(self, writer: "FunctionWriter", node: Node) -> str:
-        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
-        return writer.write_address_of_turn(start, node.block, 8)
-
-
 class FunctionWriter:
-    """Writer of one of a program's two functions: of those of its operations that are in the set `mine`.
+    """Writes the LLVM text of one of a program's two functions: the block function, or that of shared numbers.
+
+    The block function computes what differs between runs, for a block of runs at once: each SIMD lane of its vectors
+    has one run. The other function computes once what all runs share.
 
     Args:
-        single: whether vectors are of one number, as in the function of what all runs share.
-        mine: the items that this function computes: those that differ between runs, or those that do not.
+        single: whether vectors have one lane, as in the function of shared numbers.
+        items: the operations and statements that this function computes.
         products: products that are fused with the sum that uses them.
-        spread: the buffers with a number for each lane.
-        slots: places of numbers that all runs share and that the other function computes.
+        per_run: the buffers that have a number for each run of the block, and so for each lane.
+        slots: memory of the shared numbers that one function computes and the other loads.
     """
 
-    def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: SharedSlots):
-        """Begin the text of a function, without lines as yet; the class says what the arguments are."""
-        self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
+    def __init__(
+        self, single: bool, items: Collection[Any], products: set[Node], per_run: set[Any], slots: SharedSlots
+    ):
+        """Begin the text of a function that computes `items`, without lines as yet.
+
+        `single`: vectors have one lane. `products` are fused with their sums. `per_run` are the buffers with a number
+        for each lane. `slots` is the memory of numbers that all runs share.
+        """
+        self.single, self.items, self.products, self.per_run, self.slots = single, items, products, per_run, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
         self.label, self.first_line = "entry", 0  # of LLVM's basic block that is being written
@@ -83,12 +57,12 @@ class FunctionWriter:
         self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}
-        self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn
+        self.per_iteration: Collection[Buffer] = ()  # shared buffers with a copy for each iteration of their loops
         self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
-        self.counted_lanes = ""  # the lanes that count
+        self.lanes_with_run = ""  # name of the mask of lanes that have a run, and do not repeat the last one
         self.flushes = False  # whether subnormal numbers are zeros
-        self.asking_loop: Loop | None = None  # the loop that asks for memory, and for which
-        self.asked_rows: list[PrefetchedRows] = []
+        self.prefetching_loop: Loop | None = None  # the loop that prefetches memory, and which rows
+        self.prefetched_rows: list[PrefetchedRows] = []
 
     def add(self, text: str) -> str:
         """Append an operation in LLVM's text; return the new name of its result."""
@@ -106,9 +80,9 @@ class FunctionWriter:
         self.label, self.first_line = label, len(self.lines)
 
     def write_block(self, block: Block) -> None:
-        """Write the operations and statements of a block that this function computes (`self.mine`), in order."""
+        """Write the operations and statements of a block that this function computes (`self.items`), in order."""
         for statement in block.items:
-            if statement not in self.mine:
+            if statement not in self.items:
                 continue
             if len(self.lines) - self.first_line > LONGEST_BASIC_BLOCK:
                 self._go_on_in_new_basic_block()
@@ -129,7 +103,11 @@ class FunctionWriter:
         self.start_basic_block(f"next{self.count}")
 
     def _note_name(self, node: Node, name: str) -> None:
-        """Note the LLVM name of a node's value; if the function of blocks loads it, a `single` function stores it."""
+        """Note the LLVM name of a node's value in the innermost scope, where later operations find it.
+
+        In the function of shared numbers (`single`) the value is also stored if the block function loads it: then the
+        node has a slot.
+        """
         self.scopes[-1][node] = name
         if self.single and node in self.slots.places:
             self.slots.store(self, node, name)
@@ -155,20 +133,25 @@ class FunctionWriter:
         if node.op == "constant":
             name = self.scopes[0][node] = write_splat(node.value, node.type)
             return name
-        if node in self.mine and node.op != "counter":
+        if node in self.items and node.op != "counter":
             raise RuntimeError(f"{node} is used before it is computed")
         name = self.scopes[-1][node] = self.write_broadcast(self.write_scalar(node), node.type)
         return name
 
     def write_scalar(self, node: Node) -> str:
-        """Return the name of a number that all lanes share."""
+        """Return the LLVM name of a number that is equal in all lanes, as a scalar; write what computes it if needed.
+
+        It is, in this order: a constant's text; a scalar that was written before, which a scope holds under the key
+        ("scalar", node); lane 0 of a vector of this function; a load by indices that are equal in all lanes; or a load
+        from the number's slot, which the function of shared numbers stores.
+        """
         if node.op == "constant":
             return str(int(node.value))
         key = ("scalar", node)
         for scope in reversed(self.scopes):
             if key in scope:
                 return scope[key]
-        if node in self.mine or any(node in scope for scope in self.scopes):
+        if node in self.items or any(node in scope for scope in self.scopes):
             name = self.add(f"extractelement {vector_type(node.type)} {self.write_operand(node)}, i64 0")
         elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
             name = self._write_scalar_load(node)
@@ -178,8 +161,8 @@ class FunctionWriter:
         return name
 
     def _is_scalar(self, node: Node) -> bool:
-        """Return whether a number is the same in all lanes."""
-        return node.op in ("constant", "counter") or node not in self.mine or self.single
+        """Return whether a number is equal in all lanes: every number is if a vector has one lane (`single`)."""
+        return node.op in ("constant", "counter") or node not in self.items or self.single
 
     def write_broadcast(self, name: str, type: Type) -> str:
         """Return the name of a vector that has a scalar in all lanes; in `single` functions a vector has one lane."""
@@ -190,7 +173,7 @@ class FunctionWriter:
         return self.add(f"shufflevector {kind} {first}, {kind} poison, %i32 zeroinitializer")
 
     def _locate(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
-        """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
+        """Return the address of entry offset + sum strides * indices of a buffer; `entry` is the LLVM type of one."""
         owner, start = buffer.owner
         base = self._write_base(owner)
         # The address of the row by the indices, written once for all entries of it.
@@ -207,32 +190,41 @@ class FunctionWriter:
         return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
 
     def _write_base(self, owner: Buffer) -> str:
-        """Return the address of a buffer's memory; a buffer in `turning` has a copy for each turn of its loops."""
-        if owner not in self.turning:
+        """Return the address of a buffer's memory; in `per_iteration`, that of its copy for the current iteration."""
+        if owner not in self.per_iteration:
             return self.bases[owner]
         key = ("base", owner)
         base = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
         if base is None:
-            bytes_ = owner.size * BITS[owner.type] // 8
-            base = self.scopes[-1][key] = self.write_address_of_turn(self.bases[owner], owner.block, bytes_)
+            size = owner.size * BITS[owner.type] // 8  # in bytes
+            base = self.scopes[-1][key] = self.write_address_in_iteration(self.bases[owner], owner.block, size)
         return base
 
-    def write_address_of_turn(self, start: str, block: Block, bytes_: int) -> str:
-        """Return the address of this turn's `bytes_` in memory from `start` on, for the loops around `block`."""
-        index = ""
+    def write_address_in_iteration(self, start: str, block: Block, size: int) -> str:
+        """Write the address, in memory from `start` on, of the `size` bytes for the current iteration; return its name.
+
+        With the loops around `block`, innermost first, of counters c_1, c_2, ... and lengths n_1, n_2, ..., it is
+        start + size (c_1 + n_1 (c_2 + n_2 (c_3 + ...))).
+        """
+        offset, stride = "", size
         for loop in block.list_loops():
             assert loop.counter is not None
-            step = self.add(f"mul i64 {self.write_scalar(loop.counter)}, {bytes_}")
-            index = self.add(f"add i64 {index}, {step}") if index else step
-            bytes_ *= loop.length or 1
-        return self.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
+            step = self.add(f"mul i64 {self.write_scalar(loop.counter)}, {stride}")
+            offset = self.add(f"add i64 {offset}, {step}") if offset else step
+            stride *= loop.length or 1
+        return self.add(f"getelementptr i8, ptr {start}, i64 {offset}") if offset else start
 
     def _write_load(self, node: Node) -> str:
-        """Write the load of a number: one for all lanes, one for each (`spread`), or by each lane's own indices."""
+        """Write the load of buffer[offset + sum strides * indices]; return the name of the vector.
+
+        If lanes have different indices, each lane loads a number of its own (gather). Else, if all runs share the
+        buffer, one number is loaded and copied to all lanes. Else the entry has a number for each lane (`per_run`),
+        which are one vector in memory. A boolean is a byte in memory.
+        """
         buffer, offset, strides = node.value
         if not all(self._is_scalar(i) for i in node.args):
             return self._write_gather(node)
-        if buffer.owner[0] not in self.spread:
+        if buffer.owner[0] not in self.per_run:
             return self.write_broadcast(self._write_scalar_load(node), node.type)
         address = self._locate(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
@@ -249,28 +241,32 @@ class FunctionWriter:
         return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
 
     def _write_gather(self, node: Node) -> str:
-        """Load a number at a different place in each lane."""
+        """Write the load of buffer[offset + sum strides * indices] with each lane's own indices; return its name."""
         buffer, offset, strides = node.value
         owner, start = buffer.owner
-        bits, spread = BITS[node.type], owner in self.spread
-        if not spread:
+        bits, has_lanes = BITS[node.type], owner in self.per_run
+        if not has_lanes:
             self.read.add(owner)
-        # Place of each lane: offset + sum strides * indices.
+        # Position of each lane's number in the buffer: offset + sum strides * indices.
         positions = f"splat (i64 {offset + start})"
         for stride, index in zip(strides, node.args, strict=True):
             step = self.add(f"mul %i64 {self.write_operand(index)}, splat (i64 {stride})")
             positions = self.add(f"add %i64 {step}, {positions}")
         # One load for each lane; booleans are stored as bytes.
-        self.gathered.add((bits, spread))
+        self.gathered.add((bits, has_lanes))
         loaded = self.add(
-            f"call %i{bits} @{gather_name(bits, spread)}(ptr {self._write_base(owner)}, %i64 {positions})"
+            f"call %i{bits} @{gather_name(bits, has_lanes)}(ptr {self._write_base(owner)}, %i64 {positions})"
         )
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
         return self.add(f"bitcast %i{bits} {loaded} to {vector_type(node.type)}") if node.type in REAL else loaded
 
     def _write_store(self, store: Store) -> None:
-        """Write the store of a number; in a buffer of `sums` it is added, in double, by lanes that have a run."""
+        """Write the store buffer[offset + sum strides * indices] = node, one number for each lane.
+
+        A buffer in `sums` has sums over runs in double precision: the number is added to what is there. An entry is a
+        row of 64-bit sums, where each lane adds to a sum of its own. Lanes that only repeat the last run add zero.
+        """
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         is_sum = store.buffer in self.sums
         entry = f"[{self.sums[store.buffer]} x i64]" if is_sum else f"%i{bits}"
@@ -278,9 +274,9 @@ class FunctionWriter:
         if is_sum:
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
-            sum_before = self.add(f"load {kind}, ptr {address}, align 8")
-            addend = self.add(f"select %i1 {self.counted_lanes}, {kind} {name}, {kind} zeroinitializer")
-            name = self.add(f"fadd {kind} {sum_before}, {addend}")
+            previous_sum = self.add(f"load {kind}, ptr {address}, align 8")
+            addend = self.add(f"select %i1 {self.lanes_with_run}, {kind} {name}, {kind} zeroinitializer")
+            name = self.add(f"fadd {kind} {previous_sum}, {addend}")
         if store.node.type == "bool":
             name, kind = self.add(f"zext {kind} {name} to %i8"), "%i8"
         self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")
@@ -295,7 +291,7 @@ class FunctionWriter:
         name, label_before = f"loop{self.count}", self.label
         # Only the carried numbers that this function computes or reads, by their place in the carry.
         pairs = zip(loop.parameters, loop.results, strict=True)
-        carried = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
+        carried = [k for k, pair in enumerate(pairs) if any(n in self.items for n in pair)]
         starts = [self.write_operand(loop.initial[k]) for k in carried]
         self.line(f"br label %{name}")
         self.start_basic_block(name)
@@ -303,8 +299,8 @@ class FunctionWriter:
         self.scopes.append({})  # names that hold within a turn
         counter = f"%{name}.counter"
         self._name_parameters(loop, name, counter, carried)
-        if loop is self.asking_loop:  # it asks for memory before that is used
-            for rows in self.asked_rows:
+        if loop is self.prefetching_loop:
+            for rows in self.prefetched_rows:
                 requests = write_prefetch_requests(rows, loop.length or 1, counter, WIDTH, self.add)
                 self.lines += [f"  {line}" for line in requests]
         # Counted: body, then the latch. Conditional: the check is inside the body.
@@ -326,12 +322,16 @@ class FunctionWriter:
             self._note_name(loop.results[k], final)
 
     def _name_parameters(self, loop: Loop, name: str, counter: str, carried: list[int]) -> None:
-        """Note the names, within a turn, of a loop's counter and of its parameters at the places `carried`."""
+        """Note the LLVM names that a loop's counter and carried numbers have within an iteration.
+
+        The counter is the scalar `counter`, and also a vector if this function computes with it. Carried number k, for
+        the k in `carried`, is the phi node %NAME.pk, NAME the loop's `name`.
+        """
         if loop.counter is not None:
             self.scopes[-1]["scalar", loop.counter] = counter
         for k in carried:
             self._note_name(loop.parameters[k], f"%{name}.p{k}")
-        if loop.counter is not None and loop.counter in self.mine:
+        if loop.counter is not None and loop.counter in self.items:
             self._note_name(loop.counter, self.write_operand(loop.counter))
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
@@ -383,7 +383,7 @@ class FunctionWriter:
         self.start_basic_block(name)
         self.scopes.append({})
         self.write_block(guard.body)
-        used = [k for k, r in enumerate(guard.results) if r in self.mine]
+        used = [k for k, r in enumerate(guard.results) if r in self.items]
         values = [self.write_operand(guard.values[k]) for k in used]
         label_after = self.label
         self.line(f"br label %{name}.end")

@@ -17,17 +17,18 @@ FILLED = ("scratch", "carried")  # kinds of memory that the program fills
 
 
 class ProgramParts(NamedTuple):
-    """Items of a program in order, and what of them differs between runs: `spread`; all else is computed once.
+    """What a program's outputs need, and which of it differs between runs; all else is computed once for all runs.
 
-    `lanes` are the inputs that differ: a block of runs has one run's numbers in each lane of its vectors. `alone`:
-    there is one run, whose arrays are used in place. A vector has at most `width` runs.
+    items: operations, statements and buffers in order. outputs: a buffer for each result. lanes: the inputs that differ
+    between runs; in vectors each SIMD lane has the number of one run. per_run: the items and inputs that differ
+    between runs. alone: there is one run, whose arrays are used in place. width: the most runs of a vector.
     """
 
     program: Program
     items: list[Any]
     outputs: list[Buffer]
     lanes: list[Buffer]
-    spread: set[Any]
+    per_run: set[Any]
     alone: bool
     width: int
     summed: SummedOutputs | None
@@ -44,19 +45,19 @@ class ProgramParts(NamedTuple):
 
     @property
     def common(self) -> list[bool]:
-        """Return which outputs all runs share."""
-        return [b not in self.spread for b in self.outputs]
+        """Return for each output whether all runs share it."""
+        return [b not in self.per_run for b in self.outputs]
 
     @property
     def outputs_summed_in_memory(self) -> list[Buffer]:
-        """Return the outputs that are summed over runs in memory.
+        """Return the outputs to whose sums over runs the code adds each run's number.
 
-        An output that all runs share (not in `spread`) is not among them: its sum is its number times the runs.
+        An output that is equal in all runs is not among them, since its sum is its number times the number of runs.
         """
         if self.summed is None:
             return []
         pairs = zip(self.outputs, self.summed.outputs, strict=True)
-        return [b for b, is_sum in pairs if is_sum and b in self.spread]
+        return [b for b, is_sum in pairs if is_sum and b in self.per_run]
 
 
 def split_shared_from_differing(
@@ -80,18 +81,18 @@ def split_shared_from_differing(
         summed: outputs that are summed over runs.
     """
     lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
-    # What differs between runs. One run alone computes all in the function of blocks, so all counts as differing; but
-    # tables are constants, which never do.
-    spread = {*items, *program.inputs} if alone else find_differing_items(items, lanes)
-    spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
+    # One run alone computes everything in the block function, so that everything counts as differing between runs. Only
+    # tables do not: they are constants.
+    per_run = {*items, *program.inputs} if alone else find_differing_items(items, lanes)
+    per_run = {x for x in per_run if not (isinstance(x, Buffer) and x.kind == "table")}
     return ProgramParts(
         program=program,
         items=items,
         outputs=outputs,
         lanes=lanes,
-        spread=spread,
+        per_run=per_run,
         alone=alone,
-        width=width or choose_vector_width(spread),
+        width=width or choose_vector_width(per_run),
         summed=summed,
     )
 
@@ -113,36 +114,44 @@ def choose_vector_width(items: Iterable[Any]) -> int:
 
 
 class MemoryLayout(NamedTuple):
-    """Offsets of buffers, and their ends, in bytes: of memory that belongs to a thread, and that all runs share.
+    """Offsets of buffers in two memories, and the sizes of these, in bytes.
 
-    `turning` are shared buffers within loops that have a place for each turn.
+    scratch, in_scratch: size of the memory that each thread has, and offsets in it. shared, in_shared: the same of the
+    memory that all runs share. per_iteration: shared buffers with a copy for each iteration of the loops around them.
     """
 
     scratch: int
     in_scratch: dict[Buffer, int]
     shared: int
     in_shared: dict[Buffer, int]
-    turning: set[Buffer]
+    per_iteration: set[Buffer]
 
 
-def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
-    """Return where buffers lie, as offsets in bytes.
+def lay_out_memory(parts: ProgramParts, block_items: Collection[Any]) -> MemoryLayout:
+    """Return where a program's buffers lie, as offsets in bytes in each thread's scratch memory and in shared memory.
 
-    Buffers that differ between runs lie in a thread's own memory (scratch). Buffers that the program fills for all
-    runs lie in shared memory. `mine` holds the items of the function of blocks, which computes what differs between
-    runs. If it reads a shared buffer that each turn of a loop fills anew, the buffer has a copy for each turn.
+    Buffers that differ between runs lie in scratch memory, with a number for each of the `width` runs of a vector.
+    Buffers that the program fills for all runs lie in shared memory. The function of shared numbers fills them before
+    the block function begins. So if the block function reads a shared buffer that each iteration of a loop fills anew,
+    the buffer has a copy for each iteration.
+
+    Args:
+        parts: the program's items, and which of them differ between runs.
+        block_items: the items of the block function, which computes what differs between runs.
     """
-    owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
+    whole_buffers = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
     sums = set(parts.outputs_summed_in_memory)
     _check_sums(parts.items, sums)
-    used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
-    differing = [b for b in owners if b in parts.spread and b not in sums and b not in used_in_place]
-    common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
-    turning = {b for b in common if b.block.list_loops()}  # filled anew in each turn of a loop
-    turning &= _find_read_buffers(mine) if turning else turning  # and read by the function of blocks
+    caller_arrays = {*parts.outputs, *parts.lanes} if parts.alone else set()  # used in place: one run has one lane
+    differing = [b for b in whole_buffers if b in parts.per_run and b not in sums and b not in caller_arrays]
+    common = [b for b in whole_buffers if b not in parts.per_run and b.kind in FILLED]
+    filled_in_loops = {b for b in common if b.block.list_loops()}
+    per_iteration = filled_in_loops and filled_in_loops & _find_read_buffers(block_items)
     scratch, in_scratch = _place_buffers(differing, parts.width)
-    shared, in_shared = _place_buffers(common, width=1, turning=turning)
-    return MemoryLayout(scratch=scratch, in_scratch=in_scratch, shared=shared, in_shared=in_shared, turning=turning)
+    shared, in_shared = _place_buffers(common, width=1, per_iteration=per_iteration)
+    return MemoryLayout(
+        scratch=scratch, in_scratch=in_scratch, shared=shared, in_shared=in_shared, per_iteration=per_iteration
+    )
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
@@ -163,16 +172,16 @@ def _find_read_buffers(items: Iterable[Any]) -> set[Buffer]:
 
 
 def _place_buffers(
-    buffers: Iterable[Buffer], width: int, turning: Collection[Buffer] = ()
+    buffers: Iterable[Buffer], width: int, per_iteration: Collection[Buffer] = ()
 ) -> tuple[int, dict[Buffer, int]]:
-    """Place buffers of `width` runs one after another; return the end and the offset of each buffer, in bytes.
+    """Place buffers of `width` runs one after another; return their size together and the offset of each, in bytes.
 
-    A buffer in `turning` has a copy for each turn of the loops around it.
+    A buffer in `per_iteration` has a copy for each iteration of the loops around it.
     """
-    start, places = 0, dict[Buffer, int]()
+    start, offsets = 0, dict[Buffer, int]()
     for buffer in buffers:
-        places[buffer] = start
-        copies = buffer.block.count_turns() if buffer in turning else 1
+        offsets[buffer] = start
+        copies = buffer.block.count_turns() if buffer in per_iteration else 1
         bits = buffer.size * copies * width * BITS[buffer.type]
         start += divide_rounded_up(bits, 8 * LINE) * LINE  # up to the next cache line
-    return start, places
+    return start, offsets

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from straightline.constant_folding import DTYPES
-from straightline.llvm.function_writer import FunctionWriter, SharedSlots
+from straightline.llvm.function_writer import FunctionWriter
 from straightline.llvm.memory_layout import (
     FILLED,
     LINE,
@@ -20,7 +20,9 @@ from straightline.llvm.memory_layout import (
     split_shared_from_differing,
 )
 from straightline.llvm.operations import BITS
+from straightline.llvm.output_buffers import choose_output_buffers
 from straightline.llvm.prefetch import PrefetchedRows, count_cache_lines_per_turn, find_longest_loop
+from straightline.llvm.shared_slots import SharedSlots
 from straightline.llvm.transposition import FEW, MoverOptions, write_mover
 from straightline.llvm.vector_types_and_gathers import (
     WIDTH,
@@ -29,7 +31,7 @@ from straightline.llvm.vector_types_and_gathers import (
     write_subnormal_flush,
     write_vector_types,
 )
-from straightline.lowering import Lowering, Value, turn_failures_into_refusals
+from straightline.lowering import turn_failures_into_refusals
 from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
 from straightline.program import (
     Program,
@@ -41,10 +43,8 @@ from straightline.program import (
     sort_items_by_dependence,
 )
 from straightline.reuse_recurring_loop_values import reuse_recurring_values
-from straightline.rules.loops import copy_in_memory
 from straightline.rules.random_bits import write_hash_function
-from straightline.size_limits import LONGEST, TABLE
-from straightline.strided_arrays import StridedArray, contiguous_strides
+from straightline.size_limits import LONGEST
 from straightline.vectors.elementary_functions import write_elementary_functions
 
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
@@ -102,45 +102,6 @@ class ModuleText(NamedTuple):
     width: int
 
 
-def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
-    """Return a buffer for each result, no buffer twice.
-
-    A result that the program fills in memory stays where it is. A result of nodes is stored number by number. So are
-    the results whose numbers are in `last`: they may overwrite arguments, and must be stored after all others.
-    """
-    lowering = Lowering()
-    lowering.graph = program.graph
-    results: list[Buffer] = []
-    for number, value in enumerate(program.outputs):
-        if number in last or not isinstance(value, StridedArray):
-            array = _store_in_memory(lowering, value)
-        else:
-            array = _find_whole_buffer_or_copy(lowering, value, results)
-        results.append(array.buffer)
-    return results
-
-
-def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
-    """Return an array as it is if it is all of a scratch buffer that no other result has taken; else a copy of it."""
-    buffer = value.buffer
-    is_contiguous = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
-    is_free = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
-    if is_contiguous and is_free and value.size == buffer.size:
-        buffer.shape = value.shape
-        return value
-    return _store_in_memory(lowering, value) if value.size <= TABLE else copy_in_memory(lowering, value)
-
-
-def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return a copy of an array, of nodes or in memory, that is stored entry by entry in a new buffer."""
-    nodes: list[Node] = lowering.nodes(value).ravel().tolist()
-    type: Type = value.type if isinstance(value, StridedArray) else nodes[0].type
-    buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
-    for index, node in enumerate(nodes):
-        lowering.graph.store(buffer, node, offset=index, strides=(), indices=())
-    return StridedArray.of_whole_buffer(buffer)
-
-
 @turn_failures_into_refusals("the text of a program")
 def write_module(
     program: Program,
@@ -173,17 +134,16 @@ def write_module(
     )
     counts = _count_operations(items)
     parts = split_shared_from_differing(program, items, outputs, differing, width, alone, summed)
-    # The items of the function of blocks, and where the numbers lie.
-    of_blocks = find_crossing_items(items, parts.spread)
-    layout = lay_out_memory(parts, of_blocks)
-    # The function of blocks computes what differs between runs. All else it reads from slots, places in memory that are
-    # assigned as it is written.
+    # The items of the block function, which computes what differs between runs, and where the numbers lie.
+    block_items = find_crossing_items(items, parts.per_run)
+    layout = lay_out_memory(parts, block_items)
+    # The block function loads all else from slots, places in memory that are assigned as it is written.
     slots = SharedSlots(layout.shared)
     products = find_fusable_products(items) if fuse else set()
-    writer = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=parts.spread, slots=slots)
-    writer.turning, writer.flushes = layout.turning, _is_single_precision(items)
+    writer = FunctionWriter(single=alone, items=block_items, products=products, per_run=parts.per_run, slots=slots)
+    writer.per_iteration, writer.flushes = layout.per_iteration, _is_single_precision(items)
     blocks = _write_block_function(writer, parts, layout)
-    # The other function, written after it, fills just these slots, once for all runs.
+    # The function of shared numbers, written after it, fills just these slots, once for all runs.
     once = _write_shared_function(writer, parts, layout)
     tables = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
     program.graph.top.free_contents()
@@ -218,13 +178,17 @@ def _is_single_precision(items: Iterable[Any]) -> bool:
 
 
 def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[[int], str]]) -> FunctionSource:
-    """Return the source of a written text, with its helpers and counts; a loop of unknown length counts as one turn.
+    """Return a function's source: its compressed text, its helpers, and how many operations it has and executes.
 
-    Helpers write the functions that the text calls: `others`, and those that the writer noted.
+    An operation in a loop is executed once for each iteration; a loop of unknown length counts as one iteration.
+
+    Args:
+        text: LLVM text of the function.
+        writer: its writer, which noted the functions that the text calls.
+        others: write further functions that it calls, for a number of lanes.
     """
-    counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
-    turns = {block: block.count_turns() for block in counts}
-    work = sum(count * turns[block] for block, count in counts.items())
+    operations_by_block = Counter([x.block for x in writer.items if isinstance(x, Node)])
+    executed = sum(count * block.count_turns() for block, count in operations_by_block.items())
     helpers: list[Callable[[int], str]] = [*others, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
         helpers.append(write_subnormal_flush)
@@ -234,7 +198,8 @@ def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[
     if "threefry" in writer.called:  # its text is the same for each count of lanes, so it is part of the text
         text = f"{write_hash_function()}\n{text}"
     compressed = zlib.compress(text.encode(), 1)
-    return FunctionSource(compressed=compressed, helpers=helpers, operations=counts.total(), work=work)
+    operations = operations_by_block.total()
+    return FunctionSource(compressed=compressed, helpers=helpers, operations=operations, work=executed)
 
 
 HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
@@ -285,39 +250,70 @@ def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: M
 def _write_mover_call(
     writer: FunctionWriter, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]
 ) -> MoverOptions:
-    """Write a call that moves a buffer's rows, one a run, into lanes ("take") or back; return the mover it calls."""
-    few = buffer.size if buffer.size < FEW else 0
-    called = MoverOptions(bits=BITS[buffer.type], inwards=kind == "take", squared=buffer.type in SQUARED, few=few)
-    pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
-    writer.line(f"call void @{called.name}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
-    return called
+    """Write a call that transposes a buffer of a block of runs; return which function ("mover") it calls.
+
+    In the caller's array each run has a row of numbers. In scratch memory each number has a row with one lane for each
+    run of the block.
+
+    Args:
+        writer: writer of the block function.
+        names: LLVM names of the addresses of the callers' arrays.
+        buffer: what is moved.
+        kind: "take" to move the caller's rows to lanes, "give" to move lanes to the caller's rows.
+    """
+    mover = MoverOptions(
+        bits=BITS[buffer.type],
+        to_lanes=kind == "take",
+        in_squares=buffer.type in SQUARED,
+        few_entries=buffer.size if buffer.size < FEW else 0,
+    )
+    addresses = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
+    writer.line(f"call void @{mover.name}({addresses}, i64 {buffer.size}, i64 %first, i64 %last)")
+    return mover
 
 
 def _request_rows_ahead(
-    writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
+    writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], inputs: list[Buffer], outputs: list[Buffer]
 ) -> None:
-    """Let the longest loop, if there is one, prefetch the next block's inputs (`taken`) and its own outputs (`given`).
+    """Let the longest loop of the block function, if there is one, prefetch the callers' memory while it computes.
 
-    `names` maps a buffer to the name of the pointer to its memory in LLVM's text.
+    It prefetches the next block's rows of the inputs, and this block's rows of the outputs, which are written after it.
+    `names` maps a buffer to the LLVM name of the address of its memory.
     """
-    writer.asking_loop = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
-    if writer.asking_loop is not None:
-        writer.asked_rows = _locate_rows(writer, names, taken, given, parts.width, writer.asking_loop)
+    writer.prefetching_loop = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.items)
+    if writer.prefetching_loop is not None:
+        writer.prefetched_rows = _locate_rows(writer, names, inputs, outputs, parts.width, writer.prefetching_loop)
 
 
 def _locate_rows(
-    writer: FunctionWriter, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
+    writer: FunctionWriter,
+    names: dict[Buffer, str],
+    inputs: list[Buffer],
+    outputs: list[Buffer],
+    width: int,
+    loop: Loop,
 ) -> list[PrefetchedRows]:
-    """Return the rows that a loop prefetches: the next block's inputs (`taken`) and this block's outputs (`given`)."""
-    first_of_next, results = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
-    for buffer in (*taken, *given):
-        bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
-        place = writer.add(f"mul i64 {'%first' if writes else first_of_next}, {bytes_of_run}")
-        start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {place}")
-        results.append(
-            PrefetchedRows(start, bytes_of_run, count_cache_lines_per_turn(bytes_of_run, width, loop), writes)
-        )
-    return results
+    """Write the addresses of the rows that a loop prefetches; return them with their sizes and lines per iteration.
+
+    In the LLVM text %first is the block's first run, and WIDTH the number of runs of a block, which is chosen only when
+    code is generated. `width` is the most that it can be: it gives the number of cache lines.
+
+    Args:
+        writer: writer of the block function.
+        names: LLVM name of the address of each buffer's memory.
+        inputs: buffers whose rows for the next block are read.
+        outputs: buffers whose rows for this block are written.
+        width: the most runs of a block.
+        loop: the loop.
+    """
+    first_of_next, prefetched = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
+    for buffer in (*inputs, *outputs):
+        bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in outputs
+        offset = writer.add(f"mul i64 {'%first' if writes else first_of_next}, {bytes_of_run}")
+        start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {offset}")
+        lines = count_cache_lines_per_turn(bytes_of_run, width, loop)
+        prefetched.append(PrefetchedRows(start=start, bytes=bytes_of_run, lines=lines, writes=writes))
+    return prefetched
 
 
 def _add_to_sums(
@@ -353,24 +349,29 @@ def _add_to_sums(
     place = writer.add(f"add i64 {batch}, {behind}")
     # Lanes beyond the last run repeat it, and do not count: those whose number is not below the runs that are left.
     runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
-    writer.counted_lanes = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
+    writer.lanes_with_run = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:
         writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {place}")
         writer.sums[buffer] = row_length_of_sums(width, summed.batches)
 
 
 def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource | None:
-    """Return the function that computes what all runs share, or None if nothing needs it.
+    """Return the function that computes once what all runs share, or None if nothing needs it.
 
-    `blocks`: the writer of the function of blocks, which loads the numbers `slots.places` and the buffers `read`.
+    It computes the shared outputs, and what the block function loads: numbers that have a slot, and shared buffers.
+
+    Args:
+        blocks: the writer of the block function, whose text is complete, so that it knows what it loads.
+        parts: the program's items and outputs.
+        layout: where shared buffers lie.
     """
     shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
     roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
     if not roots:
         return None
     needed = list_needed_items(roots)
-    writer = FunctionWriter(single=True, mine=needed, products=blocks.products, spread=set(), slots=blocks.slots)
-    writer.turning, writer.flushes = blocks.turning, blocks.flushes
+    writer = FunctionWriter(single=True, items=needed, products=blocks.products, per_run=set(), slots=blocks.slots)
+    writer.per_iteration, writer.flushes = blocks.per_iteration, blocks.flushes
     _write_pointers(writer, parts.passed_buffers, layout.in_shared)
     writer.write_block(parts.program.graph.top)
     return _finish_source(_write_run_function("\n".join(writer.lines), writer), writer, [])

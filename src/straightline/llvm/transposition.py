@@ -1,8 +1,8 @@
 """Transposition of arrays [run][entry] to [entry][lane] for a block of runs, and back, as text of LLVM IR.
 
-Long numbers are moved in squares, of as many runs and entries as a register has, or as a vector has. A few of each run
-are registers one after another, whose numbers are exchanged: two of each take half of the time that they took one by
-one. What is left is moved one by one.
+Arrays of long numbers are moved in squares, of as many runs and entries as a register, or a vector, has lanes. If each
+run has only a few entries, all entries of some runs are loaded as whole registers, whose numbers are exchanged: two
+entries a run take half of the time that they took one by one. All other entries are moved one by one.
 """
 
 from collections.abc import Callable
@@ -44,41 +44,49 @@ class TextLines:
 
 
 class MoverOptions(NamedTuple):
-    """What a mover moves: numbers of so many bits, to lanes or back, and how.
+    """What a mover, a function that transposes an array of runs, moves, and how.
 
-    `squared`: in squares. `few`: entries of a run where they are fewer than FEW, 0 where they are not.
+    bits: of a number. to_lanes: True to move rows of runs to SIMD lanes, False to move lanes to rows. in_squares: move
+    squares of as many runs as entries. few_entries: entries of a run if they are fewer than FEW, else 0.
     """
 
     bits: int
-    inwards: bool
-    squared: bool
-    few: int
+    to_lanes: bool
+    in_squares: bool
+    few_entries: int
 
     @property
     def name(self) -> str:
-        """Return the name of the mover."""
-        kind = f"{'take' if self.inwards else 'give'}{'f' if self.squared and self.bits < 64 else ''}{self.bits}"
-        return f"{kind}x{self.few}" if self.few else kind
+        """Return the name of the mover in LLVM's text, such as take64 (rows to lanes) or give64 (lanes to rows)."""
+        kind = f"{'take' if self.to_lanes else 'give'}{'f' if self.in_squares and self.bits < 64 else ''}{self.bits}"
+        return f"{kind}x{self.few_entries}" if self.few_entries else kind
 
 
 def write_mover(move: MoverOptions, width: int) -> str:
-    """Return the LLVM text of `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or of `give64`.
+    """Return the LLVM text of a function that transposes an array of a block of runs, from rows to lanes or back.
 
-    `take` moves arrays [run][entry], of `size` entries a run, to [entry][lane]; `give` moves them back. Lane l is run
+    For numbers of 64 bits it is `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`. `take`
+    moves the array [run][entry], of `size` entries a run, to [entry][lane]; `give` moves it back. Lane l is run
     first + l, or the last run if there are fewer: it then repeats the computation of that run.
+
+    Args:
+        move: the size of a number, the direction, and in which way numbers are moved.
+        width: number of lanes.
     """
     text, bits = TextLines(), move.bits
-    side = min(REGISTER // bits if move.squared or move.few else FEW, width)  # runs that are moved together: a group
-    if move.few and width > 1:
-        _write_register_mover(text, move, side, width)
-    for first_lane in range(0, width, side):
-        rows = _write_row_addresses(text, bits, range(first_lane, first_lane + side))
-        group = _RunsInLanes(text, rows, width, first_lane, bits, move.inwards)
+    # Runs are moved in groups: of as many as a register has lanes, if registers are used.
+    uses_registers = move.in_squares or bool(move.few_entries)
+    group_size = min(REGISTER // bits if uses_registers else FEW, width)
+    if move.few_entries and width > 1:
+        _write_register_mover(text, move, group_size, width)
+    for first_lane in range(0, width, group_size):
+        rows = _write_row_addresses(text, bits, range(first_lane, first_lane + group_size))
+        group = _RunsInLanes(text, rows, width, first_lane, bits, move.to_lanes)
         first_entry = "0"
-        # Squares of `side` runs and as many entries, then the remaining entries one by one.
-        if move.squared and not move.few:
-            text.write_loop(f"g{first_lane}", "0", "%size", side, group.write_square)
-            first_entry = text.add(f"and i64 %size, {-side}")  # size rounded down to a multiple of side
+        # Squares of as many entries as the group has runs, then the remaining entries one by one.
+        if move.in_squares and not move.few_entries:
+            text.write_loop(f"g{first_lane}", "0", "%size", group_size, group.write_square)
+            first_entry = text.add(f"and i64 %size, {-group_size}")  # size rounded down to a multiple of group_size
         text.write_loop(f"h{first_lane}", first_entry, "%size", 1, group.write_entry)
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
@@ -100,30 +108,33 @@ def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
     return rows
 
 
-def _write_register_mover(text: TextLines, move: MoverOptions, side: int, width: int) -> None:
-    """Write the move of few entries of a block in which each lane has a run of its own, and the return after it.
+def _write_register_mover(text: TextLines, move: MoverOptions, group_size: int, width: int) -> None:
+    """Write the transposition of n = `few_entries` entries of each run by whole registers, and the return after it.
 
-    The runs of a group, `side` of them, have all their entries one after another in memory. These are loaded as whole
-    registers of `side` numbers; each register of the result gathers its numbers from the loaded ones. Where lanes
-    repeat the last run, the text goes on at "singles", which moves entries one by one.
+    A group of g = `group_size` runs has n g numbers, one after another in memory, which fill n registers of g lanes. In
+    lanes memory they are also n registers, one for each entry. Each register of the result takes its numbers from the
+    loaded ones. This is done if each lane has a run of its own. If some lanes repeat the last run, the text goes on at
+    the label "singles", behind which entries are moved one by one.
     """
+    n, g = move.few_entries, group_size
     text.lines.append(f"  %end = add i64 %first, {width - 1}")
     text.lines.append("  %whole = icmp sle i64 %end, %last")
     text.lines += ["  br i1 %whole, label %registers, label %singles", "registers:"]
-    start = text.add(f"mul i64 %first, {move.few}")
+    start = text.add(f"mul i64 %first, {n}")
     start = text.add(f"getelementptr i{move.bits}, ptr %runs, i64 {start}")
-    for group in range(0, width, side):
-        runs = [text.add(_write_address(move.bits, start, group * move.few + i * side)) for i in range(move.few)]
-        lanes = [text.add(_write_address(move.bits, "%lanes", i * width + group)) for i in range(move.few)]
-        sources, targets = (runs, lanes) if move.inwards else (lanes, runs)
-        # For each number of the targets, in order, its place among all numbers of the sources: the transpose of a table
-        # with a row for each run (its entries) or for each entry (its lanes).
-        numbers = np.arange(move.few * side)
-        in_sources = numbers.reshape(side, move.few).T if move.inwards else numbers.reshape(move.few, side).T
-        vector = f"<{side} x i{move.bits}>"
-        loaded = [text.add(f"load {vector}, ptr {p}, align {move.bits // 8}") for p in sources]
-        for target, places in zip(targets, in_sources.reshape(move.few, side).tolist(), strict=True):
-            chosen = _write_choice(text, loaded, [divmod(place, side) for place in places], vector)
+    for first_lane in range(0, width, g):
+        # Addresses of the group's registers: in rows of runs, and in lanes, where entry i has `width` numbers.
+        in_rows = [text.add(_write_address(move.bits, start, first_lane * n + i * g)) for i in range(n)]
+        in_lanes = [text.add(_write_address(move.bits, "%lanes", i * width + first_lane)) for i in range(n)]
+        sources, targets = (in_rows, in_lanes) if move.to_lanes else (in_lanes, in_rows)
+        # Number k of the targets is number positions[k] of the sources: a transposed table (g, n) or (n, g).
+        shape = (g, n) if move.to_lanes else (n, g)
+        positions = np.arange(n * g).reshape(shape).T
+        vector = f"<{g} x i{move.bits}>"
+        loaded = [text.add(f"load {vector}, ptr {address}, align {move.bits // 8}") for address in sources]
+        for target, positions_of_target in zip(targets, positions.reshape(n, g).tolist(), strict=True):
+            registers_and_lanes = [divmod(position, g) for position in positions_of_target]
+            chosen = _write_choice(text, loaded, registers_and_lanes, vector)
             text.lines.append(f"  store {vector} {chosen}, ptr {target}, align {move.bits // 8}")
     text.lines += ["  ret void", "singles:"]
 
@@ -152,8 +163,8 @@ def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int,
 class _RunsInLanes(NamedTuple):
     """Some runs that are moved together, from their rows to neighbouring lanes or back.
 
-    `text` takes what is written. `rows`: names of the addresses of the runs' first entries. `width`: lanes of a vector,
-    of which the runs have `first_lane` and those behind it. `bits`: of a number. `inwards`: from rows to lanes.
+    text: gets the lines. rows: names of the addresses of the runs' first entries. width: lanes of a vector; the runs
+    have the lanes from `first_lane` on. bits: of a number. to_lanes: move from rows to lanes, else from lanes to rows.
     """
 
     text: TextLines
@@ -161,7 +172,7 @@ class _RunsInLanes(NamedTuple):
     width: int
     first_lane: int
     bits: int
-    inwards: bool
+    to_lanes: bool
 
     def write_square(self, i: str) -> None:
         """Write the transposition of a square, entries i to i + n - 1 of the n runs, n a power of two.
@@ -176,7 +187,7 @@ class _RunsInLanes(NamedTuple):
         base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
         offsets = [k * self.width + self.first_lane for k in range(side)]
         in_lanes = [text.add(f"getelementptr i{bits}, ptr {base}, i64 {offset}") for offset in offsets]
-        sources, targets = (in_rows, in_lanes) if self.inwards else (in_lanes, in_rows)
+        sources, targets = (in_rows, in_lanes) if self.to_lanes else (in_lanes, in_rows)
         registers = [text.add(f"load {vector}, ptr {address}, {alignment}") for address in sources]
         # Transposed by halves: exchange the off-diagonal quarters, then those of each quarter, down to single numbers.
         half = side // 2
@@ -188,7 +199,7 @@ class _RunsInLanes(NamedTuple):
     def write_entry(self, i: str) -> None:
         """Write the moves of entry i of each run, one number at a time: from its run into its lane, or back.
 
-        `rows` holds the names of the runs' addresses. `inwards`: from runs into lanes.
+        `rows` holds the names of the runs' addresses. `to_lanes`: from runs into lanes.
         """
         text, bits = self.text, self.bits
         # Entry i of all lanes is a row of `width` numbers; the first of these runs has the lane `first_lane`.
@@ -198,7 +209,7 @@ class _RunsInLanes(NamedTuple):
         for lane, row in enumerate(self.rows):
             in_row = text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}")
             in_lane = text.add(f"getelementptr i{bits}, ptr {base}, i64 {lane}")
-            source, target = (in_row, in_lane) if self.inwards else (in_lane, in_row)
+            source, target = (in_row, in_lane) if self.to_lanes else (in_lane, in_row)
             number = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
             text.lines.append(f"  store i{bits} {number}, ptr {target}, align {bits // 8}")
 

@@ -23,27 +23,30 @@ def write_lane_numbers(width: int) -> str:
     return f"define internal %i64 @hg_lanes() noinline nounwind {{\n  ret %i64 <{numbers}>\n}}\n"
 
 
-def gather_name(bits: int, spread: bool) -> str:
-    """Return the name of a gather."""
-    return f"hg_gather{bits}_{'lanes' if spread else 'table'}"
+def gather_name(bits: int, has_lanes: bool) -> str:
+    """Return the name of the function that loads, for each SIMD lane, a number of `bits` bits by the lane's own index.
+
+    `has_lanes`: the memory has a number for each lane at each index; else it is a table that all lanes share.
+    """
+    return f"hg_gather{bits}_{'lanes' if has_lanes else 'table'}"
 
 
-def write_gather(bits: int, spread: bool, width: int) -> str:
-    """Write an LLVM function that loads for each lane the number at this lane's own place.
+def write_gather(bits: int, has_lanes: bool, width: int) -> str:
+    """Return the LLVM text of a function that loads, for each of `width` SIMD lanes, a number by the lane's own index.
 
-    Its head is like `%i64 @hg_gather64_table(ptr %start, %i64 %places)`. Numbers have `bits` bits. If `spread`, a place
-    holds `width` numbers, one for each lane, and each lane loads its own.
+    Its head is like `%i64 @hg_gather64_table(ptr %start, %i64 %places)`. Numbers have `bits` bits. If `has_lanes`, the
+    memory has at each index one number for each lane, and each lane loads its own.
     """
     # The vector begins without numbers ("poison"), and each lane is inserted.
     vector, text, gathered = f"%i{bits}", TextLines(), "poison"
-    row = f"[{width} x i{bits}]" if spread else f"i{bits}"
+    row = f"[{width} x i{bits}]" if has_lanes else f"i{bits}"
     for lane in range(width):
         index = text.add(f"extractelement %i64 %places, i64 {lane}")
-        in_row = f", i64 {lane}" if spread else ""
+        in_row = f", i64 {lane}" if has_lanes else ""
         address = text.add(f"getelementptr {row}, ptr %start, i64 {index}{in_row}")
         number = text.add(f"load i{bits}, ptr {address}, align {bits // 8}")
         gathered = text.add(f"insertelement {vector} {gathered}, i{bits} {number}, i64 {lane}")
-    head = f"define internal {vector} @{gather_name(bits, spread)}(ptr %start, %i64 %places) noinline nounwind"
+    head = f"define internal {vector} @{gather_name(bits, has_lanes)}(ptr %start, %i64 %places) noinline nounwind"
     body = "\n".join(text.lines)
     return f"{head} {{\n{body}\n  ret {vector} {gathered}\n}}\n"
 

@@ -67,7 +67,11 @@ RULES |= {"platform_index": _select_platform}
 
 
 def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower `cond`: a branch by a constant, else all branches, large ones skipped where no lane takes them."""
+    """Lower JAX's `cond`, the choice of a branch by an index (`inputs[0]`), and return the branch's results.
+
+    A constant index takes one branch. Otherwise lanes, each with a run of its own, may take different branches: all
+    branches are computed, and each lane selects its results.
+    """
     branches = equation.params["branches"]
     which = lowering.get_only_node(inputs[0])
     if which.op == "constant":
@@ -75,8 +79,9 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
         return lowering.inline_program(branches[taken], inputs[1:])
     if len(branches) == 1:
         return lowering.inline_program(branches[0], inputs[1:])
-    # Small branches are computed in any case, large ones in guarded blocks. The smallest is first, so that larger ones
-    # use what it computed: what a guarded block computes is not there outside of it.
+    # Small branches are computed in any case, large ones in guarded blocks, which are skipped where no lane takes them.
+    # Numbers of a guarded block cannot be used outside of it. So small branches come first, and larger ones can use
+    # equal numbers that these computed.
     conditions = _find_taken_branches(lowering, which, len(branches))
     sizes = [estimate_size(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}

@@ -123,9 +123,17 @@ def _batch_operation(
     leaves: Sequence[Any], axes: Sequence[int | None], *, program: _OperationProgram, levels: tuple[Axes, ...],
     sizes: tuple[int, ...],
 ) -> tuple[list[Any], list[int]]:  # fmt: skip
-    """Return the results of an operation under one more `vmap`, as one operation with one more level.
+    """Return the results of an operation under one more `vmap`, as the same operation with one more batch axis.
 
-    `axes` holds the batch axis of each argument, None for one without a batch. The axis is moved to the front.
+    Args:
+        leaves: its arguments.
+        axes: batch axis of each argument under this `vmap`, None for one without; it is moved to the front.
+        program: the operation.
+        levels: for each `vmap` inside of this one, innermost first, the batch axis of each argument, 0 or None.
+        sizes: size of the batch of each of these, outermost first.
+
+    Returns:
+        The results, and the batch axis of each, 0.
     """
     moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, axes, strict=True)]
     level = tuple(None if axis is None else 0 for axis in axes)

@@ -66,9 +66,14 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _choose_power_of_two_unit(a: jax.Array) -> jax.Array:
-    """Return a power of two in whose units squares of the matrix's entries neither overflow nor vanish, mostly 1."""
-    largest, power = jnp.max(jnp.abs(a)), 300 if a.dtype == np.float64 else 50
-    return jnp.where(largest > 2.0**power, 4.0**power, jnp.where(largest < 2.0**-power, 4.0**-power, 1.0))
+    """Return a power of two by which a matrix is divided so that squares of its entries neither overflow nor vanish.
+
+    It is 1 if the largest entry lies between 2^-p and 2^p, with p = 300 for doubles and 50 for floats: its square, at
+    most 2^600 or 2^100, is then far from 2^1024 or 2^128. Else it is 4^p or 4^-p, which brings even the largest and
+    smallest numbers of the type so near to 1 that their squares exist. Division by a power of two does not round.
+    """
+    largest, p = jnp.max(jnp.abs(a)), 300 if a.dtype == np.float64 else 50
+    return jnp.where(largest > 2.0**p, 4.0**p, jnp.where(largest < 2.0**-p, 4.0**-p, 1.0))
 
 
 def _make_tournament_turn(

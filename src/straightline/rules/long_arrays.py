@@ -37,16 +37,20 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Return whether an argument in memory is too long to have a node for each of its entries.
+    """Return whether an argument of an operation is too long to have a node for each of its entries.
 
-    More than LOADED numbers are always too long, and TABLE or fewer never. In between, an argument is too long unless
-    all arrays in memory are tables of constants and `_are_written_out` holds. The tables' zeros then save operations.
+    Arrays of nodes are never too long. Of arrays in memory, the longest one counts: more than LOADED numbers are too
+    long, and TABLE or fewer are not. In between it is too long unless all arrays in memory are tables of constants, and
+    the operation is written out entry by entry anyhow (`_are_written_out`): operations on known zeros then fall away.
     """
-    views = [x for x in inputs if isinstance(x, StridedArray)]
-    longest = max((x.size for x in views), default=0)
-    if not TABLE < longest <= LOADED:
-        return longest > TABLE
-    return not (all(map(_is_table, views)) and _are_written_out(inputs, longest))
+    arrays_in_memory = [x for x in inputs if isinstance(x, StridedArray)]
+    longest = max((x.size for x in arrays_in_memory), default=0)
+    if longest <= TABLE:
+        return False
+    if longest > LOADED:
+        return True
+    are_tables = all(map(_is_table, arrays_in_memory))
+    return not (are_tables and _are_written_out(inputs, longest))
 
 
 def _is_table(x: Value) -> bool:
@@ -232,23 +236,26 @@ def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: 
 
 
 def _find_sparse_product(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the factors of a product by a known matrix as (free, contracted) if its zeros leave few terms, else None.
+    """Return the factors A and B of a product A B' as matrices, if a known factor's zeros leave few terms; else None.
 
-    A known factor is an array of numbers, the other one of nodes.
+    A product of arrays sums over their contracted axes. All these axes are the columns of A and B, and the other, free
+    axes their rows. A factor that is known, as a table of constants, is a matrix of numbers; the other one is a matrix
+    of nodes. Few are at most WRITTEN_OUT products of two entries that are not known to be zero.
     """
     dimensions, (batch, _) = equation.params["dimension_numbers"]
-    tables = [_is_table(x) for x in inputs]
-    arrays = [x.get_known_numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
-    if batch or not any(tables) or any(isinstance(x, StridedArray) for x in arrays):
+    are_tables = [_is_table(x) for x in inputs]
+    arrays = [x.get_known_numbers() if is_table else x for x, is_table in zip(inputs, are_tables, strict=True)]
+    if batch or not any(are_tables) or any(isinstance(x, StridedArray) for x in arrays):
         return None
-    # Terms at each place along the contracted axes: entries of the one that are no zeros times those of the other.
-    factors, terms = [], np.ones(1, dtype=np.int64)
-    for x, is_table, contracted in zip(arrays, tables, dimensions, strict=True):
+    # Column k gives (nonzero entries of A in it) (nonzero entries of B in it) products.
+    factors, products_by_column = [], np.ones(1, dtype=np.int64)
+    for x, is_table, contracted in zip(arrays, are_tables, dimensions, strict=True):
         free = [d for d in range(x.ndim) if d not in contracted]
-        rows = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
-        terms = terms * (np.count_nonzero(rows, axis=0) if is_table else _count_nonzero_entries(rows, 1))
-        factors.append(rows)
-    return (factors[0], factors[1]) if terms.sum() <= WRITTEN_OUT else None
+        matrix = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
+        nonzero = np.count_nonzero(matrix, axis=0) if is_table else _count_nonzero_entries(matrix, 1)
+        products_by_column = products_by_column * nonzero
+        factors.append(matrix)
+    return (factors[0], factors[1]) if products_by_column.sum() <= WRITTEN_OUT else None
 
 
 def _write_out_product(

@@ -129,21 +129,21 @@ def _list_nodes_of_numbers(value: np.ndarray) -> list[Node]:
 def _restore_arrays(
     arrays: Sequence[np.ndarray], nodes: Sequence[Node], by_triangle: Sequence[bool]
 ) -> list[np.ndarray]:
-    """Return arrays like these of other nodes, in the order of `_flatten_carry`.
+    """Return arrays of the shapes of `arrays`, made of `nodes`, a flat list: the inverse of `_flatten_carry`.
 
-    `by_triangle` says of which arrays, symmetric matrices, the nodes are those of the upper triangle; an entry that is
-    a key of random numbers has two nodes.
+    An entry takes one node, or two where `arrays` has a key of random numbers, which consists of two words. An array
+    marked in `by_triangle` is a symmetric matrix, of which the list has only the upper triangle.
     """
     remaining = iter(nodes)
     results = []
     for array, has_triangle in zip(arrays, by_triangle, strict=True):
         n = array.shape[-1] if has_triangle else 0
-        old_entries = array[..., *np.triu_indices(n)] if has_triangle else array
+        listed_entries = array[..., *np.triu_indices(n)] if has_triangle else array
         new_entries = [
             RandomKey(next(remaining), next(remaining)) if isinstance(x, RandomKey) else next(remaining)
-            for x in old_entries.ravel().tolist()
+            for x in listed_entries.ravel().tolist()
         ]
-        restored = arrange_nodes(new_entries, old_entries.shape)
+        restored = arrange_nodes(new_entries, listed_entries.shape)
         results.append(_mirror_triangles(restored, n) if has_triangle else restored)
     return results
 
@@ -217,20 +217,19 @@ class _ScanBody(NamedTuple):
     rows: list[StridedArray]
 
     def lower_turn(self, row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Lower one turn of the loop; return the carried nodes after it, and the results that it stacks, as nodes.
+        """Lower one iteration of the loop; return the carried nodes after it, and the results to stack, as nodes.
 
-        `row` is the row of the stacked arguments that the turn reads. `numbers` are the nodes before the turn of the
-        carried arrays whose places are in `self.as_numbers`. The other carried arrays lie in memory, by place in
-        `self.in_memory`, and are read and filled there.
+        `row` is the row of the stacked arguments that it reads. `numbers` are the arrays that the loop carries as nodes
+        (`self.as_numbers`), before the iteration. Long arrays are carried in memory, which it reads and fills anew.
         """
         carried: dict[int, Value] = dict(zip(self.as_numbers, numbers, strict=True))
         carried |= {k: memory.view_in_turn() for k, memory in self.in_memory.items()}
         whole_carry = [carried.get(k, initial) for k, initial in enumerate(self.carry)]
         inputs = [*self.fixed, *whole_carry, *(array.row(row) for array in self.rows)]
-        results = self.lowering.inline_program(self.program, inputs)
-        nodes = [x if k in self.in_memory else self.lowering.nodes(x) for k, x in enumerate(results)]
-        fill_carried_memory(self.lowering, [(memory, nodes[k]) for k, memory in self.in_memory.items()])
-        return [nodes[k] for k in self.as_numbers], nodes[len(self.carry) :]
+        results = self.lowering.inline_program(self.program, inputs)  # the whole carry, then what is stacked
+        results = [x if k in self.in_memory else self.lowering.nodes(x) for k, x in enumerate(results)]
+        fill_carried_memory(self.lowering, [(memory, results[k]) for k, memory in self.in_memory.items()])
+        return [results[k] for k in self.as_numbers], results[len(self.carry) :]
 
 
 class CarriedMemory:
@@ -246,12 +245,12 @@ class CarriedMemory:
         self.memory.kind = "carried"
 
     def view_in_turn(self) -> StridedArray:
-        """Return the array in the turn whose body is open."""
-        self.memory.parts = []  # a body that is lowered once more fills it alone
+        """Return the array as an iteration reads it; the loop's body must be the graph's open block."""
+        self.memory.parts = []  # a body may be lowered twice: forget what filled the memory in the first try
         return self.view_from_here()
 
     def view_from_here(self) -> StridedArray:
-        """Return the array as the block that is open reads it from here on."""
+        """Return the array as the graph's open block reads it: in a loop's body before the end, or after the loop."""
         return self._view_part(Buffer("scratch", self.memory.type, self.memory.shape, self._graph.current))
 
     def fill(self, lowering: Lowering, x: StridedArray) -> None:

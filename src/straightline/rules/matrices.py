@@ -127,23 +127,24 @@ def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarra
 
 
 def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return A B' of A (n, k) and B (m, k); of a congruence C P C' only the upper triangle is computed.
+    """Return A B' of A (n, k) and B (m, k), arrays of nodes; if it is known to be symmetric, by its upper triangle.
 
-    A congruence is A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule,
-    since equal expressions are one node.
+    It is if A = C P and B = C, or A = C and B = C P, with a symmetric P: then A B' = C P C', as of a covariance. P may
+    be a matrix, if C P was computed by this function before, or diagonal, if C P has columns of C times one number
+    each. The product C C' needs no rule, since equal expressions are one node.
     """
-    # A weighted factor is that with a diagonal P.
     is_symmetric = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
-    places = [(i, j) for i in range(len(a)) for j in range(i if is_symmetric else 0, len(b))]
+    computed = [(i, j) for i in range(len(a)) for j in range(i if is_symmetric else 0, len(b))]
     product = np.empty((len(a), len(b)), dtype=object)
-    sums = _sum_products(lowering.graph, type, [(a[i], b[j]) for i, j in places])
-    for (i, j), entry in zip(places, sums, strict=True):
+    sums = _sum_products(lowering.graph, type, [(a[i], b[j]) for i, j in computed])
+    for (i, j), entry in zip(computed, sums, strict=True):
         product[i, j] = entry
         if is_symmetric:
             product[j, i] = entry
-    # What the product is made of, by which a later product knows that it is a congruence.
-    for entries, factors in ((product, (a, b)), (product.T, (b, a))):
-        lowering.products[_make_matrix_key(entries)] = factors
+    # `lowering.products` holds the factors of each product, and of its transpose, by the product's nodes. So a later
+    # call sees that its A = C P is a product with C.
+    lowering.products[_make_matrix_key(product)] = a, b
+    lowering.products[_make_matrix_key(product.T)] = b, a
     return product
 
 

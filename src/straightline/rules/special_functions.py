@@ -152,25 +152,29 @@ def regularised_incomplete_gammas_of_large_shape(a: jax.Array, x: jax.Array) -> 
 
 @cache
 def expand_coefficients() -> list[list[float]]:
-    """Compute the power series in y of c_0, c_1 and c_2, of `TERMS` terms.
+    """Return `TERMS` coefficients of the power series in y of c_0, c_1 and c_2, of Temme's expansion of Q(a, x).
 
-    c_0 = 1 / m - 1 / y, c_k = c_(k-1)' / y + (-1)^k g_k / m with g_1 = 1 / 12, g_2 = 1 / 288, and y (1 + m) = m m'.
+    Q(a, x) is the incomplete gamma function for a large shape a. With m = x / a - 1 and y^2 / 2 = m - log(1 + m), its
+    correction is c_0(y) + c_1(y) / a + c_2(y) / a^2, c_0 = 1 / m - 1 / y and c_k = c_(k-1)' / y + (-1)^k g_k / m. The
+    g_1 = 1 / 12 and g_2 = 1 / 288 are those of Stirling's series of Gamma(a).
     """
     count = TERMS + 5
-    # m = y (1 + b_1 y + b_2 y^2 + ...), and 1 / m = (1 + r_1 y + ...) / y.
+    # m = y sum_n b_n y^n, b_0 = 1. The derivative of y^2 / 2 is y = m m' / (1 + m), so y (1 + m) = m m'. Its power
+    # n + 1 of y is b_(n-1) = sum_{k=0}^n b_k (n - k + 1) b_(n-k), in which b_n has the factor n + 2.
     b = [Fraction(1)]
     for n in range(1, count):
-        known = sum((b[k] * b[n - k] * (n - k + 1) for k in range(1, n)), Fraction(0))
-        b.append((b[n - 1] - known) / (n + 2))
+        terms_without_b_n = sum((b[k] * b[n - k] * (n - k + 1) for k in range(1, n)), Fraction(0))
+        b.append((b[n - 1] - terms_without_b_n) / (n + 2))
+    # 1 / m = (1 / y) sum_n r_n y^n, r_0 = 1, from sum_{k=0}^n b_k r_(n-k) = 0.
     r = [Fraction(1)]
     for n in range(1, count):
         r.append(-sum((b[k] * r[n - k] for k in range(1, n + 1)), Fraction(0)))
-    # The poles at y = 0 cancel.
+    # c_0 = 1 / m - 1 / y has the coefficients r_1, r_2, ...; in c_1 and c_2, too, the terms with 1 / y cancel.
     series = [r[1:]]
-    for sign_g in (Fraction(-1, 12), Fraction(1, 288)):
-        before = series[-1]
-        series.append([(n + 2) * before[n + 2] + sign_g * r[n + 1] for n in range(len(before) - 2)])
-    return [[float(c) for c in one[:TERMS]] for one in series]
+    for signed_g in (Fraction(-1, 12), Fraction(1, 288)):  # (-1)^k g_k
+        previous = series[-1]
+        series.append([(n + 2) * previous[n + 2] + signed_g * r[n + 1] for n in range(len(previous) - 2)])
+    return [[float(c) for c in coefficients[:TERMS]] for coefficients in series]
 
 
 def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:

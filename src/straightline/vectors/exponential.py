@@ -32,7 +32,11 @@ class PrecisionFormat(NamedTuple):
 
     @property
     def negligible(self) -> float:
-        """Return a number whose square is lost beside 2, and its third power beside 1."""
+        """Return 2^-(f + 2), f the bits of the fraction: a quarter of the unit of rounding of 1.
+
+        For smaller x the first term of a series is the result: e^x - 1 = x + x^2 / 2 + ... and log(1 + x) = x - x^2 / 2
+        + ... are x, since x^2 / 2 is less than half a unit of rounding of x.
+        """
         return 2.0 ** -(self.fraction + 2)
 
 
@@ -183,16 +187,19 @@ def _limit_result(x: Vector, value: Vector, largest: float, smallest: float) -> 
 
 
 def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
-    """Return k and m with x = 2^k m and sqrt(1/2) <= m < sqrt(2), for a positive normal number x.
+    """Return k, as a real number, and m with x = 2^k m and sqrt(1/2) <= m < sqrt(2), for a positive normal number x.
 
-    The upper bits of x, read as an integer, are its exponent. k is what is left if the bits of sqrt(1/2) are
-    subtracted and the bits of the fraction are shifted out.
+    Read as integers (`form.word`), positive numbers are in their order. The lower bits are those of the fraction, and
+    above them is the exponent, so that x 2^k has the bits of x plus k << fraction. `root_half_bits` are the bits of
+    sqrt(1/2).
     """
     form = find_format(x)
     bits = x.as_type(form.word)
-    k = (bits - form.root_half_bits) >> form.fraction
+    k = (bits - form.root_half_bits) >> form.fraction  # rounded down: sqrt(1/2) 2^k <= x < sqrt(1/2) 2^(k+1)
     m = (bits - (k << form.fraction)).as_type(x.scalar)
-    return (k + form.round_bits).as_type(x.scalar) - form.round, m
+    # k as a real number: `round` is so large that its last bit is worth 1, so that its bits plus k are round + k.
+    k_real = (k + form.round_bits).as_type(x.scalar) - form.round
+    return k_real, m
 
 
 def _log(k: Vector, f: Vector, low: Vector | float) -> Vector:

@@ -132,23 +132,30 @@ def atan(x: Vector) -> Vector:
 
 
 def _atan_of_positive(x: Vector) -> Vector:
-    """Compute atan x for x >= 0: atan x = a + atan t with the nearest tabulated a, t = (x - tan a) / (1 + x tan a)."""
-    # A large x takes the place of infinity, which times 0 is no number.
+    """Return atan x for x >= 0 as A + atan t, t = (x - tan A) / (1 + x tan A), with a tabulated angle A near atan x.
+
+    atan t = t - t^3 p(t^2), with a polynomial p of coefficients ATAN, for the small |t| that remains.
+    """
+    # A large number stands for infinity, since infinity times 0 is NaN.
     x = select(x > 2.0**66, 2.0**66, x)
-    # In each lane a, b, c, d of t = (a x + b) / (c x + d), and the angle as high + low, of the last start up to x.
-    chosen = tuple(map(x.like, (1.0, 0.0, 0.0, 1.0)))
+    # Each lane takes the last entry of TURNS whose `start` is not above x, or A = 0, where t = x. An entry has the
+    # coefficients of t = (a x + b) / (c x + d), and A as the sum `high` + `low`.
+    coefficients = tuple(map(x.like, (1.0, 0.0, 0.0, 1.0)))
     high = low = x.like(0.0)
-    for start, coefficients, angle, rest in TURNS:
-        beyond = x >= start
-        chosen = tuple(select(beyond, new, old) for new, old in zip(coefficients, chosen, strict=True))
-        if x.scalar == "float":  # the table's angle is a sum of doubles
-            whole, angle = angle, rounded(angle)
-            rest = whole - angle
-        high, low = select(beyond, angle, high), select(beyond, rest, low)
-    a, b, c, d = chosen
+    for start, new_coefficients, new_high, new_low in TURNS:
+        is_reached = x >= start
+        pairs = zip(new_coefficients, coefficients, strict=True)
+        coefficients = tuple(select(is_reached, new, old) for new, old in pairs)
+        if x.scalar == "float":  # the table has the sum of two doubles: split the first into two floats
+            angle, new_high = new_high, rounded(new_high)
+            new_low = angle - new_high
+        high, low = select(is_reached, new_high, high), select(is_reached, new_low, low)
+    a, b, c, d = coefficients
     t = fma(x, a, b) / fma(x, c, d)
     z = t * t
-    return high - ((t * (z * polynomial(z, ATAN if x.scalar == "double" else ATAN_OF_FLOATS)) - low) - t)
+    p = polynomial(z, ATAN if x.scalar == "double" else ATAN_OF_FLOATS)
+    # high + t + (low - t^3 p), with the small terms added first.
+    return high - ((t * (z * p) - low) - t)
 
 
 def atan2(y: Vector, x: Vector) -> Vector:

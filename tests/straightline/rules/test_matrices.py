@@ -9,7 +9,7 @@ import pytest
 
 from straightline.compiled import compile
 from straightline.graph_as_jax_function import make_jax_function
-from straightline.llvm.module_text import choose_output_buffers
+from straightline.llvm.output_buffers import choose_output_buffers
 from straightline.nodes import Node
 from straightline.program import list_needed_items, lower_function
 

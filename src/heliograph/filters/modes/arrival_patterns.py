@@ -14,8 +14,8 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import JointModes
+from heliograph.random_affine.moments.gain_and_noise_covariances import join_gain_and_noise, split_off_noise
 from heliograph.random_affine.moments.moment_tensors import symmetric_product
-from heliograph.random_affine.moments.second_moments import join_gain_and_noise, split_off_noise
 
 
 class ChannelByPattern(Module):

@@ -7,7 +7,8 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import stack_parts
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
+from heliograph.random_affine.moments.gain_and_noise_covariances import join_gain_and_noise, split_off_noise
+from heliograph.random_affine.moments.second_moments import nominal_spread
 
 
 class ChannelByMode(Module):

@@ -20,11 +20,12 @@ from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.channel_state_information import FreshNumbers, FreshReading, list_told_maps
+from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.laws.gain_given_reading import gain_quadrature, reading_quadrature
 from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, MarkovChain
 from heliograph.random_affine.noise import FiniteSupport
+from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 
 MOST = 20_000  # combinations of numbers that are summed over
 

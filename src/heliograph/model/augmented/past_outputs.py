@@ -18,12 +18,14 @@ from heliograph.random_affine.shaped_noise import Shaped
 
 
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
-    """Return plant, sensor and channel with the states (x_k, y_k, y_{k-1}, ..., y_{k-D}), all sent without delay.
+    """Return plant, sensor and channel of the state (x_k, y_k, y_{k-1}, ..., y_{k-D}), and so without a delay.
 
-    The state y+ = C (A x + B u + w) + v includes the noise v, so that a y received twice counts once. With past x as
-    states, its noise would count as two independent ones, and the claimed covariance would be too small. Before the
-    first step zeros were sent. The new channel takes y_k, ..., y_{k-D} and draws like the late one. Any filter of
-    linear plants takes the three.
+    The sensor reads all these outputs without noise, and the channel takes them and has the law of the delayed one. So
+    any filter of linear plants can be made for the three. Before the first step zeros were sent.
+
+    The state y_{k+1} = C x_{k+1} + v_{k+1} contains the sensor's noise. So if one y is received twice, it brings the
+    same noise twice, and is used as one measurement. With past x as states instead, its noise would count as two
+    independent ones, and the claimed covariance would be too small.
 
     Args:
         plant: linear.
@@ -57,8 +59,8 @@ def _append_delay_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     xp = library(plant.matrix, plant.input_matrix, c)
     m, n = c.shape
     length = past * m  # of the older outputs together
-    # Blocks of rows: x+ (n), y+ (m), older outputs (past m). Columns of x, and of the outputs, of which y_k, ...,
-    # y_{k-past+1} move on by one place.
+    # Blocks of rows: x+ (n), y+ (m), older outputs (past m). Columns: x, and all outputs. The rows of the older outputs
+    # take y_k, ..., y_{k-past+1}.
     from_state = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
     from_line = np.concatenate([np.zeros((n + m, length + m)), np.eye(length, length + m)])
     input_matrix = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])

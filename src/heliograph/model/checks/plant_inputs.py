@@ -87,9 +87,18 @@ def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
 
 
 def _is_near_wrap(dt: Array, counts: float, near: float, precision: type) -> Array:
-    """Return whether each time step is so many counts below 2^32, rounded as the precision has them."""
-    ends = [float(precision((WRAPPED - below) / counts)) for below in (near, 0.5)]
-    return (dt >= ends[0]) & (dt <= ends[1])
+    """Return whether each time step, in counts of a 32-bit counter, is at most `near` below 2^32.
+
+    A counter that goes back by d counts wraps, so that the unsigned difference of two of its readings is 2^32 - d.
+
+    Args:
+        dt: time steps (steps,).
+        counts: counts of the counter in a unit of dt.
+        near: the largest d that is taken for a wrap; the least is 1, with 0.5 for rounding.
+        precision: type of numbers to which dt is rounded, and so also the limits with which it is compared.
+    """
+    lowest, highest = (float(precision((WRAPPED - d) / counts)) for d in (near, 0.5))
+    return (dt >= lowest) & (dt <= highest)
 
 
 def check_inputs(
@@ -252,10 +261,13 @@ def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarr
 def do_inputs_spoil(
     model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int, precision: type | None = None
 ) -> jax.Array:
-    """Decide in a compiled step whether the time step is none, or a function of the inputs returns what is none.
+    """Return, in a compiled step, whether inputs are invalid for the plants and sensors in a model.
+
+    They are if the time step among them is not a valid duration, or if a plant's or sensor's function of the inputs
+    returns a matrix that is not finite, or not a covariance where it must be one.
 
     Args:
-        model: a filter, or anything else that holds plants with these inputs.
+        model: a filter, or anything else that holds plants and sensors with these inputs.
         names: names of the inputs.
         u: inputs of the step (inputs,).
         k: number of the step.
@@ -299,15 +311,15 @@ def _is_covariance(matrix: jax.Array, precision: type | None) -> jax.Array:
     """
     variances = jnp.diagonal(matrix)
     scale = 1 / jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
-    left = matrix * scale[:, None] * scale  # what elimination has left of the correlations
-    like: Array = left if precision is None else np.zeros(0, precision)
-    sound = jnp.all(jnp.isfinite(matrix)) & jnp.all(variances >= 0)
-    sound &= jnp.all(jnp.abs(left - left.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, like))
+    remainder = matrix * scale[:, None] * scale  # correlations of the components that are not eliminated yet
+    like: Array = remainder if precision is None else np.zeros(0, precision)
+    is_valid = jnp.all(jnp.isfinite(matrix)) & jnp.all(variances >= 0)
+    is_valid &= jnp.all(jnp.abs(remainder - remainder.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, like))
     tolerance = rounding(LOOSE * DEFINITENESS_TOLERANCE, like, 10 * len(matrix))
     for _ in range(len(matrix)):
-        pivot, column = left[0, 0], left[1:, 0]
-        determined = pivot <= tolerance
-        sound &= (pivot >= -tolerance) & (~determined | jnp.all(column**2 <= 2 * tolerance))
-        taken = column / jnp.where(determined, 1.0, pivot)
-        left = left[1:, 1:] - jnp.where(determined, 0.0, taken[:, None] * left[0, 1:])
-    return sound
+        pivot, column = remainder[0, 0], remainder[1:, 0]
+        is_zero = pivot <= tolerance
+        is_valid &= (pivot >= -tolerance) & (~is_zero | jnp.all(column**2 <= 2 * tolerance))
+        multiples = column / jnp.where(is_zero, 1.0, pivot)
+        remainder = remainder[1:, 1:] - jnp.where(is_zero, 0.0, multiples[:, None] * remainder[0, 1:])
+    return is_valid

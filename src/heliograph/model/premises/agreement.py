@@ -39,11 +39,9 @@ ENCODER = "encoder"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
-    """Return the names of the parts of which a filter believes something else than what holds where it stands.
+    """Return the names of the models that differ: of those for which a filter was made and those where it stands.
 
-    Args:
-        believed: the plant, sensor, channel and so on for which the filter was made.
-        own: those of the network and node in which it stands.
+    `believed` are the former, such as plant, sensor and channel, and `own` those of the filter's network and node.
     """
     # `order`: up to which moments the filter uses the laws of noises; None for the laws as a whole.
     order, own = believed.order, _enlarge_world_by_past(believed, own)
@@ -76,10 +74,8 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
 def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
     """Return the models of a node with past signals as states if the filter was made for such a larger plant.
 
-    Args:
-        believed: the models that the filter was made for.
-        own: plant, sensor and channel where it stands. They are returned unchanged if the channel is not late
-            (`past` is 0) or the filter's plant has no more states.
+    `believed` are the models that the filter was made for, and `own` those where it stands. The latter are returned
+    unchanged if the channel is not late (`past` is 0) or the filter's plant has no more states.
     """
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
@@ -90,35 +86,36 @@ def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
 
 
 def join_premises(premises: Sequence[Premise]) -> Premise:
-    """Return the premise of a filter that receives all measurements of these, one after the other; of one plant."""
+    """Return what a filter assumes (its premise) that receives the measurements of several filters of one plant.
+
+    Sensors and channels are stacked. The first trigger, encoder or range of values among them stands for all.
+    """
     if len(premises) == 1:
         return premises[0]
     sensors = [premise.sensor for premise in premises if premise.sensor is not None]
     channels = [premise.channel for premise in premises if premise.channel is not None]
-    triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]
-    ranges = [premise.range for premise in premises if premise.range is not None]
     sensor, channel = join_links({str(i): s for i, s in enumerate(sensors)}, channels)
+    triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    encoders = [premise.encoder for premise in premises if premise.encoder is not None]
+    ranges = [premise.range for premise in premises if premise.range is not None]
     return premises[0].replaced(
         sensor=sensor,
         channel=channel,
         trigger=triggers[0] if triggers else None,
-        encoder=next((premise.encoder for premise in premises if premise.encoder is not None), None),
+        encoder=encoders[0] if encoders else None,
         range=ranges[0] if ranges else None,
         order=None if any(premise.order is None for premise in premises) else MEAN_AND_COVARIANCE,
     )
 
 
 def restrict_premise_to_rows(premise: Premise, rows: Sequence[int]) -> Premise:
-    """Return the premise of what is received of these rows of the channel's outputs."""
-    chosen = known(np.eye(first(premise.channel).outputs)[list(rows)])
-    return premise.replaced(channel=at_each_step(lambda channel: Series([channel, chosen]), premise.channel))
+    """Return what a filter assumes (its premise) if only these rows of its channel's outputs are received."""
+    selection = known(np.eye(first(premise.channel).outputs)[list(rows)])
+    return premise.replaced(channel=at_each_step(lambda channel: Series([channel, selection]), premise.channel))
 
 
 def _agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
-    """Return whether two models agree at each step by `agree(a, b, order)`; a constant model is the same at all steps.
-
-    `order`: the order of the moments that a filter uses, None for the whole law.
-    """
+    """Return whether agree(a, b, order) at each step; `order` of the moments that a filter uses, None for the law."""
     if are_same(a, b):
         return True
     if steps_covered((a, b)) is None:
@@ -287,16 +284,22 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
 
 
 def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:
-    """Tell whether two channels have the same law, or moments as far as a filter uses them (`order`, known `loses`)."""
+    """Return whether a filter that assumes the map a, z = G y + n, is right for the map b.
+
+    `order` is MEAN_AND_COVARIANCE if the filter uses only E[(G, n)] and E[z z' | y], and None if it uses the whole law.
+    `loses` is True if losses may have another law, since the filter sees which outputs are lost.
+    """
     if are_same(a, b):
         return True
+
     if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:
         return False
     if a.covers(b, lambda x, y: _same_noise(x, y, order)):
         return True
-    parts, others = a.in_parallel, b.in_parallel
-    if len(parts) > 1 and [m.outputs for m in parts] == [m.outputs for m in others]:
-        return all(_same_map(x, y, order, loses) for x, y in zip(parts, others, strict=True))
+    maps_of_a, maps_of_b = a.in_parallel, b.in_parallel
+    if len(maps_of_a) > 1 and [m.outputs for m in maps_of_a] == [m.outputs for m in maps_of_b]:
+        return all(_same_map(x, y, order, loses) for x, y in zip(maps_of_a, maps_of_b, strict=True))
+    # Compare what arrives, whatever is lost, by its law and then by its moments.
     if not loses:
         return False
     if (a.erases or b.erases) and _same_given_arrival(a, b):
@@ -329,39 +332,40 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
     if where_all_arrive is None:
         return False
     # In both, each set of components that may arrive must have the moments that it has when all arrive.
-    every = [*moments_of_a, *moments_of_b]
-    return all(_moments_agree(where_all_arrive, moments, arrived) for arrived, moments in every)
+    pairs = [*moments_of_a, *moments_of_b]
+    return all(_moments_agree(where_all_arrive, moments, arrived) for arrived, moments in pairs)
 
 
 Moments = tuple[np.ndarray, np.ndarray]  # E[(G, n)] (m, p + 1) and the tensor of E[z z' | y] (m, m, p + 1, p + 1)
 
 
 def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.ndarray, Moments]]:
-    """Return the moments of what arrives, for each set of components that may, and in each mode on which losses depend.
+    """Return which outputs arrive (m,) and their moments, for each possible set of outputs that arrive.
+
+    If losses depend on a hidden mode, a set is listed once for each mode.
 
     Raises:
-        ValueError: uncertain probabilities, gains that are correlated over time, more sets than are listed.
+        ValueError: uncertain probabilities, gains that are correlated over time, or more sets than are listed.
     """
     maps: Sequence[AbstractRandomAffine]
     try:
-        whole = channel.condition_on_arrival()
-    except ValueError:  # losses that depend on the mode: where all modes are alike, no memory of the gains is left
+        if_all_arrives = channel.condition_on_arrival()
+    except ValueError:  # losses depend on the mode
         maps = joint_modes(channel).maps
     else:
-        if memory_matters(whole):
+        if memory_matters(if_all_arrives):
             raise ValueError("memory")
-        maps = unstack(without_memory(whole))
-    parts = [outcome for m in maps for outcome in m.list_outcomes() if outcome.arrived.any()]
-    if any(outcome.map.corner_count() > 1 for outcome in parts):
+        maps = unstack(without_memory(if_all_arrives))
+    outcomes = [outcome for m in maps for outcome in m.list_outcomes() if outcome.arrived.any()]
+    if any(outcome.map.corner_count() > 1 for outcome in outcomes):  # several possible laws
         raise ValueError("uncertain probabilities")
-    return [(np.asarray(outcome.arrived), second_moments(outcome.map)) for outcome in parts]
+    return [(np.asarray(outcome.arrived), second_moments(outcome.map)) for outcome in outcomes]
 
 
 def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
     """Return whether the moments of the components that arrived are equal to rounding (EQUAL), relative to their size.
 
-    a and b are each E[(G, n)] (m, p + 1), and E[z z' | y] as a tensor (m, m, p + 1, p + 1) that multiplies (y, 1)(y,
-    1)'.
+    a and b are each E[(G, n)] (m, p + 1), and E[z z' | y] as a tensor (m, m, p + 1, p + 1) acting on (y, 1) (y, 1)'.
     """
     (mean_a, second_a), (mean_b, second_b) = a, b
     rows = np.ix_(arrived, arrived)
@@ -375,10 +379,9 @@ def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
 def _same_observation(
     a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
 ) -> bool:
-    """Return whether two pairs of sensor and channel deliver the same of the state, though written differently.
+    """Return whether two pairs of sensor and channel are one map from the state, though written differently.
 
-    This is only decided for filters that use mean and covariance (`order`). Each pair is then compared as one map from
-    the state.
+    This is only decided for filters that use mean and covariance (`order`).
     """
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False

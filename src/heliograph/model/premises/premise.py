@@ -59,7 +59,12 @@ class Premise:
         range: "ReadingLimits | None" = None,
         encoder: "Words | None" = None,
     ):
-        """Hold the models that a filter believes in; the class says what the arguments are."""
+        """Hold the models for which a filter is made, and on which its claim (exact, upper or nominal) depends.
+
+        `order`: highest order of moments of noises and gains that the filter uses, None for their whole laws. `relays`
+        with their `gains` by name stand for sensor and channel. `range`: limits beyond which the receiver refuses a
+        number. `encoder`: rounds what is sent to codewords.
+        """
         self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
         self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
         self.encoder = encoder
@@ -106,7 +111,18 @@ P = ParamSpec("P")
 
 
 def with_premise(made: B, premise: Premise | None) -> B:
-    """Return the filter, schedule or system with this premise, and the same numbers."""
+    """Return a copy of a filter, schedule or system that keeps what it was made for, its premise.
+
+    Later a network compares the premise with its own models, to decide whether the claim on the covariance holds.
+
+    Args:
+        made: the filter, schedule or system, whose numbers stay.
+        premise: the plant, sensor, channel and so on that it assumes; None if they are not known.
+
+    Raises:
+        ValueError: the plant has an unknown start, attitudes, limits or rates of its modes, and `made` is of a kind
+            that has no formulas for them.
+    """
     unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
     if unknown and not getattr(made, "takes_unknown_start", False):
         raise fail("initial covariance", TAKEN_BY, "hg.diffuse")
@@ -119,9 +135,9 @@ def with_premise(made: B, premise: Premise | None) -> B:
     rates = None if premise is None else getattr(first(premise.plant), "rates", None)
     if rates is not None and not getattr(made, "takes_rates", False):
         raise fail("plant", RATES_TAKEN_BY, "rates of switches")
-    twin = copy(made)
-    object.__setattr__(twin, "kept", StaticPremise(premise))
-    return twin
+    with_its_premise = copy(made)
+    object.__setattr__(with_its_premise, "kept", StaticPremise(premise))  # the fields of a module are frozen
+    return with_its_premise
 
 
 def believes(make: Callable[P, B]) -> Callable[P, B]:

@@ -206,10 +206,15 @@ def _find_counts_by_noise_law(
 
 
 def delivers_as_sent(link: AbstractRandomAffine, outputs: tuple[int, ...]) -> bool:
-    """Return whether a link delivers outputs exactly as sent or loses them, unlike a radio with a gain and noise."""
-    if any(isinstance(hop, AbstractHop) and hop.transmits for hop in (link, *all_inner_maps(link))):
+    """Return whether a link delivers each output, given by its index, unchanged and in order, or loses it.
+
+    It must have no radio hop, which has a random gain or noise. Of what remains, `carry_angles` returns the indices of
+    received angles if these outputs are angles, and refuses a gain other than 1. So equal indices mean z = y.
+    """
+    has_radio_hop = any(isinstance(hop, AbstractHop) and hop.transmits for hop in (link, *all_inner_maps(link)))
+    if has_radio_hop:
         return False
     try:
-        return link.carry_angles(outputs) == outputs  # as if all were angles, which must arrive as sent
+        return link.carry_angles(outputs) == outputs
     except ValueError:
         return False

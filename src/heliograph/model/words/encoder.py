@@ -57,8 +57,11 @@ class Words(Module):
         dither: Dither = "none",
         resolution: "Float[ArrayLike, ''] | None" = None,
     ):
-        """Check and hold the lowest and highest word, the bits (or those that D needs) and the dither."""
-        # The range of the words; of a resolution D the highest word follows.
+        """Check and hold the lowest and highest word, the bits of a word, and the kind of dither.
+
+        If the distance D of two words (`resolution`) is given in place of `bits`, the bits are the fewest with which
+        words low, low + D, ... reach `high`. The highest word is then low + (2^bits - 1) D, and may be above `high`.
+        """
         self.low, self.high = (np.asarray(_read_range_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):
             raise fail("range of words", "low below high", f"{self.low.tolist()} and {self.high.tolist()}")
@@ -97,8 +100,11 @@ class Words(Module):
 
     @property
     def carried(self) -> int:
-        """Numbers by which a word is carried through a simulated channel: its bits, and a dither to be taken off."""
-        return self.bits + self.subtracts
+        """How many numbers stand for a word in a simulated channel: its bits, and its dither if it is subtracted.
+
+        A receiver that subtracts the dither has to know it, so that it is simulated as one more number.
+        """
+        return self.bits + (1 if self.subtracts else 0)
 
     def check_outputs(self, outputs: int) -> None:
         """Raise ValueError unless low and high are one number each, or one for each component."""
@@ -204,28 +210,35 @@ def _mix_bits(state: np.ndarray) -> np.ndarray:
 
 
 class WordReader(NamedTuple):
-    """How a receiver reads the bits of words that came: of each output of the channel its component, -1 of a flag."""
+    """How a receiver reads codewords from received bits.
 
-    places: tuple[int, ...]
+    components: for each output of the channel the index in y of the component that its codeword stands for; -1 for a
+    flag, a number that is no codeword.
+    """
+
+    components: tuple[int, ...]
 
     def read_words(self, encoder: Words, outputs: int, numbers: jax.Array) -> jax.Array:
-        """Return the received words and flags, in the order of the channel, then the dithers to be taken off.
+        """Return the received codewords and flags, in the order of the channel, then dithers that are to be subtracted.
+
+        A codeword is q = low + D i, i = sum_j 2^j b_j, whose bit b_j is received as the sign s_j = 1 - 2 b_j.
 
         Args:
-            encoder: of the words.
+            encoder: encoder of the codewords.
             outputs: length of y.
-            numbers: what the channel delivers: for each word its bits, as signs, and its dither if it has one; flags.
+            numbers: what the channel delivers: for each codeword its signs, and its dither if the receiver subtracts
+                it; for each flag one number.
         """
-        low, step = (jnp.asarray(encoder.each(end, outputs)) for end in (encoder.low, encoder.step))
+        low, step = (jnp.asarray(encoder.each(value, outputs)) for value in (encoder.low, encoder.step))
         powers = 2.0 ** np.arange(encoder.bits)
         values, dithers, start = list[jax.Array](), list[jax.Array](), 0
-        for place in self.places:
-            if place < 0:  # a flag
+        for component in self.components:
+            if component < 0:  # a flag
                 values.append(numbers[start])
                 start += 1
                 continue
             signs = numbers[start : start + encoder.bits]
-            values.append(low[place] + step[place] * jnp.sum(powers * (1 - signs)) / 2)
+            values.append(low[component] + step[component] * jnp.sum(powers * (1 - signs)) / 2)
             if encoder.subtracts:
                 dithers.append(numbers[start + encoder.bits])
             start += encoder.carried

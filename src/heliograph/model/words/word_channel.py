@@ -1,7 +1,7 @@
-"""Channels of words: the same channel of the words' bits, and of the words as numbers about the centres of their range.
+"""Channels of codewords, rewritten as channels of their bits, or of their values less the centre of the range.
 
-Words are not amplified. They go through `decode_and_forward`, losses, constant and drawn delays, choices and modes of
-such links, and are selected and copied on the way.
+A codeword is a rounded component of y, sent as bits. Codewords are not amplified. They go through `decode_and_forward`,
+losses, constant and drawn delays, choices and modes of such links, and are selected and copied on the way.
 """
 
 from collections.abc import Callable
@@ -22,163 +22,187 @@ from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.series_and_stack import Series, Stack
 from heliograph.random_affine.words.bit_flips import Flips
 
-FLAG = -1  # in the place of a component: a number that is no word
-Places = tuple[int, ...]  # of words: the component that each carries
+FLAG = -1  # in place of a component: the number is a flag, and no codeword
+Components = tuple[int, ...]  # for each codeword the index in y of the component that it stands for, or FLAG
 
 
 class RewrittenMap(NamedTuple):
-    """A map of words in another form, and the components that stand at its outputs."""
+    """A rewritten map of codewords, and for each codeword at its outputs the component of y that it stands for."""
 
     map: AbstractRandomAffine
-    places: Places
+    components: Components
 
 
 class WordForm(NamedTuple):
-    """How a link of words and a selection of words are written in another form."""
+    """How a codeword is written as numbers: as its bits, or as its value less the centre of the range.
 
-    flips: Callable[[Flips, Places], AbstractRandomAffine]
+    flips: function of a link that flips bits and of the components of y that its codewords stand for, which returns the
+    link's map of these numbers. selection: function of a matrix of zeros and ones, which selects codewords; it returns
+    the map that selects all numbers of these. size: how many numbers a codeword is written as.
+    """
+
+    flips: Callable[[Flips, Components], AbstractRandomAffine]
     selection: Callable[[np.ndarray], AbstractRandomAffine]
-    size: int  # numbers that a word is written as
+    size: int
 
 
 def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
-    """Return a channel of words as a channel of the numbers that carry them: their bits, and unchanged dithers.
+    """Return a channel of codewords as a channel of their bits, each a sign -1 or 1.
 
-    Losses, delays and choices act on all numbers of a word. Only bits are flipped.
+    A receiver that subtracts the dither of a codeword needs it, so that the dither is one more number behind the bits.
+    Losses, delays and choices act on all numbers of a codeword. Only bits are flipped.
 
     Args:
-        encoder: encoder of the words.
-        channel: channel of the words.
+        encoder: encoder of the codewords.
+        channel: channel of the codewords.
     """
-    beside = encoder.carried - encoder.bits  # numbers of a word beside its bits: its dither, if any
-    eye = np.eye(encoder.carried)
+    dither_count = encoder.carried - encoder.bits  # 1 or 0 for each codeword
+    identity = np.eye(encoder.carried)
     form = WordForm(
-        flips=lambda link, places: link.on_bits(encoder.bits, beside),
-        selection=lambda matrix: known(np.kron(matrix, eye)),
+        flips=lambda link, components: link.on_bits(encoder.bits, dither_count),
+        selection=lambda matrix: known(np.kron(matrix, identity)),
         size=encoder.carried,
     )
-    carried: Channel = at_each_step(lambda link: rewrite_channel(link, form).map, channel)
-    return carried
+    channel_of_bits: Channel = at_each_step(lambda link: rewrite_channel(link, form).map, channel)
+    return channel_of_bits
 
 
 def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
-    """Return a channel of words as a channel of numbers, where each word counts from the centre of its range.
+    """Return a channel of codewords as a channel of one number each, q - c, with q the word and c the range's centre.
 
-    Flipped bits are then a random gain and noise, which depend on the variance of a word, `power`.
+    Bits that are flipped are then a random gain g = 1 - 2p, p the probability of a flip, and a noise of variance
+    U (1 - E g^2). U is the variance of a codeword if all its values are equally likely (`encoder.power`).
 
     Args:
-        encoder: encoder of the words.
-        channel: channel of the words.
+        encoder: encoder of the codewords.
+        channel: channel of the codewords.
     """
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link of one step; `power` is the variance of each word if all of its values are equally likely."""
-        power = encoder.each(encoder.power, signal_size(link))
-        as_numbers = WordForm(
-            flips=lambda flips, places: flips.about_centre(power[list(places)]), selection=known, size=1
+        """Return the link of one step as a map of the numbers q - c, one for each component of y."""
+        power = encoder.each(encoder.power, signal_size(link))  # U by component of y
+        form = WordForm(
+            flips=lambda flips, components: flips.about_centre(power[list(components)]), selection=known, size=1
         )
-        return rewrite_channel(link, as_numbers).map
+        return rewrite_channel(link, form).map
 
-    numbers: Channel = at_each_step(convert, channel)
-    return numbers
+    channel_of_numbers: Channel = at_each_step(convert, channel)
+    return channel_of_numbers
 
 
-def find_carried_components(channel: Channel) -> Places:
-    """Return the component of y that each output of a channel of words carries, FLAG of a number that is no word."""
-    form = WordForm(lambda flips, places: known(np.eye(flips.dimension)), known, 1)
-    return rewrite_channel(first(channel), form).places
+def find_carried_components(channel: Channel) -> Components:
+    """Return for each output of a channel of codewords the index in y of the component that it stands for.
+
+    It is FLAG (-1) for an output that is a flag, and no codeword. Only the components are of interest here, so that a
+    link that flips bits is written as the identity.
+    """
+    form = WordForm(flips=lambda flips, components: known(np.eye(flips.dimension)), selection=known, size=1)
+    return rewrite_channel(first(channel), form).components
 
 
 def make_word_reader(channel: Channel) -> WordReader:
-    """Return how the receiver behind a channel of words reads their bits."""
+    """Return how the receiver behind a channel of codewords reads their bits."""
     return WordReader(find_carried_components(channel))
 
 
 def rewrite_channel(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
-    """Return a channel of words in another form (bits or numbers), and which component each of its outputs carries.
-
-    Raises:
-        ValueError: a channel that does more with words than select, copy, flip, delay and lose them.
-    """
-    sent = tuple(range(signal_size(channel)))  # repeated below for the earlier signals that a late channel takes
-    return _rewrite_map(channel, sent * (1 + channel.past), form)
-
-
-def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a map of words written in another form, and the components of y at its outputs.
-
-    Maps that are made of others are rewritten part by part: those in series hand on the components.
+    """Return a channel of codewords as a map of the numbers that stand for them, and the components at its outputs.
 
     Args:
-        link: the map; it may select, copy, flip, delay and lose words.
-        places: component of y that each word carries which comes in.
-        form: how flips and selections are written, and how many numbers a word is.
+        channel: the channel; it takes y_k, and if it delays also y_{k-1}, ..., y_{k-past}, all as codewords.
+        form: how a codeword is written as numbers: as its bits, or as its value less the centre of the range.
+
+    Raises:
+        ValueError: a channel that does more with codewords than select, copy, flip, delay and lose them.
+    """
+    components_of_signal = tuple(range(signal_size(channel)))
+    return _rewrite_map(channel, components_of_signal * (1 + channel.past), form)
+
+
+def _rewrite_map(link: AbstractRandomAffine, components: Components, form: WordForm) -> RewrittenMap:
+    """Return a map of codewords as a map of the numbers that stand for them, and the components of y at its outputs.
+
+    Maps that are made of others are rewritten one by one. In series each gets the components that the one before it
+    delivers.
+
+    Args:
+        link: the map; it may select, copy, flip, delay and lose codewords.
+        components: for each codeword at its inputs the index in y of the component that it stands for.
+        form: how flips and selections are written, and how many numbers a codeword is.
     """
     match link:
         case Flips():
-            return RewrittenMap(form.flips(link, places), places)
+            return RewrittenMap(form.flips(link, components), components)
         case GainAndNoise():
-            return _rewrite_selection(link, places, form)
+            return _rewrite_selection(link, components, form)
         case ModeOutput():
             return RewrittenMap(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
         case Series():
-            return _rewrite_series(link, places, form)
+            return _rewrite_series(link, components, form)
         case Stack():
-            parts = [_rewrite_map(part, places, form) for part in link.maps]
-            places_of_all = tuple(place for part in parts for place in part.places)
-            return RewrittenMap(Stack([part.map for part in parts]), places_of_all)
+            stacked = [_rewrite_map(inner, components, form) for inner in link.maps]
+            components_of_all = tuple(component for inner in stacked for component in inner.components)
+            return RewrittenMap(Stack([inner.map for inner in stacked]), components_of_all)
         case AbstractOneOfSeveralMaps():
-            return _rewrite_choice(link, places, form)
+            return _rewrite_choice(link, components, form)
         case Erasure() | DelayLine():
             (inner,) = inner_maps(link)
-            rewritten = _rewrite_map(inner, places, form)
-            return RewrittenMap(replace_inner_maps(link, [rewritten.map]), rewritten.places)
-        case DelayedLink() if not link.timestamped:  # the choice of what is late, then the link
-            chosen = _rewrite_map(link.delay, places, form)
-            rewritten = _rewrite_map(link.link, chosen.places, form)
-            maps = [chosen.map if inner is link.delay else rewritten.map for inner in inner_maps(link)]
-            return RewrittenMap(replace_inner_maps(link, maps), rewritten.places)
+            rewritten = _rewrite_map(inner, components, form)
+            return RewrittenMap(replace_inner_maps(link, [rewritten.map]), rewritten.components)
+        case DelayedLink() if not link.timestamped:  # `delay` selects a past signal, which `link` transmits
+            selected = _rewrite_map(link.delay, components, form)
+            rewritten = _rewrite_map(link.link, selected.components, form)
+            maps = [selected.map if inner is link.delay else rewritten.map for inner in inner_maps(link)]
+            return RewrittenMap(replace_inner_maps(link, maps), rewritten.components)
     raise make_word_link_error(type(link).__name__)
 
 
-def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a noiseless link that selects components, in the given form, and the component at each of its outputs.
+def _rewrite_selection(link: GainAndNoise, components: Components, form: WordForm) -> RewrittenMap:
+    """Return a noiseless map z = S y of codewords as a map of the numbers that stand for them, and its components.
 
-    `places`: the components of y that it gets. Another gain, or noise, raises ValueError, since words do not pass it.
+    Each row of S selects one codeword. Codewords are not amplified, nor is noise added to them: another gain than 1, or
+    noise, raises ValueError.
+
+    Args:
+        link: the map.
+        components: for each codeword at its inputs the index in y of the component that it stands for.
+        form: has `selection`, a function of S that returns the map of the numbers.
     """
     matrix, gain = np.asarray(link.matrix), link.law.constant
     is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
     selects_one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
     if gain is None or float(gain) != 1.0 or not is_noiseless or not selects_one_each:
         raise make_word_link_error(link.in_words() or "a gain")
-    return RewrittenMap(form.selection(matrix), tuple(places[int(np.argmax(row))] for row in matrix))
+    selected_components = tuple(components[int(np.argmax(row))] for row in matrix)
+    return RewrittenMap(form.selection(matrix), selected_components)
 
 
-def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMap:
-    """Return maps in series, in the given form; each gets the components that the previous one delivers.
+def _rewrite_series(link: Series, components: Components, form: WordForm) -> RewrittenMap:
+    """Return maps in series as maps of the numbers of their codewords, and the components that the last one delivers.
 
-    `places`: the components of y that the first map gets.
+    `components` are those that the first map gets. Each map gets the components that the previous one delivers.
     """
     maps = []
     for inner in link.maps:
-        rewritten = _rewrite_map(inner, places, form)
-        places = rewritten.places
+        rewritten = _rewrite_map(inner, components, form)
+        components = rewritten.components
         maps.append(rewritten.map)
-    return RewrittenMap(Series(maps), places)
+    return RewrittenMap(Series(maps), components)
 
 
-def _rewrite_choice(link: AbstractOneOfSeveralMaps, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a choice among several maps, in the given form; raise ValueError unless all deliver the same components.
+def _rewrite_choice(link: AbstractOneOfSeveralMaps, components: Components, form: WordForm) -> RewrittenMap:
+    """Return a choice among maps as a choice among maps of the numbers of their codewords, and its components.
 
-    `places`: the components of y that each map gets.
+    All maps get the same `components`. All must deliver the same, since the receiver does not see which was chosen:
+    otherwise ValueError is raised.
     """
-    choices = [_rewrite_map(inner, places, form) for inner in link.maps]
-    if len({choice.places for choice in choices}) > 1:
+    choices = [_rewrite_map(inner, components, form) for inner in link.maps]
+    if len({choice.components for choice in choices}) > 1:
         raise fail("channel of words", "choices and modes that deliver the same components", "others")
-    return RewrittenMap(replace_inner_maps(link, [choice.map for choice in choices]), choices[0].places)
+    return RewrittenMap(replace_inner_maps(link, [choice.map for choice in choices]), choices[0].components)
 
 
 def make_word_link_error(got: str) -> Exception:
-    """Return the error of a link that words do not pass."""
+    """Return the error of a link that codewords do not pass; `got` says in the message what link it is."""
     expected = "one that words pass, which are not amplified: hg.decode_and_forward([p]), perfect(), erasure, delays"
     return fail("channel of a node with an encoder", expected, got)

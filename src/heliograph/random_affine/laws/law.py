@@ -69,9 +69,9 @@ class AbstractLaw(Module):
         ends = self.corner_moments(order)[:, order]
         return plain(ends.min()), plain(ends.max())
 
-    def covers(self, own: "AbstractLaw") -> bool:
-        """Decide whether another law, with all that it may be, is one of those that this one may be."""
-        return are_same(self, own)
+    def covers(self, actual: "AbstractLaw") -> bool:
+        """Return whether all laws that `actual` may be (within its radius) are laws that this one may be."""
+        return are_same(self, actual)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
         """Return probability and value of each of finitely many gains; by default a refusal."""
@@ -161,19 +161,26 @@ class Discrete(AbstractLaw):
         return plain(self.probabilities @ self.values**order)
 
     def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
-        """Return the lowest and highest E[g^order], also where the corners are too many to list."""
+        """Return the lowest and highest E[g^order] = sum_i p_i v_i^order over all probabilities p that are possible.
+
+        `worst` returns the maximum of such a sum, and the minimum is minus the maximum of the negative sum. So the
+        extreme laws ("corners"), which may be too many, need not be listed.
+        """
+        if order == 0:
+            return 1.0, 1.0
         powers = self.values**order
-        return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
+        lowest, highest = -self.worst(-powers), self.worst(powers)
+        return lowest, highest
 
-    def covers(self, own: AbstractLaw) -> bool:
-        """Return whether all that another law may be is possible under this one.
+    def covers(self, actual: AbstractLaw) -> bool:
+        """Return whether all laws that `actual` may be are laws that this one may be.
 
-        It must have the same values, and its probabilities with their radii must lie within this law's radii. A radius
+        Its values must be the same, and its probabilities with their radii must lie within this law's radii. A radius
         is how far a probability may be off. A law of another kind must be the same law.
         """
-        if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
-            return are_same(self, own)
-        return within(own.probabilities, own.radius, self.probabilities, self.radius)
+        if not isinstance(actual, Discrete) or not equal_to_rounding(self.values, actual.values):
+            return are_same(self, actual)
+        return within(actual.probabilities, actual.radius, self.probabilities, self.radius)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
         """Return the values, with their probabilities."""

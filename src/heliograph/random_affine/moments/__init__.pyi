@@ -5,6 +5,8 @@ from .gain_and_disturbance_moments import disturb_hop as disturb_hop
 from .gain_and_disturbance_moments import mix_gains as mix_gains
 from .gain_and_disturbance_moments import noise_gain as noise_gain
 from .gain_and_disturbance_moments import stack_on_shared_inputs as stack_on_shared_inputs
+from .gain_and_noise_covariances import join_gain_and_noise as join_gain_and_noise
+from .gain_and_noise_covariances import split_off_noise as split_off_noise
 from .interval_products import CORNERS as CORNERS
 from .interval_products import Interval as Interval
 from .interval_products import multiply_interval_polynomials as multiply_interval_polynomials
@@ -46,10 +48,8 @@ from .second_moments import SecondOrder as SecondOrder
 from .second_moments import describe_second_moments as describe_second_moments
 from .second_moments import has_known_mean as has_known_mean
 from .second_moments import has_random_gain as has_random_gain
-from .second_moments import join_gain_and_noise as join_gain_and_noise
 from .second_moments import nominal_spread as nominal_spread
 from .second_moments import second_order as second_order
-from .second_moments import split_off_noise as split_off_noise
 from .signal_path import ChannelPosition as ChannelPosition
 from .signal_path import Second as Second
 from .signal_path import SignalMoment as SignalMoment

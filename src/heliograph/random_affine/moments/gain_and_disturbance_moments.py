@@ -23,7 +23,7 @@ class DisturbedGain(NamedTuple):
 
     @property
     def disturbances(self) -> int:
-        """Number of noise sources."""
+        """Number of columns of N, each of which takes one disturbance."""
         return int(self.mean.shape[1]) - self.inputs
 
     @property
@@ -33,12 +33,10 @@ class DisturbedGain(NamedTuple):
         return covariance
 
     def spreads(self) -> np.ndarray:
-        """Return the matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A, for H (m, c).
+        """Return matrices X_j (rank, m, c) with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
 
         They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
-        eigenvalues. There are as many as the covariance's rank, and none if nothing is random.
-
-        Shapes: (rank, m, c).
+        eigenvalues. Their number is the rank of the covariance, and zero if nothing is random.
         """
         m, c = self.mean.shape
         root_moments = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
@@ -51,16 +49,17 @@ class DisturbedGain(NamedTuple):
         return factors
 
     def then(self, other: "DisturbedGain") -> "DisturbedGain":
-        """Return the moments of this map [G1, N1] followed by another [G2, N2]: H = [G2 G1, G2 N1, N2].
+        """Return the moments of H = [G2 G1, G2 N1, N2], this map [G1, N1] followed by the `other` map [G2, N2].
 
-        G acts on the signal, and N on the disturbances. H = [G2, N2] diag([G1, N1], I), where I passes on the
-        disturbances of the other map.
+        G acts on the signal, and N on the disturbances d. In series z = G2 (G1 y + N1 d1) + N2 d2 = H (y, d1, d2). So
+        H = H2 K with H2 = [G2, N2] and K = diag([G1, N1], I), which passes d2 on unchanged.
         """
         identity = np.eye(other.disturbances)
-        passed_on = DisturbedGain(identity, np.multiply.outer(identity, identity), inputs=0)
-        passed = stack_on_shared_inputs([self, passed_on], shared=0)
-        second = np.einsum("aicj,ibjd->abcd", other.second, passed.second)
-        return DisturbedGain(other.mean @ passed.mean, second, self.inputs)
+        second_disturbance = DisturbedGain(identity, np.multiply.outer(identity, identity), inputs=0)
+        first_and_identity = stack_on_shared_inputs([self, second_disturbance], shared=0)  # K
+        # H2 and K are independent: E[H_ab H_cd] = sum_ij E[H2_ai H2_cj] E[K_ib K_jd].
+        second = np.einsum("aicj,ibjd->abcd", other.second, first_and_identity.second)
+        return DisturbedGain(other.mean @ first_and_identity.mean, second, self.inputs)
 
 
 def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> np.ndarray:
@@ -90,20 +89,20 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
     With S = [A, 0] and F = [0, N], H = g S + F. So E[H_ab H_ij] is
     E[g^2] S_ab S_ij + E[g] (S_ab F_ij + F_ab S_ij) + F_ab F_ij.
     """
-    scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
-    fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
+    S = np.concatenate([gain, np.zeros_like(root)], axis=1)
+    F = np.concatenate([np.zeros_like(gain), root], axis=1)
     mean_gain, mean_square_gain = moments
     outer = np.multiply.outer
-    cross = mean_gain * (outer(scaled, fixed) + outer(fixed, scaled))
-    mean = mean_gain * scaled + fixed
-    joint_second = mean_square_gain * outer(scaled, scaled) + cross + outer(fixed, fixed)
-    return DisturbedGain(mean, joint_second, gain.shape[1])
+    cross = mean_gain * (outer(S, F) + outer(F, S))
+    second = mean_square_gain * outer(S, S) + cross + outer(F, F)
+    return DisturbedGain(mean_gain * S + F, second, gain.shape[1])
 
 
 def mix_gains(gains: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
-    """Return the moments of a map drawn from `gains` with `weights`: sum_i w_i E_i and sum_i w_i E_i[H_ab H_ij].
+    """Return the moments of a map drawn from `gains` with probabilities `weights`: sum_i w_i E_i[H_ab], and so on.
 
-    The first `inputs` columns of H take the signal. Then each part has columns of its own for its noises.
+    E_i is the expectation for map i. The first `inputs` columns of H take the signal. Then come columns for the
+    disturbances of each map in turn, which are zero in the other maps.
     """
     in_joint_columns = [_place_columns(gain, inputs, gains, i) for i, gain in enumerate(gains)]
     mean = np.tensordot(weights, [gain.mean for gain in in_joint_columns], axes=1)

@@ -44,16 +44,19 @@ class Lift(AbstractMapWrapper):
 
     @property
     def outputs(self) -> int:
-        """Monomials of z of degree 1 to `degree`."""
+        """Number of monomials of z of degree 1 to `degree`: all of (z, 1) of this degree but the constant 1."""
         return count_monomials(self.base.outputs + 1, self.degree) - 1
 
     @property
     def inputs(self) -> int:
-        """Monomials of y of degree 1 to `degree`."""
+        """Number of monomials of y of degree 1 to `degree`: all of (y, 1) of this degree but the constant 1."""
         return count_monomials(self.base.inputs + 1, self.degree) - 1
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw Sym^degree(H)."""
+        """Draw H of `base`; return its next state and Sym^degree(H), the H of the lifted map.
+
+        Sym^degree(H) is the matrix that takes the monomials of (y, 1) of this degree to those of (z, 1) = H (y, 1).
+        """
         state, h = self.base.draw(state, key)
         return state, jnp.asarray(symmetric_power(h, self.degree))
 
@@ -64,16 +67,16 @@ class Lift(AbstractMapWrapper):
         an equal share of its coefficient.
         """
         check_forgets("moments of a map", self)
-        inner = self.base.moments(order * self.degree).matrix
+        base_moments = self.base.moments(order * self.degree).matrix
         rows = _find_product_positions(self.base.outputs + 1, self.degree, order)
         columns = _find_product_positions(self.base.inputs + 1, self.degree, order)
         refuse_if_too_large(len(rows), len(columns), f"lifted moments of order {order}")
-        repetitions = np.bincount(columns)
-        matrix = inner[rows][:, columns] / repetitions[columns]
+        repetitions = np.bincount(columns)  # number of products that equal each monomial
+        matrix = base_moments[rows][:, columns] / repetitions[columns]
         return JointMoments(matrix, self.outputs, self.inputs, order)
 
     def degree_in(self, identity: str) -> int:
-        """Return `degree` times that of the map."""
+        """Return the degree in a memory's state: Sym^degree(H) has `degree` times that of H of the base map."""
         return self.degree * self.base.degree_in(identity)
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:

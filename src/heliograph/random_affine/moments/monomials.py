@@ -171,7 +171,11 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
 
 
 def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
-    """Multiply two homogeneous polynomials given by coefficients."""
+    """Return the coefficients of the product of two homogeneous polynomials in `variables` variables.
+
+    `a` are the coefficients of the monomials of degree `first`, and `b` those of degree `second`, as in
+    `list_exponents`.
+    """
     terms = a[:, None] * b
     return scatter((count_monomials(variables, first + second),), product_table(variables, first, second), terms)
 
@@ -195,21 +199,21 @@ def degrees(dimension: int, order: int) -> np.ndarray:
 
 @cache_arrays
 def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the terms of (y + n)^a = sum_b C(a, b) n^(a-b) y^b: the places of a, of b and of a - b, and C(a, b).
+    """Return the terms of (y + n)^a = sum_b C(a, b) n^(a-b) y^b: the positions of a, of b and of a - b, and C(a, b).
 
-    There is a term for each monomial a of (y, 1) of this order and each b <= a. y has `dimension` numbers. Places are
-    those among these monomials, where b and a - b are filled up by powers of 1.
+    There is a term for each monomial a of (y, 1) of this order and each b <= a. y has `dimension` numbers. Positions
+    are those in `list_exponents`: y^b and n^(a-b) are multiplied by powers of 1 up to this order.
     """
     position_of, terms = position(dimension + 1, order), []
     for row, powers in enumerate(list_exponents(dimension + 1, order)):
         a = powers[:-1]
         for b in product(*(range(x + 1) for x in a)):
-            remainder = tuple(x - y for x, y in zip(a, b, strict=True))
-            weight = prod(comb(x, y) for x, y in zip(a, b, strict=True))
+            remainder = tuple(x - y for x, y in zip(a, b, strict=True))  # a - b
+            binomial = prod(comb(x, y) for x, y in zip(a, b, strict=True))  # C(a, b) = prod_i C(a_i, b_i)
             column = position_of[(*b, order - sum(b))]
-            terms.append((row, column, position_of[(*remainder, order - sum(remainder))], weight))
-    rows, columns, remainders, weights = np.array(terms, dtype=np.int64).T
-    return rows, columns, remainders, weights
+            terms.append((row, column, position_of[(*remainder, order - sum(remainder))], binomial))
+    rows, columns, remainders, binomials = np.array(terms, dtype=np.int64).T
+    return rows, columns, remainders, binomials
 
 
 class JointMoments(Module):
@@ -228,7 +232,10 @@ class JointMoments(Module):
 
     @property
     def mean(self) -> Float[jax.Array | np.ndarray, "outputs+1 inputs+1"]:
-        """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
+        """E[H] of shape (outputs + 1, inputs + 1).
+
+        The monomials z_i = z_i 1^(k-1) are among those of degree k, so that E[H] is a part of the matrix E[Sym^k(H)].
+        """
         return self.lower(1)
 
     @property
@@ -242,9 +249,12 @@ class JointMoments(Module):
         return tensor
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
-        """Return E[Sym^order(H)] of a lower order: times powers of 1 its monomials are among those of `self.order`."""
-        positions = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
-        matrix: jax.Array | np.ndarray = self.matrix[positions]
+        """Return E[Sym^order(H)], of an `order` up to self.order, as a part of the matrix E[Sym^k(H)], k = self.order.
+
+        A monomial of lower degree times 1^(k - order) is one of degree k. So rows and columns are selected.
+        """
+        rows_and_columns = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
+        matrix: jax.Array | np.ndarray = self.matrix[rows_and_columns]
         return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
@@ -254,15 +264,24 @@ class JointMoments(Module):
 
 @cache_arrays
 def _place_lower_monomials(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
-    """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
-    return np.ix_(*(times_one(size + 1, low, high) for size in (outputs, inputs)))
+    """Return the index of the matrix E[Sym^high(H)] that selects E[Sym^low(H)] from it.
+
+    Row by row these are the positions of the monomials of (z, 1) of degree `low`, times 1^(high - low), among those of
+    degree `high`; column by column those of (y, 1).
+    """
+    rows, columns = times_one(outputs + 1, low, high), times_one(inputs + 1, low, high)
+    return np.ix_(rows, columns)
 
 
 @cache_arrays
 def times_one(variables: int, low: int, high: int) -> np.ndarray:
-    """Return the positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
-    chosen = factor_variables(variables, low)
-    return place_monomials(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)
+    """Return the positions, among monomials of degree `high`, of those of degree `low` times 1^(high - low).
+
+    The constant 1 is the last of the `variables`.
+    """
+    factors = factor_variables(variables, low)
+    factors_with_ones = np.pad(factors, ((0, 0), (0, high - low)), constant_values=variables - 1)
+    return place_monomials(factors_with_ones, variables)
 
 
 def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:

@@ -41,7 +41,10 @@ class QuadraticMap(Module):
         return center + jnp.diag(unit * jnp.sum(radius / unit, axis=1))
 
     def evaluate_center(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
-        """Return C:W alone, which is all where the law is known."""
+        """Return C:W, C the `center` and W the second moment of (y, 1); rows of components not `present` are zero.
+
+        This is the second moment of z itself where the law is known, since the radius is then zero.
+        """
         return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 
@@ -56,14 +59,18 @@ def map_of_known_law(tensor: Tensor) -> QuadraticMap:
 
 
 def signal_of_map(bound: QuadraticMap) -> QuadraticMap:
-    """Return what the map makes of y alone, without the constant 1."""
+    """Return the map from W = E[(y, 1) (y, 1)'] that uses only the block E[y y'] of W: the rest is multiplied by 0."""
     return QuadraticMap(drop_constant(bound.center), drop_constant(bound.radius))
 
 
-def size_of_map(shift: QuadraticMap) -> Any:
-    """Return the root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
-    tensor = stop_gradient(shift.center + shift.radius)
-    return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
+def size_of_map(moment_map: QuadraticMap) -> Any:
+    """Return the root of the trace of the map's upper bound at W = I, sqrt(sum_ia (C + R)_iiaa): one number.
+
+    C is `center`, and R `radius`. The number weighs bounds of several maps that are added. Any positive weights give a
+    valid bound, so that it has no derivative.
+    """
+    largest = stop_gradient(moment_map.center + moment_map.radius)
+    return library(largest).sqrt(library(largest).einsum("iiaa->", largest))
 
 
 def add_maps(*maps: QuadraticMap) -> QuadraticMap:
@@ -71,9 +78,9 @@ def add_maps(*maps: QuadraticMap) -> QuadraticMap:
     return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
 
 
-def scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
+def scale_map(moment_map: QuadraticMap, factor: Any) -> QuadraticMap:
     """Return a map of second moments times a number."""
-    return QuadraticMap(factor * part.center, factor * part.radius)
+    return QuadraticMap(factor * moment_map.center, factor * moment_map.radius)
 
 
 def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:

@@ -13,6 +13,11 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
+from heliograph.random_affine.moments.gain_and_noise_covariances import (
+    make_power_of_constant,
+    pad_columns,
+    split_off_noise,
+)
 from heliograph.random_affine.moments.interval_products import CORNERS
 from heliograph.random_affine.moments.moment_tensors import (
     Matrix,
@@ -67,46 +72,28 @@ class SecondOrder(Module):
 def describe_second_moments(
     mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
 ) -> SecondOrder:
-    """Return the second moments of z = G y + n from E[(G, n)] and four maps; `nominal` is split into gain and noise.
+    """Return mean and second moments of z = G y + n as a `SecondOrder`; the nominal spread is split in gain and noise.
 
-    Each map takes W = E (y, 1)(y, 1)' to a second moment: that of z about its nominal mean (`spread`), that of the
-    mean's shift, that of G y (`power`), and the spread under the `nominal` law. `uncertain`: several laws are possible.
+    Args:
+        mean: nominal [M, b] = E[(G, n)] (m, p + 1). The maps below take W = E[(y, 1) (y, 1)'] to a matrix (m, m).
+        spread: above E_v[(z - M y - b) (z - M y - b)'] under every possible law v.
+        shift: above the same with the mean M_v y + b_v under law v in place of z.
+        power: above E_v[G y y' G'].
+        nominal: the spread under the nominal law.
+        uncertain: True if several laws are possible.
     """
-    gain, noise = split_off_noise(nominal.center)
-    return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
-
-
-def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
-    """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
-
-    spread (m, m, p + 1, p + 1) has the covariance of the rows i and j of (A, n) at [i, j], with that of n last. If A
-    and n are correlated, nothing is split: the covariances are returned as they are, with columns of zeros.
-    """
-    xp, covariance = library(spread), spread[..., -1, -1]
-    uncorrelated = xp.all(spread[..., :-1, -1] == 0)
-    at_noise = np.zeros(spread.shape[-2:])
-    at_noise[-1, -1] = 1.0
-    # `at_noise` is 1 at the entry of the covariance of n.
-    split = xp.where(uncorrelated, covariance, 0.0)
-    noise = _pad_columns(columns_of(split))  # m columns, some of them zero if the covariance has fewer
-    return spread - split[..., None, None] * at_noise, noise
-
-
-def _pad_columns(noise: WeightedColumns) -> WeightedColumns:
-    """Return the columns of a covariance, with columns of zeros to as many as it has rows."""
-    xp, lacking = library(noise), len(noise.matrix) - noise.matrix.shape[1]
-    return WeightedColumns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
-
-
-def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
-    """Return the covariances of (A, n) from those of a random gain A alone and the columns of Cov n.
-
-    This is the inverse of `split_off_noise`. Cov n is columns diag(weights) columns', and is added at the constant 1.
-    """
-    xp = library(gain, noise)
-    covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
-    joint: Tensor = gain + covariance[..., None, None] * _make_power_of_constant(gain.shape[-1])
-    return joint
+    gain_spread, noise = split_off_noise(nominal.center)
+    return SecondOrder(
+        mean_gain=mean[:, :-1],
+        offset=mean[:, -1],
+        spread=spread,
+        shift=shift,
+        power=power,
+        nominal=nominal,
+        gain_spread=gain_spread,
+        noise=noise,
+        uncertain=uncertain,
+    )
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
@@ -159,7 +146,7 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
         power=bounds.power,
         nominal=bounds.nominal,
         gain_spread=np.zeros(bounds.nominal.center.shape),
-        noise=_pad_columns(columns_of(_noise_covariance(channel))),
+        noise=pad_columns(columns_of(_noise_covariance(channel))),
         uncertain=uncertain,
     )
 
@@ -175,28 +162,33 @@ class MomentBounds(NamedTuple):
 
 
 def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
-    """Return E[(G, n)] under the nominal law, and maps that bound second moments of z = G y + n under all laws.
+    """Return M = E[(G, n)] under the nominal law, and bounds of second moments of z = G y + n under all laws v.
 
-    The maps take W = E[(y, 1) (y, 1)'] to matrices above three moments: the spread E[((G, n) - nominal mean) W (...)'],
-    the shift (the same with the law's mean in place of (G, n)), and the power E[G y y' G']. They are exact if the law
-    is known.
+    A bound takes W = E[(y, 1) (y, 1)'] to a matrix that is above
+    - the spread E_v[((G, n) - M) W ((G, n) - M)'], the second moment of z about its nominal mean;
+    - the shift (M_v - M) W (M_v - M)' with M_v = E_v[(G, n)], the part of the spread that is due to another mean;
+    - the power E_v[G y y' G'].
+    The bounds are exact if the law is known: then there is one extreme law ("corner").
     """
-    # Corners are the extreme possible laws; None if there are too many.
-    corners = count_corners(channel)
-    # With a single corner nothing is uncertain.
-    if corners == 1:
+    corner_count = count_corners(channel)  # None if there are too many to count
+    if corner_count == 1:
         return _take_known_moments(channel)
     entries = (channel.inputs + 1) ** 2
-    can_list_corners = corners is not None and corners <= CORNERS and corners * entries <= MEMORY_LIMIT_ENTRIES
+    limit = min(CORNERS, MEMORY_LIMIT_ENTRIES // entries)
+    can_list_corners = corner_count is not None and corner_count <= limit
     return _bound_uncertain_moments(channel, can_list_corners)
 
 
 def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
-    """Return the moments of a channel of known law, which are their own bounds."""
-    # Independent maps, added up or side by side: the covariances of each map alone are all there are.
+    """Return the moments of z = G y + n of a channel of known law, which are their own bounds.
+
+    With M = E[(G, n)] these are the spread, Cov of the entries of (G, n); the shift of the mean under other laws, here
+    zero; and the power E[G y y' G'], which is the spread of G plus the square of E[G].
+    """
+    # Maps in a sum or stack are independent. Their covariances give the spread without the channel's large moments.
     if isinstance(channel, Superposed | Stack):
-        mean, tensor = _compute_mean_and_spread(channel)
-        spread = map_of_known_law(tensor)
+        mean, covariance = _compute_mean_and_spread(channel)
+        spread = map_of_known_law(covariance)
         power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
         return MomentBounds(
             mean=mean,
@@ -207,17 +199,22 @@ def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
         )
     moments = channel.moments(2)
     mean = moments.mean[:-1]
-    spread, shift, power = (map_of_known_law(tensor) for tensor in tensors_of_law(moments, mean))
-    spread = map_of_known_law(_drop_known_gain(channel, spread.center))
-    return MomentBounds(mean=mean, spread=spread, shift=shift, power=power, nominal=spread)
+    covariance, shift, power = tensors_of_law(moments, mean)
+    spread = map_of_known_law(_drop_known_gain(channel, covariance))
+    return MomentBounds(
+        mean=mean,
+        spread=spread,
+        shift=map_of_known_law(shift),
+        power=map_of_known_law(power),
+        nominal=spread,
+    )
 
 
 def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bool) -> MomentBounds:
-    """Return bounds of the moments of a channel of uncertain law.
+    """Return the nominal mean of (G, n) of a channel z = G y + n of uncertain law, and bounds over all its laws.
 
-    Args:
-        channel: the channel.
-        can_list_corners: whether the extreme laws (`corner_moments`) are few enough to be gone through one by one.
+    Bounded are the spread of z about its nominal mean, the shift of the mean, and the power E[G y y' G'].
+    `can_list_corners` says whether the extreme laws ("corners") are few enough to be computed one by one.
     """
     if isinstance(channel, Superposed) and not can_list_corners:
         return _bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
@@ -225,22 +222,28 @@ def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bo
     mean = nominal.mean[:-1]
     # Bounds from the blocks of a stack, as maxima over the extreme laws, or from intervals of moments.
     if isinstance(channel, Stack):
-        parts = _bound_stacked_maps(channel)
+        bounds = _bound_stacked_maps(channel)
     elif can_list_corners:
-        laws = [JointMoments(corner, nominal.outputs, nominal.inputs, 2) for corner in channel.corner_moments(2)]
-        # One map above all laws for each of spread, shift and power.
-        by_kind = zip(*(tensors_of_law(law, mean) for law in laws), strict=True)
-        parts = [bound_all_laws(stack_parts(tensors), mean) for tensors in by_kind]
+        laws = [JointMoments(matrix, nominal.outputs, nominal.inputs, 2) for matrix in channel.corner_moments(2)]
+        # Spreads under all extreme laws, then their shifts, then their powers; each kind is bounded by one map.
+        spreads, shifts, powers = zip(*(tensors_of_law(law, mean) for law in laws), strict=True)
+        bounds = [bound_all_laws(stack_parts(tensors), mean) for tensors in (spreads, shifts, powers)]
     else:
-        parts = bound_from_intervals(channel, nominal, mean)
-    spread, shift, power = parts
+        bounds = bound_from_intervals(channel, nominal, mean)
+    spread, shift, power = bounds
     return MomentBounds(mean=mean, spread=spread, shift=shift, power=power, nominal=nominal_spread(channel))
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
-    """Return Cov(z | y) under the nominal law."""
-    nominal = channel.moments(2)
-    return map_of_known_law(_drop_known_gain(channel, tensors_of_law(nominal, nominal.mean[:-1])[0]))
+    """Return the map from W = E[(y, 1) (y, 1)'] to the covariance of z = G y + n about E[G] y + E[n], nominal law.
+
+    Its center (m, m, p + 1, p + 1) has at [i, j, a, b] the covariance of entries (i, a) and (j, b) of (G, n), made
+    symmetric in a and b.
+    """
+    moments = channel.moments(2)
+    mean = moments.mean[:-1]  # of (G, n)
+    covariance, _, _ = tensors_of_law(moments, mean)
+    return map_of_known_law(_drop_known_gain(channel, covariance))
 
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
@@ -308,7 +311,7 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
         return library(means).concatenate(means), _stack_spreads(spreads)
     # In a sum the spreads of the parts and of its own noise add up.
     mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
-    noise = channel.noise.covariance[..., None, None] * _make_power_of_constant(size)
+    noise = channel.noise.covariance[..., None, None] * make_power_of_constant(size)
     spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), axes=2) + noise
     return mean_of_maps + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
@@ -355,7 +358,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     every = range(len(parts))  # numbers of the parts
     mean = channel.sum_in_places({i: parts[i].mean for i in every}, axes=1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = map_of_known_law(channel.noise.covariance[..., None, None] * _make_power_of_constant(channel.inputs + 1))
+    noise = map_of_known_law(channel.noise.covariance[..., None, None] * make_power_of_constant(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
     spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     # Known means: nothing is shifted.
@@ -386,15 +389,12 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
-    """Return the weighted sum of second-moment maps, each at the places in (y, 1) of the inputs that its part takes.
+    """Return sum_i w_i Q_i, the second-moment maps Q_i of some of the summands z_i = H_i (y_i, 1) of a channel.
 
-    `weighted` holds the second-moment map and its weight by the number of the part, a map that the channel sums.
+    `weighted` holds (Q_i, w_i) by the summand's number i. Q_i acts on E[(y_i, 1) (y_i, 1)'] of the components y_i of y
+    that summand i takes. The sum acts on E[(y, 1) (y, 1)'], with the entries of each Q_i at these components.
     """
     scaled = {i: scale_map(moment_map, weight) for i, (moment_map, weight) in weighted.items()}
-    center = channel.sum_in_places({i: moment_map.center for i, moment_map in scaled.items()}, axes=2)
-    return QuadraticMap(center, channel.sum_in_places({i: moment_map.radius for i, moment_map in scaled.items()}, 2))
-
-
-def _make_power_of_constant(size: int) -> np.ndarray:
-    """Return the matrix W = Y Y' of zeros, but 1 as its last entry: that of the constant 1 alone."""
-    return np.outer(np.eye(size)[-1], np.eye(size)[-1])
+    centers = {i: moment_map.center for i, moment_map in scaled.items()}
+    radii = {i: moment_map.radius for i, moment_map in scaled.items()}
+    return QuadraticMap(channel.sum_in_places(centers, axes=2), channel.sum_in_places(radii, axes=2))

@@ -35,9 +35,13 @@ class ChannelPosition(NamedTuple):
     signal: SignalMoment | None
 
     def number_maps(self, maps: Sequence[T], word: str) -> "list[tuple[T, ChannelPosition]]":
-        """Return maps side by side, each with its position: names begin with the word and the map's number."""
-        at = [self._replace(prefix=f"{self.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
-        return list(zip(maps, at, strict=True))
+        """Return each of the maps that stand side by side here, with the position at its beginning.
+
+        The names of the hops in map i begin with `word` and i, such as "part2.hop1": each map counts its own hops. The
+        signal there is the same for all maps.
+        """
+        positions = [self._replace(prefix=f"{self.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
+        return list(zip(maps, positions, strict=True))
 
     def select_components(self, places: Sequence[int]) -> "ChannelPosition":
         """Return the position at a map that takes only the components of y at these places.
@@ -75,7 +79,10 @@ def carry_by_moments(signal: SignalMoment, moments: JointMoments) -> SignalMomen
 
 
 def refuse_gain_on_angles(got: str) -> ValueError:
-    """Return the error of a map behind which angles are no angles."""
+    """Return the error that an angle is multiplied by a gain other than 1, so that the product is no angle.
+
+    `got` says in the message which gain or map it is.
+    """
     expected = "gain 1 on circular outputs (behind any other, send sine and cosine, which are no angles)"
     return fail("channel", expected, got)
 

@@ -34,14 +34,19 @@ def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor,
 
 
 def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
-    """Return one map above all tensors (law, m, m, p + 1, p + 1), such as the spreads under the corner laws v.
+    """Return one bound of the second moments of z = G y + n under all extreme laws v, such as of the spreads.
 
-    If y enters as s_v M y y' M' under every law, and one noise matrix is above all others, it is the map of the largest
-    s_v and of that noise. Else it has the middle of each entry's range as center, and half the range as radius.
+    The bound is exact if every law has the second moment s_v M y y' M' + N_v, as with one random scalar gain, and one
+    noise matrix N_max is above all others. Then max_v s_v M y y' M' + N_max is above all. Else each entry of the bound
+    has the range of this entry over the laws: its middle as center, and half its width as radius.
+
+    Args:
+        tensors: the second moments (law, m, m, p + 1, p + 1), each a map of (y, 1) (y, 1)'.
+        mean: nominal E[(G, n)] (m, p + 1); M is its part E[G].
     """
     xp = library(tensors)
     low, high = tensors.min(axis=0), tensors.max(axis=0)
-    dominating, is_above_all = _find_dominating_tensor(tensors, mean)  # the tensor of the largest s_v and noise
+    dominating, is_above_all = _find_dominating_tensor(tensors, mean)
     center = xp.where(is_above_all, dominating, (low + high) / 2)
     radius = xp.where(is_above_all, 0.0, (high - low) / 2)
     return QuadraticMap(center, radius)

@@ -57,9 +57,12 @@ class Flips(AbstractRandomAffine):
         return Discrete(1 - 2 * self.error.values, self.error.probabilities)
 
     def about_centre(self, power: Float[np.ndarray, " words"]) -> AbstractRandomAffine:
-        """Return the random affine map of words less their centre: gain g, and noise of variance U (1 - E g^2).
+        """Return the random affine map q' - c = g (q - c) + n of received codewords q', with Var n = U (1 - E g^2).
 
-        If each word draws a gain of its own, it is a stack of one map for each word.
+        c is the centre of the words, and g = 1 - 2p with the probability p that a bit is flipped. A word is
+        q = c + sum_j s_j w_j / 2, with the sign s_j = +-1 and the weight w_j of bit j. A received sign has the mean
+        g s_j and the variance 1 - g^2, independently of the others, and sum_j (w_j / 2)^2 = U. If each word draws a
+        gain of its own, the map is a stack of one map for each word.
 
         Args:
             power: U of each word, the variance that it would have if all its values were equally likely.
@@ -72,7 +75,10 @@ class Flips(AbstractRandomAffine):
         return Stack([Series([known(rows[i : i + 1]), link]) for i, link in enumerate(links)])
 
     def on_bits(self, bits: int, beside: int) -> "BitFlips":
-        """Return the map of words that are written as `bits` numbers of -1 or 1, and `beside` numbers that pass."""
+        """Return the map of words that are each written as `bits` signs -1 or 1, and `beside` more numbers.
+
+        The signs may be flipped. The other numbers, such as a dither, arrive as they are.
+        """
         return BitFlips(self.error, self.dimension, self.per_message, bits, beside)
 
     def moments(self, order: int) -> JointMoments:
@@ -90,9 +96,9 @@ class Flips(AbstractRandomAffine):
 
 
 class BitFlips(AbstractRandomAffine):
-    """The link of words as one of their bits: each is multiplied by -1 with the probability p, else by 1.
+    """The link of codewords as a link of their bits, signs -1 or 1, each of which is flipped with probability p.
 
-    Of each word stand `bits` numbers -1 or 1, and behind them `beside` numbers that arrive as they are.
+    y has for each word `bits` signs, and behind them `beside` more numbers, such as a dither, that arrive as they are.
     """
 
     error: Constant | Discrete
@@ -103,7 +109,7 @@ class BitFlips(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Length of z: all bits of all words, and what stands beside them."""
+        """Length of z: for each of the `dimension` words its `bits` signs and `beside` other numbers."""
         return self.dimension * (self.bits + self.beside)
 
     @property

@@ -70,39 +70,50 @@ class RoundedNoise(AbstractNoise):
         gaussian: bool = False,
         matters: bool = False,
     ):
-        """Hold the law of the sensor's noise v (`source`), the rounding, and the flags that the class describes."""
-        # By component: the step D of the rounding, half of its range, and its centre.
+        """Hold the law of the sensor's noise v (`source`) and the rounding of its measurement y.
+
+        By component: the `step` D, `half` the range of the steps, and their `centre`. `dither` names what is added to y
+        before rounding. `gaussian`: y is Gaussian, so that its moments give the variance of the rounding error.
+        `matters`: the claim on the covariance depends on the second moment of the rounded signal.
+        """
         self.source, self.step, self.half, self.centre = source, step, half, centre
         self.dither, self.gaussian, self.matters = dither, gaussian, matters
 
     @property  # type: ignore[misc]
     def mean(self) -> Vector:  # type: ignore[override]
-        """Mean of the sensor's noise v less the centre."""
+        """Mean E[v] - c of the noise in q - c, q the rounded measurement and c the centre of the steps."""
         mean: Vector = self.source.mean - self.centre
         return mean
 
     @property  # type: ignore[misc]
     def covariance(self) -> Square:  # type: ignore[override]
-        """Cov v + Var e, the largest that e may have."""
+        """Cov(v) + k diag(D^2), where k D^2 is the largest variance that the rounding error e may have for any y.
+
+        v is the sensor's noise, D the step, and k = LARGEST[dither].error, which is 1/12 or 1/4 by the dither.
+        """
         covariance: Square = self.source.covariance + LARGEST[self.dither].error * self._squares()
         return covariance
 
     @property
     def columns(self) -> WeightedColumns:
-        """Covariance as columns: those of v, then those of the rounding error e."""
+        """Covariance as weighted columns: those of the sensor's noise v, then those of the rounding error e."""
         return self._with_error(LARGEST[self.dither].error * self.step**2)
 
     @property
     def has_outliers(self) -> bool:
-        """True if v has."""
+        """True if the law of the sensor's noise v has outliers; the rounding error, within a step, has none."""
         return self.source.has_outliers
 
     @property
     def is_exact(self) -> bool:
-        """True if the rounding's error e has a known variance, and the mean 0 for every state.
+        """True if the covariance of the noise is exact: the rounding error e has mean 0 for every y, and known moments.
 
-        This depends on the dither. If `gaussian`, y is Gaussian, and its moments give Var e. If `matters`, the second
-        moment of the rounded signal enters the claim. Without a dither the noise v itself must act as one.
+        By the dither, D the step and f the fraction of a step by which y lies above the next step below:
+        - "triangular": Var e = D^2/4 for every y.
+        - "stochastic": Var e = D^2 E f(1 - f), which is known if y is Gaussian (`gaussian`).
+        - "subtracted": Var e = D^2/12 for every y. The second moment of the rounded signal, dither included, has
+          D^2 E f(1 - f). Where the claim depends on it (`matters`), as behind a random gain, y must be Gaussian.
+        - "none": Var e = D^2/12 if the noise v is Gaussian and wide enough to act as a dither.
         """
         match self.dither:
             case "triangular":
@@ -115,7 +126,10 @@ class RoundedNoise(AbstractNoise):
 
     @property
     def is_bounded(self) -> bool:
-        """True if e has mean 0 whatever the state is, and the largest of its variances stands for it."""
+        """True if the covariance of the noise is an upper bound and not exact.
+
+        The rounding error e then has mean 0 for every y, and `covariance` has the largest variance that e may have.
+        """
         return not self.is_exact and self.dither in ("stochastic", "subtracted")
 
     @property
@@ -129,19 +143,25 @@ class RoundedNoise(AbstractNoise):
         return bool(np.all(np.linalg.eigvalsh(unit)[..., 0] >= DITHERLESS))
 
     def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
-        """Return the law of v + e, the sensor's noise plus the rounding error, for a Gaussian signal of these moments.
+        """Return the noise v + e of a rounded measurement, v the sensor's noise, for a signal of these moments.
 
-        For a known signal the variance of e in squared steps is E f (1 - f), with f the place of y between two steps.
-        Else it is the largest for any y (`variances_in_steps`). `covariance` includes the dither, even one that is
-        subtracted again.
+        Two covariances are returned. That of what a receiver does not know, as `columns`: a dither that it subtracts
+        does not count. And that of all that is added to the signal, as `covariance`: this includes the dither.
+
+        If y is Gaussian, the dither and e together have the variance D^2 E f(1 - f), D the step and f the fraction of a
+        step by which y lies above the next step below. Else the largest variance for any y is taken.
+
+        Args:
+            mean: mean of the signal (dimension,).
+            variances: variances of the signal (dimension,), without the noise v.
         """
-        variances_in_steps = LARGEST[self.dither]
+        largest = LARGEST[self.dither]  # variances in squared steps: `error` without a subtracted dither, `whole` with
         if self.dither not in ("stochastic", "subtracted") or not self.gaussian:
-            covariance = self.source.covariance + variances_in_steps.whole * self._squares()
+            covariance = self.source.covariance + largest.whole * self._squares()
             return SignalNoise(self.columns, covariance)
-        bound = self._bound_rounding(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
-        error = variances_in_steps.error if self.dither == "subtracted" else bound
-        covariance = jnp.asarray(self.source.covariance) + jnp.diag(bound * jnp.asarray(self.step) ** 2)
+        whole = self._bound_rounding(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
+        error = largest.error if self.dither == "subtracted" else whole
+        covariance = jnp.asarray(self.source.covariance) + jnp.diag(whole * jnp.asarray(self.step) ** 2)
         return SignalNoise(self._with_error(error * self.step**2), covariance)
 
     def _bound_rounding(self, mean: Vector, variances: Vector) -> jax.Array:
@@ -176,22 +196,28 @@ class RoundedNoise(AbstractNoise):
         return join_columns(self.source.columns, WeightedColumns(np.eye(self.dimension), variances))
 
     def branches(self) -> GaussianBranches:
-        """Return the branches of v, each with the variance of e more."""
-        branches, error = self.source.branches(), LARGEST[self.dither].error * self.step**2
-        return branches._replace(variance=branches.variance + error[:, None])
+        """Return each component of v + e as a mixture of Gaussian branches about its mean.
+
+        They are those of the sensor's noise v, each with the largest variance of the rounding error e added.
+        """
+        branches, error_variance = self.source.branches(), LARGEST[self.dither].error * self.step**2
+        return branches._replace(variance=branches.variance + error_variance[:, None])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return v without its outliers, and e."""
-        plain = self.source.without_outliers()
-        return plain._replace(covariance=plain.covariance + LARGEST[self.dither].error * self._squares())
+        """Return mean and covariance of v + e if the sensor's noise v is no outlier; e has its largest variance."""
+        inlier = self.source.without_outliers()
+        return inlier._replace(covariance=inlier.covariance + LARGEST[self.dither].error * self._squares())
 
     def report(self, y: jax.Array) -> jax.Array:
-        """Return the step nearest to each component of y."""
+        """Return each component of the measurement y (dimension,) rounded to the nearest step, which is reported.
+
+        Steps are low, low + D, low + 2 D, ..., D = `step`, where the lowest is low = centre - half.
+        """
         low = jnp.asarray(self.centre) - jnp.asarray(self.half)
         return low + jnp.asarray(self.step) * jnp.floor((y - low) / jnp.asarray(self.step) + 0.5)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw v - centre: the rounding is the sensor's or the encoder's."""
+        """Draw v - centre, v the sensor's noise: the sensor or encoder rounds y itself, so that e is not drawn."""
         return self.source.sample(key) - jnp.asarray(self.centre)
 
     def moment(self, powers: Exponents) -> Number:
