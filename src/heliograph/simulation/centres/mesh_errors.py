@@ -187,10 +187,9 @@ def _compute_step_when_all_is_measured(
 ) -> MeshStep:  # fmt: skip
     """Return what does not depend on the estimates in step k, such as gains, if no measurement is missing.
 
-    It is one compiled program, called at every step. `covariance` (node, n, n) weighs the nodes' estimates before the
-    step, `blocks` (node, degree, n, degree, n) is the joint covariance of each node's and its neighbours' errors if the
-    rule needs it, `moments` are the mean and covariance of the plant's state, and `arrived` (node, rounds, degree) says
-    which messages arrive.
+    `covariance` (node, n, n) weighs the nodes' estimates before the step, `blocks` (node, degree, n, degree, n) is the
+    joint covariance of each node's and its neighbours' errors if the rule needs it, `moments` are the mean and
+    covariance of the plant's state, and `arrived` (node, rounds, degree) says which messages arrive.
     """
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, arrived, u, k)
