@@ -103,8 +103,9 @@ class Started(Traced):
 
 
 @pytest.mark.parametrize("make", [hg.linear_filter, hg.cubature_filter])
-def test_recordings_of_any_length_share_one_program(make):
+def test_recordings_of_any_length_share_one_program(make, monkeypatch):
     """The rows of a shorter one are the first of a longer one, bit for bit; rows behind others have a program too."""
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     item = Compiled(make(PLANT, SENSOR, RELAY), Notes())
     whole, compiled = item.run(Z, U), len(item.noted)
     for rows in (1, 2, 13, 19):
@@ -123,7 +124,8 @@ def whiten(item, z, u):
 
 
 @pytest.mark.parametrize("function", [hg.log_likelihood, whiten, hg.forecasting.predict_rows])
-def test_what_is_computed_of_rows_has_one_program_for_any_number_of_them(function):
+def test_what_is_computed_of_rows_has_one_program_for_any_number_of_them(function, monkeypatch):
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     item = Started(hg.linear_filter(PLANT, SENSOR, RELAY), Notes())
     function(item, Z, U)
     compiled = len(item.noted)

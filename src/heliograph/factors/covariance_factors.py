@@ -115,8 +115,7 @@ def is_positive(x: jax.Array) -> jax.Array:
 @jax.jit
 def reciprocal_or_one(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 1 of 0: for a numerator that is 0 where x is, so that 0 / 0 is 0."""
-    one = lax.full_like(x, 1.0)
-    return lax.div(one, lax.select(is_positive(x), x, one))
+    return lax.div(lax.full_like(x, 1.0), lax.select(is_positive(x), x, lax.full_like(x, 1.0)))
 
 
 @jax.jit

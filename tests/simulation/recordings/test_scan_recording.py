@@ -150,8 +150,9 @@ class Notes(list):
 
 @pytest.mark.filterwarnings("ignore:.*left out")
 @pytest.mark.parametrize("outlier", [0.0, 1e6])
-def test_recordings_of_any_length_share_one_program(outlier):
+def test_recordings_of_any_length_share_one_program(outlier, monkeypatch):
     """Also where a value is implausible, so that all rows are filtered again with judgements."""
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     item = Compiled(hg.linear_filter(WALK, PLACE, LOSSY), Notes())
     net = hg.Network(WALK, {"far": hg.Node(PLACE, LOSSY, {"f": item})})
     z = np.where(np.arange(ROWS) == 0, outlier, measured()["far"])
