@@ -68,6 +68,18 @@ def test_an_infinite_stamp_does_not_cost_the_digits_of_others(folder, capsys, wo
     assert read_table("out.parquet")["time"].tolist() == stamps
 
 
+def test_hours_of_a_clock_that_was_set_back_are_not_mixed(folder, capsys):
+    """Rows of 02:10 to 02:50 came twice, and were put in order between one another."""
+    hours = [
+        *(f"02:{minute}" for minute in range(10, 60, 10)),
+        "02:00",
+        *(f"02:{m}" for m in range(10, 60, 10)),
+        "03:00",
+    ]
+    (folder / "data.csv").write_text("time,push,pos\n" + "".join(f"2026-10-25T{hour}:00,0,1\n" for hour in hours))
+    refused(folder, capsys, run_arguments(), "row 6, column 'time'", "dates in UTC", "when summer time ends")
+
+
 def test_rows_that_could_not_be_read_do_not_share_the_time_of_others(folder, capsys):
     """Their times are made up: "3 of 3 rows share their time, as stamps do that lost their digits" was said of them."""
     (folder / "net.py").write_text(

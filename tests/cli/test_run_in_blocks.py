@@ -113,6 +113,17 @@ def counts_in(lines) -> list[str]:
     return [line for line in found if "could not be read" in line or "in the order" in line]
 
 
+@pytest.mark.parametrize("size", [60, 120, 10**6])
+@pytest.mark.parametrize("network", [NETWORK, STEPS], ids=["time", "steps"])
+def test_a_clock_that_was_set_back_is_refused_wherever_blocks_end(folder, network, size):
+    """By an hour at the end of summer time: put in order, rows of two hours were mixed."""
+    minutes = [*range(60, 180, 10), *range(120, 240, 10)]
+    rows = [f"2026-10-25T0{minute // 60}:{minute % 60:02}:00,0,1" for minute in minutes]
+    (folder / "data.csv").write_text(table(rows))
+    with pytest.raises(InputError, match=r"row 13, column .time.: expected dates in UTC.* when summer time ends"):
+        run_in_blocks(network, block=BlockSize(rows=8, bytes=size))
+
+
 @pytest.mark.parametrize("size", [1, 10, 60])
 @pytest.mark.parametrize("text", [
     table(["0,1,x", "x,1,1", *ROWS[2:9]]),  # the first two rows, of times 0 and 1

@@ -281,6 +281,19 @@ def test_stamps_that_lost_their_digits_are_said(tmp_path):
         h.files.read_recording(tmp_path / "six.csv", WALK)
 
 
+@pytest.mark.parametrize("minutes", [10, 60])
+def test_a_clock_that_was_set_back_is_refused(minutes):
+    """As when summer time ends; of rows an hour apart two had one time, with a dt of 0, and nobody said so."""
+    utc = np.datetime64("2026-10-24T22:00", "ns") + np.arange(30) * np.timedelta64(minutes, "m")
+    berlin = utc + np.where(utc < np.datetime64("2026-10-25T01:00"), 2, 1) * np.timedelta64(1, "h")
+    with pytest.raises(h.InputError, match=r"expected dates in UTC.* clocks are set back so when summer time ends"):
+        h.files.read_recording({"time": berlin, "y": np.ones(30)}, WALK)
+    twice = np.sort(np.concatenate([berlin[:3], berlin[2:3], berlin[3:4] + np.timedelta64(20, "m")]))
+    for times in (utc, twice if minutes == 10 else utc, berlin + np.timedelta64(1, "D")):  # twice: one row; on a Monday
+        kept = np.sort(times)
+        assert len(h.files.read_recording({"time": kept, "y": np.ones(len(kept))}, WALK).time) == len(kept)
+
+
 def test_steps_that_are_rounded_by_the_size_of_their_times_are_said():
     """Nanoseconds since 1970 as doubles are multiples of 256: steps of 1000 were 1024, or 768, without a word."""
     k = np.arange(20)

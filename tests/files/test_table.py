@@ -164,6 +164,27 @@ def test_bytes_that_are_no_utf8(tmp_path):
     refused(lambda: read_table(tmp_path / "data.csv"), "data.csv", "UTF-8")
 
 
+def test_a_table_without_names_is_refused(tmp_path):
+    """Its first row was taken for the names, and was gone."""
+    path = text_file(tmp_path, "0,1.5\n1,-2e-3\n2,3\n")
+    refused(lambda: read_table(path), "header", "names of columns", "numbers alone, '0,1.5'", "header=None")
+
+
+@pytest.mark.parametrize(
+    "text", [",time,a,,\n7,0,1,,\n8,1,2,,\n", "time,a,,\n0,1,7,\n1,2,8,\n", "time,,a,\n0,7,1,\n1,8,2,x\n"]
+)
+def test_columns_without_a_name_do_not_replace_each_other(tmp_path, text):
+    """As an index of pandas beside commas at the ends of lines: the last of them was read, and others were gone."""
+    path = text_file(tmp_path, text.replace(",x", ","))
+    read = read_table(path)
+    np.testing.assert_array_equal(read[""], [7, 8])
+    np.testing.assert_array_equal(read["a"], [1, 2])
+    refused(lambda: read_table(text_file(tmp_path, "time,,\n0,7,1\n1,8,2\n")), "a name for each column that has values")
+    refused(
+        lambda: read_table(text_file(tmp_path, "time,,\n0,7,1\n1,8, 2\n")), "a name for each column that has values"
+    )
+
+
 @pytest.mark.parametrize(
     ("content", "kind"),
     [

@@ -227,6 +227,18 @@ def test_states_are_found_by_their_names_in_datasets_and_tables(runs):
         hg.Record.from_pandas(frame.iloc[:, without])
 
 
+def test_statistics_of_a_part_of_the_states_are_refused(result):
+    """The NEES of all states was divided by the number of those that were left: twice what it is."""
+    dataset = result.to_xarray()
+    reordered = type(result).from_xarray(dataset.isel(state=[1, 0]))
+    np.testing.assert_allclose(reordered.to_pandas()["nees"], result.to_pandas()["nees"], rtol=1e-12)  # another order
+    for part in (dataset.isel(state=[0]), dataset.isel(state=[0], other=[0])):
+        with pytest.raises(
+            ValueError, match="dimension 'state': expected all states, position, velocity, since the NEES"
+        ):
+            type(result).from_xarray(part)
+
+
 def test_rows_of_runs_are_whole_and_in_order(runs):
     """Rows were taken by their places: of a shuffled table the runs were mixed, and a missing row was NumPy's error."""
     frame = runs.to_pandas()

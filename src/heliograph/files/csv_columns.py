@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.table_rows import EXACT, TableRows
+from heliograph.files.table_rows import EXACT, TableRows, find_missing
 from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import CsvReader, CsvRow, parse_cell
 from heliograph.files.text.numeric_csv_lines import parse_numeric_lines
@@ -106,7 +106,8 @@ class CsvColumnReader:
         columns = dict[str, np.ndarray]()
         for i, name in enumerate(self.header):
             if self._only is None or name in self._only:
-                columns[name] = self._make_column(name, [row[i] for row in values], [cells[i] for cells in texts])
+                column = self._make_column(name, [row[i] for row in values], [cells[i] for cells in texts])
+                self._add_column(columns, name, column)
         return TableRows(columns, np.array(numbers, dtype=np.int64), refused)
 
     def accepts_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
@@ -132,12 +133,25 @@ class CsvColumnReader:
             if self._only is not None and name not in self._only:
                 continue
             if self._dated.get(name):  # plain lines have no dates: its cells are empty here
-                columns[name] = np.full(len(values), "NaT", "datetime64[ns]")
+                self._add_column(columns, name, np.full(len(values), "NaT", "datetime64[ns]"))
                 continue
-            columns[name] = values.copy()
+            self._add_column(columns, name, values.copy())
             if name not in self._dated and not np.isnan(values).all():
                 self._dated[name] = False
         return TableRows(columns, np.arange(first, first + len(numbers)), [])
+
+    def _add_column(self, columns: dict[str, np.ndarray], name: str, values: np.ndarray) -> None:
+        """Add a column by name; of several without one, as commas at the ends of lines make, that with values.
+
+        Raises:
+            ValueError: there are values in several columns without a name.
+        """
+        if name in columns:
+            earlier = columns[name]
+            if not (_is_empty(earlier) or _is_empty(values)):
+                raise fail(f"{self.source}, header", "a name for each column that has values", "several without")
+            values = earlier if _is_empty(values) else values
+        columns[name] = values
 
     def _check_header(self, row: CsvRow) -> None:
         """Raise if a row stands under another header than the rows before it."""
@@ -215,3 +229,8 @@ class CsvColumnReader:
         if not all(match or np.isnan(number) for match, number in zip(found, numbers, strict=True)):
             return numbers
         return np.array([int(match[1]) if match else NAT for match in found], dtype=np.int64)
+
+
+def _is_empty(values: np.ndarray) -> bool:
+    """Return whether a column has no value: NaN, NaT, or the number of NaT among int64."""
+    return bool((np.isnat(values) if values.dtype.kind == "M" else find_missing(values)).all())

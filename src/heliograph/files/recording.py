@@ -24,6 +24,7 @@ from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import read_compact_date, seconds_between
 from heliograph.numerics.times.row_times import backwards_text, find_backwards_row, find_lost_digits, is_mix_of_units
+from heliograph.numerics.times.timestamp_order import find_clock_set_back
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
@@ -195,13 +196,25 @@ class RowReader:
         """Return rows sorted by their times, or as they are if reading is strict.
 
         `self._behind` counts rows that came after later ones. `self.refused` gets the reasons why rows were left out.
+
+        Raises:
+            ValueError: a clock of local time was set back by an hour: put in order, rows of two hours would be mixed.
         """
+        self._refuse_clock_set_back(cells)
         if self._strict:
             return cells
         cells, refused, behind = order_rows(cells, self.network, self.source)
         self.refused += refused
         self._behind += behind
         return cells
+
+    def _refuse_clock_set_back(self, cells: RecordingRows) -> None:
+        """Raise ValueError if the dates go back by an hour as local time does when summer time ends."""
+        row = find_clock_set_back(cells.time) if cells.time.dtype.kind == "M" else None
+        if row is not None:
+            where = f"{self.source}, row {cells.numbers[row]}, column {TIME!r}"
+            came = f"{backwards_text(cells.time, row)}: clocks are set back so when summer time ends"
+            raise fail(where, "dates in UTC, or with their zone (pandas: tz_localize(ambiguous='infer'))", came)
 
     def make_recording(self, cells: RecordingRows, before: RecordingRows | None = None) -> Recording:
         """Return rows in the order of their times as a recording.

@@ -116,6 +116,20 @@ def test_samples_that_a_file_marks_as_invalid_did_not_arrive(tmp_path):
     assert np.flatnonzero(np.isnan(values)).tolist() == [3, 4]
 
 
+def test_signals_of_one_name_are_both_there(tmp_path):
+    """Two of one name in a group: the file was called no MDF4 file, whatever was read of it."""
+    asammdf = pytest.importorskip("asammdf", reason="the extra `mdf`")
+    path, seconds = tmp_path / "twice.mf4", np.arange(logs.COUNT) / 10
+    file = asammdf.MDF(version="4.10")
+    signals = [asammdf.Signal(seconds + shift, seconds, name="FrontLeft", unit="km/h") for shift in (0.0, 100.0)]
+    file.append(signals, acq_name="WheelSpeeds")
+    file.save(path)
+    for field, first in (("FrontLeft", 0.0), ("FrontLeft 2", 100.0)):
+        source = hg.files.json_field(field, node="wheel", output="speed")
+        _, _, values = recorded(path, {"WheelSpeeds": source})
+        assert values[0] == first and np.isfinite(values).all()
+
+
 def test_a_log_without_a_date_begins_in_1970(tmp_path):
     path = logs.write_ulog(tmp_path / "drive.ulg", date=False)
     _, time, _ = recorded(path, {"WheelSpeeds": logs.wheel(time="timestamp")})

@@ -27,10 +27,14 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     try:
         with MDF(path) as file:
             names = _name_groups(file)
-            units = {name: _list_units(file, i) for i, name in enumerate(names)}
-            if any(RAW in signals for signals in units.values()):
+            channels = {name: _list_channels(file, i) for i, name in enumerate(names)}
+            if any(RAW in signals for signals in channels.values()):
                 raise fail(str(path), "dbc= of LogSources, for its frames of CAN", "none")
-            series = {name: _read_group(file, i, units[name]) for i, name in enumerate(names) if wanted(name)}
+            series = {name: _read_group(file, i, channels[name]) for i, name in enumerate(names) if wanted(name)}
+            units = {
+                name: {signal: file.get_channel_unit(group=i, index=index) or "" for signal, index in signals.items()}
+                for i, (name, signals) in enumerate(channels.items())
+            }
             begin = file.start_time.timestamp() if sources.start is None else sources.start
     except InputError:
         raise
@@ -49,25 +53,28 @@ def _name_groups(file: "MDF") -> list[str]:
     return names
 
 
-def _list_units(file: "MDF", group: int) -> dict[str, str]:
-    """Return {name: unit} for the signals of the group with this number, without its channel of times."""
+def _list_channels(file: "MDF", group: int) -> dict[str, int]:
+    """Return the index of each signal of the group with this number, by name, without its channel of times.
+
+    A further signal of one name has its index added to it.
+    """
     index_of_times = file.masters_db.get(group)
     channels: Any = file.groups[group].channels
-    return {
-        channel.name: file.get_channel_unit(channel.name, group=group, index=i) or ""
-        for i, channel in enumerate(channels)
-        if i != index_of_times
-    }
+    indices = dict[str, int]()
+    for index, channel in enumerate(channels):
+        if index != index_of_times:
+            indices[channel.name if channel.name not in indices else f"{channel.name} {index}"] = index
+    return indices
 
 
-def _read_group(file: "MDF", group: int, names: dict[str, str]) -> MessageSeries:
-    """Return the times, in seconds, and the signals of a group; `names` holds the names of the signals.
+def _read_group(file: "MDF", group: int, indices: dict[str, int]) -> MessageSeries:
+    """Return the times, in seconds, and the signals of a group; `indices` holds their places in it, by name.
 
     A sample that the file marks as invalid becomes None. A signal with several numbers per sample is left out.
     """
     time, values = np.zeros(0), dict[str, np.ndarray]()
-    for name in names:
-        signal = file.get(name, group=group, ignore_invalidation_bits=True)
+    for name, index in indices.items():
+        signal = file.get(group=group, index=index, ignore_invalidation_bits=True)
         time, samples = np.asarray(signal.timestamps, dtype=np.float64), np.asarray(signal.samples)
         if samples.ndim > 1 or samples.dtype.names:
             continue

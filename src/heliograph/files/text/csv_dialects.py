@@ -49,6 +49,9 @@ def check_header(source: str, header: Sequence[str], path: Path | None, marked: 
         came = f"{SEPARATORS[mark]} in {show_value(line)}{remedy}"
         raise fail(f"{source}, header", "names separated by commas", came)
     check_distinct(source, [name for name in header if name])
+    if len(header) > 1 and all(re.fullmatch(r"[-+]?\d*\.?\d+(?:e[-+]?\d+)?", name, re.IGNORECASE) for name in header):
+        example = "" if path is None else f": {suggest_rewrite(path, header=None, names=['time', '...'])}"
+        raise fail(f"{source}, header", "names of columns", f"numbers alone, {show_value(line)}{example}")
 
 
 def find_separator(header: Sequence[str]) -> str | None:

@@ -4,7 +4,7 @@ from bisect import bisect_right
 
 import numpy as np
 
-from heliograph.numerics.types import Bool
+from heliograph.numerics.types import Bool, Int
 
 SECOND = 10**9  # nanoseconds
 YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
@@ -38,6 +38,35 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
         out_of_order[len(time) - 1 - row] = False
         row = previous[row]
     return out_of_order
+
+
+def find_clock_set_back(time: np.ndarray) -> int | None:
+    """Return the first row by which a clock of local time was set back by an hour, as when summer time ends; else None.
+
+    Dates then go from 02:50 to 02:00, if a row comes every ten minutes: back by an hour less a step. It is so on a
+    Sunday, to an hour before three, wherever summer time is known. Of rows an hour apart two have one time then, which
+    rows may have for other reasons too: they count on the last Sunday of October, and the first of November and April.
+
+    Args:
+        time: dates in the order of the rows, datetime64[ns].
+    """
+    nanoseconds: Int[np.ndarray, " rows"] = time.astype("datetime64[ns]").astype(np.int64)
+    steps: Int[np.ndarray, " steps"] = np.diff(nanoseconds)
+    forward = steps[steps > 0]
+    if time.dtype.kind != "M" or not forward.size:
+        return None
+    step, hour = float(np.median(forward)), 3600.0 * SECOND
+    if step > hour or np.count_nonzero(steps <= 0) > 2 * (1 + np.ptp(nanoseconds) // YEAR):
+        return None  # the rows are in no order at all, or share their times
+    rows = 1 + np.flatnonzero((steps <= 0) & (np.abs(-steps - (hour - step)) <= step / 2))
+    days = time[rows].astype("datetime64[D]")
+    is_sunday = (days.astype(np.int64) + 4) % 7 == 0  # 1970 began on a Thursday
+    is_early = time[rows] - days < np.timedelta64(3, "h")
+    months = days.astype("datetime64[M]")
+    month, day = months.astype(np.int64) % 12 + 1, (days - months).astype(np.int64) + 1
+    ends_summer_time = ((month == 10) & (day > 24)) | (np.isin(month, (4, 11)) & (day < 8))
+    found = rows[is_sunday & is_early & ((steps[rows - 1] < 0) | ends_summer_time)]
+    return int(found[0]) if len(found) else None
 
 
 def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
+from heliograph.disk.quoted_text import label_with_unit, quote_for_figure, visible
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in
@@ -110,13 +110,17 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
-        """Return the statistics from a dataset that `to_xarray` made.
+        """Return the statistics from a dataset that `to_xarray` made, with all its states.
 
         Raises:
-            ValueError: no such dataset.
+            ValueError: no such dataset, or one with a part of the states, of which the NEES is not known.
         """
         check_title(dataset, STATISTICS)
         states, count = read_labels(dataset, "state"), read_values(dataset, "runs", [TIME])
+        made_of = str(dataset.attrs.get("states", ""))
+        if sorted(visible(", ".join(states)).split(", ")) != sorted(made_of.split(", ")):
+            expected = f"all states, {made_of}, since the NEES is of all"
+            raise fail("dataset, dimension 'state'", expected, ", ".join(states))
         upper, uplinks = np.triu_indices(len(states)), read_uplinks(dataset, [TIME])
         # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
         results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in read_labels(dataset, "node")}
