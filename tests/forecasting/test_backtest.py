@@ -65,6 +65,18 @@ def test_scores_of_a_mixture_are_their_integrals():
     assert log_score(law, np.array([0.4]))[0] == pytest.approx(np.log(slope), rel=1e-7)
 
 
+def test_scores_of_many_rows_are_those_of_each():
+    """Rows whose laws are shifts of one another share the distance of two draws; others, and values, do not."""
+    generator = np.random.default_rng(0)
+    weights, means, variances = (generator.uniform(0.2, 1.0, size=(3, 4)) for _ in range(3))
+    law = MixtureLaws(weights / weights.sum(axis=1, keepdims=True), means, variances)
+    shifted = MixtureLaws(*(np.concatenate([part, part[:2]]) for part in law))
+    shifted.means[3:] += np.array([[2.0], [-1.0]])
+    z = generator.normal(size=5)
+    alone = [crps(MixtureLaws(*(part[[k]] for part in shifted)), z[[k]])[0] for k in range(5)]
+    np.testing.assert_allclose(crps(shifted, z), alone, rtol=1e-12)
+
+
 def test_standard_errors_know_the_overlap():
     """Sums of 8 neighbours: their mean's error over 400 series is as said; the naive one is 2.8 times too small."""
     generator = np.random.default_rng(0)

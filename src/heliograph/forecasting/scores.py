@@ -91,12 +91,22 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
     """
     distance_from_z = np.sum(law.weights * _compute_mean_size(values[:, None] - law.means, law.variances), axis=1)
-    distance_of_two = np.zeros(len(values))  # E|X - X'|
-    for i in range(law.weights.shape[1]):
-        differences, variances = law.means[:, [i]] - law.means, law.variances[:, [i]] + law.variances
-        mean_sizes = _compute_mean_size(differences, variances)
-        distance_of_two += law.weights[:, i] * np.sum(law.weights * mean_sizes, axis=1)
+    # The distance of X and X' takes K^2 terms, and is the same in rows whose laws differ by a shift alone, as those of
+    # a settled filter do: each such law once.
+    shape = np.concatenate([law.weights, law.means - law.means[:, :1], law.variances], axis=1)
+    _, rows, which = np.unique(shape, axis=0, return_index=True, return_inverse=True)
+    distance_of_two = _compute_distance_of_two(MixtureLaws(*(part[rows] for part in law)))[which.ravel()]
     return np.asarray(distance_from_z - distance_of_two / 2)
+
+
+def _compute_distance_of_two(law: MixtureLaws) -> np.ndarray:
+    """Return E|X - X'| of independent X and X' of each row's law (rows,); each pair of parts counts twice."""
+    total = np.zeros(len(law.weights))
+    for i in range(law.weights.shape[1]):
+        differences, variances = law.means[:, [i]] - law.means[:, i:], law.variances[:, [i]] + law.variances[:, i:]
+        pairs = law.weights[:, [i]] * law.weights[:, i:] * _compute_mean_size(differences, variances)
+        total += 2 * pairs.sum(axis=1) - pairs[:, 0]
+    return total
 
 
 def _compute_mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
