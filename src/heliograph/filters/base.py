@@ -281,7 +281,7 @@ class AbstractFilter(Module):
 
     @property
     def of_atoms(self) -> bool:
-        """True for a mixture over atoms, whose likelihood alone says which values its model excludes."""
+        """True if the law of z is a mixture over points, so that likelihood 0 says that the model excludes z."""
         return False
 
     @property

@@ -119,7 +119,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """True if the filter within is a mixture over atoms."""
+        """True if for the filter within likelihood 0 says that its model excludes a measurement."""
         return self.base.of_atoms
 
     def _with_own_claim(self, estimate: Estimate) -> Estimate:

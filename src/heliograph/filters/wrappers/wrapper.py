@@ -73,7 +73,7 @@ class AbstractWrapper(AbstractSizedFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """True for a filter within that is a mixture over atoms."""
+        """True if for the filter within likelihood 0 says that its model excludes a measurement."""
         return self.base.of_atoms
 
     @property
