@@ -86,7 +86,7 @@ class _CombinationUpdate(NamedTuple):
     `certain` counts components of z that arrived and that the combination determines.
     """
 
-    after: Gaussian
+    posterior: Gaussian
     log_likelihood: jax.Array
     certain: jax.Array
     value: jax.Array
@@ -159,11 +159,11 @@ class MixtureFilter(AbstractSizedFilter):
             """
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
-            after, innovations = condition_on_observation(x, slopes, value, noise, present)
+            posterior, innovations = condition_on_observation(x, slopes, value, noise, present)
             log_likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
             covariance = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
             certain = jnp.sum(present & innovations.determined)
-            return _CombinationUpdate(after, log_likelihood, certain, value=value, covariance=covariance)
+            return _CombinationUpdate(posterior, log_likelihood, certain, value=value, covariance=covariance)
 
         updates = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
         # Posterior weights of the combinations; `excluded` where none of them can produce z: the state stays.
@@ -175,7 +175,7 @@ class MixtureFilter(AbstractSizedFilter):
         innovation = mixed_innovation(prior, value, covariance, density)
         # The probability of a mode is that of all its combinations.
         law = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
-        updated = MixtureBelief(gaussian=merge_mixture(updates.after, weight), law=law, moved=state.moved)
+        updated = MixtureBelief(gaussian=merge_mixture(updates.posterior, weight), law=law, moved=state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates
