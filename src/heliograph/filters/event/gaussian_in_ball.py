@@ -92,7 +92,7 @@ def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Ar
     )
 
 
-def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
+def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
     """Return the sum with each Gaussian x of N components cut to |D x| <= radius, or to |D x| > radius.
 
     A cut Gaussian is replaced by the Gaussian of the same mean and covariance, and its weight is multiplied by the
@@ -101,7 +101,7 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
     the mean becomes m + K (E e - V' D m), and the covariance Cov(x | e) + K Cov(e) K'.
 
     Args:
-        parts: the sum of K Gaussians.
+        mixture: the sum of K Gaussians.
         directions: D (m, N).
         radius: of the ball, ().
         inside: |D x| <= radius; else |D x| > radius.
@@ -126,8 +126,8 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
         explained_by_e = eliminate(moments.covariance).through(gain)
         return moments.log_mass, from_columns(mean, join_columns(given_e.columns, explained_by_e))
 
-    log_mass, truncated = jax.lax.map(truncate_one, parts.gaussian)
-    return GaussianSum(parts.log_weight + log_mass, truncated, parts.label)
+    log_mass, truncated = jax.lax.map(truncate_one, mixture.gaussian)
+    return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.label)
 
 
 def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:

@@ -127,8 +127,8 @@ def condition_parts_on_received(
         """Return one Gaussian of (x, r, y) given z, and log of the density of z."""
         return _condition_on_received(x, z, arrived, link, sender, m, delivers)
 
-    after, density = jax.vmap(update_one)(mixture.gaussian)
-    return GaussianSum(mixture.log_weight + density, after, mixture.label)
+    updated, log_density = jax.vmap(update_one)(mixture.gaussian)
+    return GaussianSum(mixture.log_weight + log_density, updated, mixture.label)
 
 
 def _condition_on_received(

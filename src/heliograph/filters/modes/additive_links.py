@@ -77,8 +77,9 @@ class AdditiveBelief(NamedTuple):
 class AdditiveModalFilter(AbstractModalFilter):
     """The linear minimum-mean-square-error filter of a linear plant behind a sum of links with memory.
 
-    It is the `ModalFilter` of all links' joint modes, of which a sum needs but one function for each mode of a link
-    beside the first. The innovation covariance is exact; the innovation is not Gaussian, so its likelihood is nominal.
+    It equals the filter of all links' joint modes. But for a sum of links it is enough to estimate the products of the
+    state with one function for each mode of a link but the first. The innovation covariance is exact; the innovation is
+    not Gaussian, so its likelihood is nominal.
 
     Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994),
     of functions of the modes.

@@ -67,7 +67,7 @@ def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M
 def _describe_step_by_pattern(
     outcomes: list[list[ArrivalOutcome]],
     patterns: list[tuple[bool, ...]],
-    before: JointModes,
+    modes_before: JointModes,
     flags: Float[np.ndarray, "M F"],
 ) -> ChannelByPattern:
     """Return the channel of one step by mode and pattern of arrivals.
@@ -75,7 +75,7 @@ def _describe_step_by_pattern(
     Args:
         outcomes: of each mode, what may arrive: a probability, which components arrive, and the random map z = G y + n.
         patterns: all patterns of arrivals, each (m,).
-        before: modes of the step before, with the transition to this step's.
+        modes_before: those of the step before, with the transition to this step's.
         flags: P(flag | mode).
     """
     some_map = outcomes[0][0].map
@@ -96,14 +96,14 @@ def _describe_step_by_pattern(
     # Moments given mode and pattern; where the pattern cannot occur they are 0.
     xp, divisor = library(firsts, seconds), np.where(chance > 0, chance, 1.0)
     means = [one / share for one, share in zip(firsts, divisor.flat, strict=True)]
-    parts = [one / share - symmetric_product(gain, gain)
-             for one, share, gain in zip(seconds, divisor.flat, means, strict=True)]  # fmt: skip
-    gains, noises = zip(*map(split_off_noise, parts), strict=True)
+    covariances = [one / share - symmetric_product(gain, gain)
+                   for one, share, gain in zip(seconds, divisor.flat, means, strict=True)]  # fmt: skip
+    gains, noises = zip(*map(split_off_noise, covariances), strict=True)
     noise = WeightedColumns(
         *(xp.reshape(xp.stack(part), (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True))
     )
     return ChannelByPattern(
-        transition=before.transition,
+        transition=modes_before.transition,
         present=np.array(patterns).reshape(len(patterns), m),
         chance=chance,
         mean=xp.reshape(xp.stack(means), (*shape, m, p)),

@@ -56,10 +56,10 @@ from heliograph.random_affine.series_and_stack import Series
 
 
 class AtomCombinations(Module):
-    """All combinations of atoms of one step, each with its `mode` of the links and its probability in that mode.
+    """All combinations of values of gains and noises of finite support at one step, each with its mode of the links.
 
-    weight: P(combination | mode). transition: of the modes from the step before; a single mode for links without
-    memory.
+    In combination a, z = gain_a x + offset_a + N(0, noise_a). weight: P(combination | mode). transition: of the modes
+    from the step before; a single mode for links without memory.
 
     Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m) columns, transition (M, M).
     """
@@ -86,7 +86,7 @@ class _CombinationUpdate(NamedTuple):
     `certain` counts components of z that arrived and that the combination determines.
     """
 
-    after: Gaussian
+    posterior: Gaussian
     log_likelihood: jax.Array
     certain: jax.Array
     value: jax.Array
@@ -147,23 +147,23 @@ class MixtureFilter(AbstractSizedFilter):
         a Gaussian noise.
         """
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
-        prior = state.law[c.mode] * jnp.asarray(c.weight)
+        prior = state.law[c.mode] * jnp.asarray(c.weight)  # P(combination) = P(mode) P(combination | mode)
         size = square_root(second_moments_at_start(self.plant))  # of the states, for the rounding of gain @ x
         present = ~jnp.isnan(z)
 
         def condition_on_combination(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> _CombinationUpdate:
             """Return the Kalman update by z = gain x + offset + noise.
 
-            x is the predicted Gaussian. `size` (n,) holds the roots of E[x_i^2], which give the rounding. `present`
-            says which components of z arrived. `certain` is the number of components that are determined exactly.
+            x is the predicted Gaussian. `certain` is the number of components of z that the combination determines
+            exactly.
             """
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
-            after, innovations = condition_on_observation(x, slopes, value, noise, present)
+            posterior, innovations = condition_on_observation(x, slopes, value, noise, present)
             log_likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
             covariance = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
             certain = jnp.sum(present & innovations.determined)
-            return _CombinationUpdate(after, log_likelihood, certain, value=value, covariance=covariance)
+            return _CombinationUpdate(posterior, log_likelihood, certain, value=value, covariance=covariance)
 
         updates = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
         # Posterior weights of the combinations; `excluded` where none of them can produce z: the state stays.
@@ -175,7 +175,7 @@ class MixtureFilter(AbstractSizedFilter):
         innovation = mixed_innovation(prior, value, covariance, density)
         # The probability of a mode is that of all its combinations.
         law = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
-        updated = MixtureBelief(gaussian=merge_mixture(updates.after, weight), law=law, moved=state.moved)
+        updated = MixtureBelief(gaussian=merge_mixture(updates.posterior, weight), law=law, moved=state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates
@@ -241,11 +241,13 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     # All combinations of atoms, mode by mode, for each step where they vary; one step stands for all where none do.
     added_variance = float(scalar("resolution", resolution, low=0.0, high=1e100)) ** 2
     steps = steps_covered((sensor, channel)) or 1
-    modes = [_joint_modes_of(now) for now in list_models_by_step(channel, steps)]
+    modes = [_joint_modes_of(channel_of_step) for channel_of_step in list_models_by_step(channel, steps)]
     modes_before = [modes[0], *modes[:-1]]
     combinations = [
-        _list_combinations(of_step, now, before, added_variance)
-        for of_step, now, before in zip(list_models_by_step(sensor, steps), modes, modes_before, strict=True)
+        _list_combinations(sensor_of_step, present, previous, added_variance)
+        for sensor_of_step, present, previous in zip(
+            list_models_by_step(sensor, steps), modes, modes_before, strict=True
+        )
     ]
     return MixtureFilter(
         plant=plant,
@@ -264,25 +266,25 @@ def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
 
 
 def _list_combinations(
-    sensor: AnySensor, now: JointModes, before: JointModes, added_variance: float
+    sensor: AnySensor, modes: JointModes, modes_before: JointModes, added_variance: float
 ) -> AtomCombinations:
-    """Return all combinations of values (atoms) of the gains and noises of z = G (C x + v) + n at one step, by mode.
+    """Return all combinations of values of the gains and noises of z = G (C x + v) + n at one step, mode after mode.
 
     Args:
         sensor: C and v.
-        now: the links' modes, each with its law of G and n.
-        before: the modes of the step before, whose chain leads to this step.
+        modes: the links' modes, each with its law of G and n.
+        modes_before: those of the step before, which hold the transition to this step.
         added_variance: variance that is added to each component of each noise.
     """
     assert isinstance(sensor, LinearSensor)  # checked before
     # In each mode the atoms of sensor and link in series; those of probability 0 are left out where it is known.
     sensed = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
-    atoms, modes = [], []
-    for mode, link in enumerate(now.maps):
+    atoms, mode_of_atom = [], []
+    for mode, link in enumerate(modes.maps):
         for atom in Series([sensed, link]).list_atoms():
             if is_traced(atom.weight) or atom.weight > 0:
                 atoms.append(atom)
-                modes.append(mode)
+                mode_of_atom.append(mode)
     if len(atoms) > COMPONENT_LIMIT:
         raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(atoms):,}")
     weight, gain, offset, noise = (stack_parts(column) for column in zip(*atoms, strict=True))
@@ -291,6 +293,6 @@ def _list_combinations(
         gain=gain,
         offset=offset,
         noise=factor_covariances(noise + added_variance * np.eye(noise.shape[-1])),
-        mode=np.array(modes),
-        transition=before.transition,
+        mode=np.array(mode_of_atom),
+        transition=modes_before.transition,
     )

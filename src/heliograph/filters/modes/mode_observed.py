@@ -124,16 +124,16 @@ class ModeObservedFilter(AbstractSizedFilter):
             prior, channel_moments = state.belief, _find_moments_given_states(channel, states_or_zero)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
-        after, innovation = correct_linear(
+        corrected, innovation = correct_linear(
             prior, sensor, channel_moments, Polytope(), z, second_moments_at_start(self.plant)
         )
-        after = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), after, prior)
+        corrected = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), corrected, prior)
         value, covariance = innovation.value, jnp.asarray(innovation.covariance)
         # The innovation has an entry for each received number, also for the states, which are given: 0 or NaN.
         for memory_state in memory_states:
             flag_innovation, covariance = append_flag(covariance, memory_state)
             value = jnp.append(value, flag_innovation)
-        belief = ModeObservedBelief(belief=after, before=prior, z=usable, move=state.move, begun=jnp.asarray(True))
+        belief = ModeObservedBelief(belief=corrected, before=prior, z=usable, move=state.move, begun=jnp.asarray(True))
         return belief, Innovation(value, covariance, innovation.log_likelihood)
 
     def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:

@@ -65,7 +65,7 @@ def move_pairs(
     plants: tuple[AbstractPlant, ...],
     plant_of: np.ndarray,
     transform: AbstractTransform,
-    parts: Gaussian,
+    gaussians: Gaussian,
     u: jax.Array,
     initial_power: jax.Array,
 ) -> MovedPairs:
@@ -75,7 +75,7 @@ def move_pairs(
         plants: the different plants.
         plant_of: [j], number of the plant of mode j.
         transform: of moments, for a nonlinear plant.
-        parts: the Gaussian of each mode (M, n).
+        gaussians: the Gaussian of each mode (M, n).
         u: input.
         initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """
@@ -93,7 +93,7 @@ def move_pairs(
         return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, unexplained))
 
     # Each Gaussian moved by each plant, [i, plant]; then for each mode j the one by its plant, [i, j].
-    by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(parts) for plant in plants]
+    by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(gaussians) for plant in plants]
     pairs: MovedPairs = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, plant_of], *by_plant)
     return pairs
 
@@ -196,8 +196,8 @@ class ModalSmootherStep(SmootherStep):
             """
             noise = WeightedColumns(jnp.eye(len(x.mean)), observed.noise)
             expected, slopes = observed.rows @ x.mean, observed.rows @ x.root
-            after, innovation = condition_on_measurement(x, slopes, noise, observed.value, expected)
-            return after, jnp.asarray(innovation.log_likelihood)
+            corrected, innovation = condition_on_measurement(x, slopes, noise, observed.value, expected)
+            return corrected, jnp.asarray(innovation.log_likelihood)
 
         corrected, log_likelihood = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, observations)
         # P(i, j | all data) = P(j | all data) P(i | j, all data), where P(i | j, all data) is proportional to P(i, j)
@@ -222,15 +222,15 @@ class ModalSmootherStep(SmootherStep):
         """
         if isinstance(law, Gaussian):
             return super().estimate_from(law)
-        parts = law.gaussian
+        gaussians = law.gaussian
         if self.limits:
-            within_limits = jax.vmap(lambda x: hold_mean_within_limits(x, self.limits))(parts)
-            log_mass, parts = truncate_to_limits(within_limits, self.limits)
+            within_limits = jax.vmap(lambda x: hold_mean_within_limits(x, self.limits))(gaussians)
+            log_mass, gaussians = truncate_to_limits(within_limits, self.limits)
             weight = law.law * jnp.exp(log_mass - jnp.max(log_mass))
-            law = ModalLaw(parts, weight / jnp.sum(weight))
+            law = ModalLaw(gaussians, weight / jnp.sum(weight))
         # Angles of all modes within half a turn of those of the likeliest.
-        mean = wrap_near(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
-        covariances = jax.vmap(lambda x: x.covariance)(parts)
+        mean = wrap_near(gaussians.mean, gaussians.mean[jnp.argmax(law.law)], self.angles)
+        covariances = jax.vmap(lambda x: x.covariance)(gaussians)
         mean, covariance = moments_of_mixture(mean, covariances, law.law)
         return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)
 

@@ -130,24 +130,29 @@ class ParticleFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
-        """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
+        """Correct each particle with z, weight it by its likelihood, and resample if too few particles have weight.
+
+        Too few: the effective number 1 / sum w_i^2 is below half the number of particles.
+        """
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         initial_power = second_moments_at_start(self.plant)
         signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, initial_power))(
             state.gaussian
         )
-        after, weight, mixed = correct_in_every_mode(
+        # Each particle is corrected in its own mode.
+        corrected, weight, innovation = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )
-        after = after._replace(mean=align_angles(plant, after.mean, weight))
+        corrected = corrected._replace(mean=align_angles(plant, corrected.mean, weight))
         # Systematic resampling.
         key = fold_in_bits(state.key, z)
         resampled = resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
         too_few = effective_number(weight) < self.particles / 2
         indices = jnp.where(too_few, resampled, jnp.arange(self.particles))
         weight = jnp.where(too_few, 1 / self.particles, weight)
-        kept: Gaussian = jax.tree.map(lambda leaf: leaf[indices], after)
-        return Particles(gaussian=kept, mode=state.mode[indices], weight=weight, key=key, moved=state.moved), mixed
+        chosen: Gaussian = jax.tree.map(lambda leaf: leaf[indices], corrected)
+        particles = Particles(chosen, mode=state.mode[indices], weight=weight, key=key, moved=state.moved)
+        return particles, innovation
 
     @estimates
     def estimate(self, state: Particles) -> Estimate:
@@ -215,15 +220,16 @@ def particle_filter(
         2001; Gordon, Salmond and Smith (1993) and Doucet, Godsill and Andrieu (2000) of the state; Schoen, Gustafsson
         and Nordlund, Marginalized particle filters for mixed linear/nonlinear state-space models (2005).
     """
-    # Modes of plant or sensor, or named states: some states drawn. No memory in the link: the whole state drawn. Else
-    # modes of links alone, with a Gaussian of the state in each particle.
-    of_modes = isinstance(plant, ModalPlant) or isinstance(sensor, ModalSensor)
-    if drawn is not None or of_modes:
+    # With named states, or modes of plant or sensor: modes and named states are drawn.
+    has_modes = isinstance(plant, ModalPlant) or isinstance(sensor, ModalSensor)
+    if drawn is not None or has_modes:
         count = MANY if particles is None else particles
         return build_partly_drawn(plant, sensor, channel, count, seed, proposal, resample, drawn, nodes)
+    # Without memory in the link: the whole state is drawn.
     if not memories(channel):
         count = MANY if particles is None else particles
         return build_state_particles(plant, sensor, channel, count, seed, proposal, resample)
+    # Else the modes of links are drawn, and each particle has a Gaussian of the state.
     return ParticleFilter(
         particles=check_count("particles", FEW if particles is None else particles),
         seed=np.asarray(check_count("seed", seed, least=0)),

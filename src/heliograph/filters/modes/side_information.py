@@ -342,8 +342,8 @@ def side_information_filter(
         flagged=flags is not None,
         **make_sizes(claim, first(plant), first(channel).outputs + (flags is not None)),
     )
-    # What the filter is told is what `with_flag` delivers; flags of the joint mode of several chains no channel
-    # delivers, so that nothing is known of what the claim is about.
+    # The filter's measurements are those of `with_flag`. But no channel delivers flags of the joint mode of several
+    # chains, so that for these the filter cannot say under which models its claim holds.
     if flags is not None and len(memories(channel)) != 1:
         return filter
     received = channel if flags is None else at_each_step(lambda link: with_flag(link, chances), channel)

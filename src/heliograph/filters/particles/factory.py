@@ -48,8 +48,8 @@ def build_partly_drawn(
     for model in list_mode_models(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
         model.refuse_inputs("particle_filter")
         check_link(model, first(channel), len(start.states), moments=False)
-    drawn_places = _find_places_of_drawn(start, drawn)
-    _check_linear_given(plant, sensor, drawn_places)
+    drawn_indices = _find_indices_of_drawn(start, drawn)
+    _check_linear_given(plant, sensor, drawn_indices)
     # One chain of the modes of plant, sensor and links: joint.beside has the pair (plant, sensor) of each joint mode.
     joint = joint_modes(first(channel), nodes, beside=(first(plant), first(sensor)))
     sensor_modes = find_models("sensor", sensor, [model for _, model in joint.beside])
@@ -72,8 +72,8 @@ def build_partly_drawn(
         observed_angles=find_received_angles(plant, sensor, channel),
         plant_modes=find_models("plant", plant, [model for model, _ in joint.beside]),
         sensor_modes=sensor_modes,
-        order=(*drawn_places, *(i for i in range(len(start.states)) if i not in drawn_places)),  # drawn ones first
-        drawn=len(drawn_places),
+        order=(*drawn_indices, *(i for i in range(len(start.states)) if i not in drawn_indices)),  # drawn ones first
+        drawn=len(drawn_indices),
         particles=check_count("particles", particles),
         optimal=proposal == "optimal",
         seed=np.asarray(check_count("seed", seed, least=0)),
@@ -81,7 +81,7 @@ def build_partly_drawn(
     )
 
 
-def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
+def _find_indices_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
     """Return the indices of the drawn states in the plant's order; None means that all states are drawn."""
     if drawn is None:
         return tuple(range(len(start.states)))

@@ -61,8 +61,8 @@ def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -
     log_density = -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2  # LOG_TURN = log 2 pi
     log_density = jnp.where(certain, 0.0, log_density)
     mean = (x.mean + x.root[:, :drawn] @ xi).at[:drawn].set(d)
-    given = x._replace(mean=mean, variances=x.variances.at[:drawn].set(0.0))
-    return given, jnp.sum(log_density)
+    conditioned = x._replace(mean=mean, variances=x.variances.at[:drawn].set(0.0))
+    return conditioned, jnp.sum(log_density)
 
 
 def draw_index(log_weight: jax.Array, uniform: jax.Array) -> jax.Array:

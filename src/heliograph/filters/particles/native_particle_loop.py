@@ -141,8 +141,8 @@ def _compile_programs(
     log_weight, prior, weight = np.zeros((3, length))
     # First program: a particle moved and weighed in each lane. It returns the particle's arrays, its log weight, and
     # what it expected of z. Booleans say which arguments differ from lane to lane.
-    before = row, used, particles, log_weight, numbers
-    advance = _compile_in_place(_advance_particle, filter, before, (False, False, True, True, True), length)
+    inputs = row, used, particles, log_weight, numbers
+    advance = _compile_in_place(_advance_particle, filter, inputs, (False, False, True, True, True), length)
     if advance is None:
         return None
     leaves, structure = jax.tree.flatten(particles)
@@ -162,7 +162,7 @@ def _compile_programs(
     second = _compile_in_place(_sum_for_covariance, filter, arguments, (False, True, True), len(group.weight))
     if second is None:
         return None
-    memory = _RowArrays(*before, prior=prior, weight=weight, reference=reference, states=states)
+    memory = _RowArrays(*inputs, prior=prior, weight=weight, reference=reference, states=states)
     return _ParticlePrograms(memory, advanced, log_weight_after, predicted, advance=advance, first=first, second=second)
 
 

@@ -15,12 +15,15 @@ MANY = 10_000  # normal numbers, more than a program of native code draws at onc
 
 
 def invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Return the index that a uniform number draws by the law: where the distribution function passes the number."""
+    """Return the index at which the distribution function of a law passes a uniform number: a draw from the law."""
     return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform).astype(int)
 
 
 def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
-    """Resample systematically: indices where the distribution function passes (start + 0 ... N - 1) / N."""
+    """Return N indices at which the distribution function of the weights passes (start + j) / N, j = 0, ..., N - 1.
+
+    This is systematic resampling, with one uniform number `start` for all draws.
+    """
     return invert_distribution(weight, (start + jnp.arange(len(weight))) / len(weight))
 
 
@@ -44,36 +47,39 @@ def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles
     A number depends on the key and on its index among all numbers, so that particles draw the same together or one by
     one. Fewer than MANY (10,000) numbers in all are those of `jax.random.normal(key, (particles, size))`. More have
     single precision, and are made two from each 64 random bits, in half of the time. They have 2^23 values, up to 5.3.
-    Native code and XLA agree on them to single precision. STEP, 2^-22, is the distance of two uniform numbers.
+    Native code and XLA agree on them to single precision.
     """
     if size * particles < MANY:
         smallest = np.nextafter(-1.0, 0.0)
         uniform = jnp.maximum(smallest, 2 * draw_uniforms(key, numbers, size, particles) + smallest)
         # The inverse error function turns uniform numbers on (-1, 1) into normal ones.
         return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
-    words = draw_random_bits(key, numbers, -(-size // 2), particles)
-    words_of_32_bits = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
-    # The middles of 2^23 parts of (-1, 1).
-    numbers_of_23_bits = (words_of_32_bits >> 9).astype(jnp.int32).astype(jnp.float32)
-    uniform = numbers_of_23_bits * np.float32(STEP) + np.float32(STEP / 2 - 1)
+    bits_64 = draw_random_bits(key, numbers, -(-size // 2), particles)
+    bits_32 = jnp.concatenate([bits_64 >> np.uint64(32), bits_64], axis=1)[:, :size].astype(jnp.uint32)
+    # The middles of 2^23 parts of (-1, 1), a distance STEP apart.
+    bits_23 = (bits_32 >> 9).astype(jnp.int32).astype(jnp.float32)
+    uniform = bits_23 * np.float32(STEP) + np.float32(STEP / 2 - 1)
     return (np.float32(np.sqrt(2)) * jax.lax.erf_inv(uniform)).astype(float)
 
 
 def draw_uniforms(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
-    """Draw numbers of [0, 1), (B, size), for particles: those of `jax.random.uniform(key, (particles, size))`."""
+    """Draw numbers of [0, 1), (B, size), for the particles with indices `numbers` (B,); for all if None.
+
+    They are those of `jax.random.uniform(key, (particles, size))`.
+    """
     # 52 random bits are the mantissa of a number in [1, 2), from which 1 is subtracted.
     mantissa = draw_random_bits(key, numbers, size, particles) >> np.uint64(12)
     return jax.lax.bitcast_convert_type(mantissa | np.float64(1.0).view(np.uint64), jnp.float64) - 1.0
 
 
 def draw_random_bits(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
-    """Draw `size` words of 64 bits, (B, size), for each of the particles of these numbers (B,), or for all."""
+    """Draw `size` integers of 64 random bits (B, size) for particles with indices `numbers` (B,); for all if None."""
     if numbers is None:
         return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
-    # Each word's index among the words of all particles is folded into the key, which gives two halves of 32 bits.
-    positions = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
-    fold_positions = jax.vmap(jax.vmap(partial(jax.random.fold_in, key)))  # over particles and words
-    halves = fold_positions(positions).astype(jnp.uint64)
+    # Each integer's index among those of all particles is folded into the key, which gives two halves of 32 bits.
+    indices = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
+    fold_indices = jax.vmap(jax.vmap(partial(jax.random.fold_in, key)))  # over particles and integers
+    halves = fold_indices(indices).astype(jnp.uint64)
     return halves[..., 0] << np.uint64(32) | halves[..., 1]
 
 
@@ -102,12 +108,12 @@ def draw_keys_of_rows(filter: Any, z: Array, key: Array | None) -> tuple[jax.Arr
         key: key of the state before the rows; None for the start before any data.
 
     Returns:
-        Key of x_0; uniform numbers by which particles are chosen (rows,); the key after the last row; keys of noises,
+        Key of x_0; uniform numbers with which resampling starts (rows,); the key after the last row; keys of noises,
         and of proposals (rows, ...).
     """
 
     def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Return the key after a row, a uniform number by which to choose particles, and keys of noise and proposal."""
+        """Return the key after a row, the uniform number of its resampling, and its keys of noise and proposal."""
         key, choice_key, noise_key = filter.keys_of_prediction(key)
         key, proposal_key = filter.keys_of_correction(key, row)
         return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)

@@ -28,12 +28,12 @@ Pairs = jax.Array  # (words, bits, 2): likelihoods of a zero and a one
 
 
 class LinkOfBits(Module):
-    """A channel of words as the laws that it may have at a step, each with known error rates.
+    """A channel of codewords at one step, as a mixture of channels with known bit error rates.
 
     Args:
         links: the channel with each combination of error rates.
-        weights: probabilities of these, for each mode where modes are told, (modes, combinations).
-        flag: output at which the mode is told; None without modes.
+        weights: probabilities of these in each mode (modes, combinations); one row without modes.
+        flag: index of the output that reports the mode with each message; None without modes.
     """
 
     links: tuple[AbstractRandomAffine, ...]
@@ -41,9 +41,9 @@ class LinkOfBits(Module):
     flag: int | None = eqx.field(static=True)
 
     def find_probabilities(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
-        """Return the probability of each combination of bit error rates, given the mode that was told as z[flag].
+        """Return the probability of each combination of bit error rates, given the mode that z[flag] reports.
 
-        `self.flag` is the output that tells the mode, or None without modes. `self.weights` (modes, combinations) are
+        `self.flag` is the output that reports the mode, or None without modes. `self.weights` (modes, combinations) are
         the probabilities in each mode. If z[flag] is NaN, all modes are equally likely.
         """
         weights = jnp.asarray(self.weights)
@@ -59,46 +59,49 @@ class LinkOfBits(Module):
 
 
 def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
-    """Return a channel of words as its possible laws, each with known error rates, and their probabilities.
+    """Return a channel of codewords as a mixture of channels with known bit error rates, and their probabilities.
+
+    An error rate of finite support, or a choice of one of several links, is replaced by each of its values. If links
+    have modes, the mode must be reported with each message, so that its probabilities can be used.
 
     Raises:
-        ValueError: a channel that is late, modes that are not told, more than 64 combinations of error rates.
+        ValueError: a channel with a delay, modes that are not reported, more than 64 combinations of error rates.
     """
     if channel.past:
         expected = "a link that is not late (linear_filter takes delays)"
         raise fail("channel of a word filter", expected, f"one late by up to {channel.past} steps")
     if not channel.remembers:
-        fixed = _list_known_rates(channel)  # pairs (probability, link of these error rates)
-        weights = np.array([[share for share, _ in fixed]], dtype=float)
-        return LinkOfBits(links=tuple(link for _, link in fixed), weights=weights, flag=None)
-    # The link as it is in each mode, of which the number comes with the words (a told mode).
+        mixture = _list_known_rates(channel)  # pairs (probability, channel with these error rates)
+        weights = np.array([[probability for probability, _ in mixture]], dtype=float)
+        return LinkOfBits(links=tuple(link for _, link in mixture), weights=weights, flag=None)
+    # The channel in each mode, whose number is received with the codewords.
     link_by_mode = list_told_modes(channel)
     if not link_by_mode:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
-    # All links of known error rates, mode after mode. In each mode only its own have a probability above 0.
-    combinations = [_list_known_rates(in_mode) for in_mode in link_by_mode]
-    links = [link for of_mode in combinations for _, link in of_mode]
+    # All channels with known error rates, mode after mode. In each mode only its own have a probability above 0.
+    mixture_by_mode = [_list_known_rates(link) for link in link_by_mode]
+    links = [link for mixture in mixture_by_mode for _, link in mixture]
     weights = np.zeros((len(link_by_mode), len(links)))
     start = 0
-    for mode, of_mode in enumerate(combinations):
-        weights[mode, start : start + len(of_mode)] = [share for share, _ in of_mode]
-        start += len(of_mode)
-    return LinkOfBits(links=tuple(links), weights=weights, flag=channel.outputs - 1)  # the mode is told last
+    for mode, mixture in enumerate(mixture_by_mode):
+        weights[mode, start : start + len(mixture)] = [probability for probability, _ in mixture]
+        start += len(mixture)
+    return LinkOfBits(links=tuple(links), weights=weights, flag=channel.outputs - 1)  # the last output is the mode
 
 
 def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
-    """Return the channel in each mode of its chain, without the output that tells the mode.
+    """Return the channel of codewords in each mode of its chain, without the output that reports the mode.
 
-    Words are numbers that are sent in bits. A channel of words may tell the mode of its only chain by its last output,
-    a `ModeOutput`. If it does not, the list is empty.
+    A channel may report the mode of its only Markov chain with each message: its last output is then a `ModeOutput`,
+    which delivers the mode's number. If that is not so, the list is empty.
     """
     outputs = channel.in_parallel
     mode_outputs = [output for output in outputs if isinstance(output, ModeOutput)]
     chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
-    # There must be one such output, for the only chain, in the last place.
-    is_told = len(mode_outputs) == 1 and set(chains) == {mode_outputs[0].memory.identity}
-    if not is_told or outputs[-1] is not mode_outputs[0] or len(outputs) < 2:
+    is_only_chain_reported = len(mode_outputs) == 1 and set(chains) == {mode_outputs[0].memory.identity}
+    has_other_outputs = len(outputs) > 1
+    if not is_only_chain_reported or outputs[-1] is not mode_outputs[0] or not has_other_outputs:
         return []
     modes = next(iter(chains.values())).modes
     return [Stack([_fix_mode(output, mode) for output in outputs[:-1]]) for mode in range(modes)]
@@ -121,7 +124,11 @@ def _fix_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
 
 
 def _list_known_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAffine]]:
-    """Return the combinations of error rates and choices of a link: (probability, link with these)."""
+    """Return a link as a mixture of links without random error rates or choices: pairs (probability, link).
+
+    A bit error rate of finite support is replaced by each of its values, and a choice of one of several links by each
+    of these. The links inside a link vary independently.
+    """
     if isinstance(link, Flips):
         atoms = link.error.list_atoms()
         return [(float(share), Flips(Constant(p), link.dimension, link.per_message)) for share, p in atoms]

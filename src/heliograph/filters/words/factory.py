@@ -30,7 +30,7 @@ from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rou
 
 
 class WordAlphabet(NamedTuple):
-    """The words of each component: the lowest (or any one), step and centre (m,); bits, 0 for words without end."""
+    """The codewords of each component: the lowest (or any one), step and centre (m,), bits (0 without end), dither."""
 
     low: np.ndarray
     step: np.ndarray
@@ -40,10 +40,9 @@ class WordAlphabet(NamedTuple):
 
 
 def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
-    """Return the words of an encoder, or of a sensor that reports multiples of its resolution.
+    """Return the codewords of an encoder, or those of a sensor that reports multiples of its resolution.
 
-    A word is a number that is rounded to steps and sent in bits. The words of a sensor's resolution have `bits` 0,
-    since their range has no end.
+    A codeword is a number that is rounded to steps and sent in bits. Multiples of a resolution have no end: `bits` 0.
     """
     m = len(sensor.outputs)
     rounded = find_rounded_noises(sensor)
@@ -60,7 +59,7 @@ def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
 
 
 def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
-    """Return the sensor with the noise that it has before it rounds."""
+    """Return the sensor with the noise that it has before it rounds: without the error of rounding."""
     if not isinstance(sensor.noise, RoundedNoise):
         return sensor
     unrounded = copy(sensor)
@@ -69,10 +68,9 @@ def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
 
 
 def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the second moments of the arriving words as numbers about their centres, averaged over modes.
+    """Return mean and covariance of gain and noise that arriving codewords have as numbers, averaged over modes.
 
-    A word is a number that is sent in bits, and its centre is the middle of the range. An output that tells a mode is
-    no word, and is left out. The moments are conditional on the words' arrival.
+    The numbers count from the centre of their range. An output that reports a mode is no codeword, and is left out.
     """
     word_links = [output for output in channel.in_parallel if not isinstance(output, ModeOutput)]
     link = word_links[0] if len(word_links) == 1 else Stack(word_links)
@@ -131,7 +129,7 @@ def word_filter(
     channel = perfect(len(first(sensor).outputs)) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states), late=True)
     refuse_angles("word filter", plant, sensor)
-    # The words, the component of y (or flag) at each output of the channel, and what the link does to bits.
+    # The codewords, the component of y (or FLAG) at each output of the channel, and what the link does to bits.
     words = _alphabet_of(first(sensor), encoder)
     places = find_carried_components(channel)
     links = at_each_step(make_link_of_bits, channel)
@@ -139,7 +137,7 @@ def word_filter(
     if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
-    # A dither that is taken off arrives with each word, behind what the channel delivers.
+    # A dither that is subtracted again is received with each codeword, after what the channel delivers.
     dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
     one_gaussian = WordFilter(
         plant=plant,

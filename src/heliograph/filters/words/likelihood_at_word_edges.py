@@ -37,10 +37,10 @@ POWERS = (
 
 
 class LikelihoodStep(NamedTuple):
-    """What a step of a likelihood from 0 to 1 at |t| = a adds to the sums, smoothed by a dither.
+    """What a likelihood L(t) that steps from 0 to 1 at t = a adds to sums over a standard normal t.
 
-    beyond: Q(a) = P(t' > a) of a standard normal t' plus dither; density: -Q'(a); slope: Q''(a), without dither
-    a phi(a).
+    beyond: E L = Q(a), the normal tail; density: E[t L] = -Q'(a) = phi(a); slope: E[t^2 L] - E L = Q''(a) = a phi(a).
+    A dither d that is added to t makes each of them its mean over d, as a function of a.
     """
 
     beyond: jax.Array
@@ -77,42 +77,53 @@ def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def step_without_dither(a: jax.Array, width: jax.Array) -> LikelihoodStep:
-    """Return a step without dither: Q, phi and a phi."""
+    """Return Q(a), phi(a) and a phi(a), for a likelihood that steps from 0 to 1 at a >= 0, if there is no dither.
+
+    `width`, that of the dither, is not used: all forms of a step have the same arguments.
+    """
     q, density = tail_and_density(a)
     return LikelihoodStep(q, density, a * density)
 
 
 def smooth_step_by_uniform(a: jax.Array, width: jax.Array) -> LikelihoodStep:
-    """Return a likelihood that rises from 0 to 1 at a, smoothed by a uniform dither of width D.
+    """Return the means of Q, phi and a phi over a uniform dither of width D about a, for a step of a likelihood at a.
 
-    t is standard normal, with the tail Q and the density phi. The moments of a smoothed step are differences between
-    a - D / 2 and a + D / 2, divided by D, of I(a) = E max(t - a, 0) = phi(a) - a Q(a), of Q and of phi.
+    Q is the normal tail and phi the density. The mean of f over [a - D/2, a + D/2] is (F(a + D/2) - F(a - D/2)) / D
+    with F' = f. With E_1(a) = E max(t - a, 0) = phi(a) - a Q(a) for a standard normal t, these are
+
+        Q(a) = -E_1'(a),    phi(a) = -Q'(a),    a phi(a) = -phi'(a)
     """
     low, high = a - width / 2, a + width / 2
     (q_low, p_low), (q_high, p_high) = (signed_tail_and_density(x) for x in (low, high))
     return LikelihoodStep(
-        beyond=(p_low - low * q_low - p_high + high * q_high) / width,
+        beyond=(p_low - low * q_low - p_high + high * q_high) / width,  # (E_1(low) - E_1(high)) / D
         density=(q_low - q_high) / width,
         slope=(p_low - p_high) / width,
     )
 
 
 def smooth_step_by_triangle(a: jax.Array, width: jax.Array) -> LikelihoodStep:
-    """Return a step by a triangular dither: second differences of E((t - a)+)^2 / 2 = ((1 + a^2) Q - a phi)/2, I, Q."""
-    tails, squares, means = [], [], []
+    """Return the means of Q, phi and a phi over a triangular dither about a, for a step of a likelihood at a.
+
+    Q is the normal tail and phi the density. The dither, on [-D, D], is a sum of two uniform ones of width D. So the
+    mean of f is the second difference (F(a - D) - 2 F(a) + F(a + D)) / D^2 with F'' = f. For a standard normal t,
+
+        E_1(a) = E max(t - a, 0)       = phi(a) - a Q(a)
+        E_2(a) = E max(t - a, 0)^2 / 2 = ((1 + a^2) Q(a) - a phi(a)) / 2
+        Q(a) = E_2''(a),    phi(a) = E_1''(a),    a phi(a) = Q''(a)
+    """
+    Q, E_1, E_2 = [], [], []
     for x in (a - width, a, a + width):
         q, p = signed_tail_and_density(x)
-        tails.append(q)
-        means.append(p - x * q)  # I(x)
-        squares.append(((1 + x * x) * q - x * p) / 2)
+        Q.append(q)
+        E_1.append(p - x * q)
+        E_2.append(((1 + x * x) * q - x * p) / 2)
 
     def second_difference(values: list[jax.Array]) -> jax.Array:
-        """Return (f(a - D) - 2 f(a) + f(a + D)) / D^2."""
+        """Return (F(a - D) - 2 F(a) + F(a + D)) / D^2, from the three values of F."""
         return (values[0] - 2 * values[1] + values[2]) / width**2
 
-    return LikelihoodStep(
-        beyond=second_difference(squares), density=second_difference(means), slope=second_difference(tails)
-    )
+    return LikelihoodStep(beyond=second_difference(E_2), density=second_difference(E_1), slope=second_difference(Q))
 
 
 SMOOTH: dict[str, Smooth] = {

@@ -35,18 +35,19 @@ MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 
 class LinearWordsFilter(AbstractWrapper):
-    """A linear filter of the numbers z = q' - c - E[g] d, with q' the received words and d the dithers to take off.
+    """A linear filter of the numbers z = q - c - E[g] d, for received codewords q with centre c, and dithers d.
 
-    Of a number that is no word nothing is taken, nor of words whose dither is to be taken off by a mode that nobody
-    told.
+    A dither d was added before rounding, and is subtracted with the mean gain E[g] of the link. If E[g] depends on a
+    mode that is not reported, z is NaN.
 
     Args:
         base: the filter of z.
-        centres: c of each output of the channel, 0 of a flag.
-        gains: E[g] of each word whose dither is taken off, of each mode that is told (modes, words); none without.
-        words: outputs that are words.
-        flag: output at which the mode is told on which gains depend; None without one.
-        overload: of the words, before any data.
+        centres: c of each output of the channel; 0 for an output that reports a mode.
+        gains: E[g] of each codeword with a dither, in each mode (modes, words), one row without modes; (1, 0) without
+            dithers that are subtracted.
+        words: outputs that are codewords.
+        flag: output that reports the mode on which E[g] depends; None without one.
+        overload: how often codewords overload before any data.
     """
 
     base: AbstractFilter
@@ -58,28 +59,28 @@ class LinearWordsFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the words that arrived, as numbers.
+        """Correct with the codewords that arrived, as numbers less their centres and dithers.
 
-        The received row has the words and then their dithers, which are known numbers.
+        z: the codewords, and then their dithers, which are known numbers.
         """
         numbers = self._convert_words_to_numbers(jnp.asarray(z))
-        after, innovation = self.base.correct(state, numbers, k)
-        # Dithers have no innovation.
+        corrected, innovation = self.base.correct(state, numbers, k)
+        # Dithers are given, so that they have no innovation.
         dithers = self.received - len(self.centres)
         value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(dithers, jnp.nan)])
         covariance = jnp.pad(innovation.covariance, ((0, dithers), (0, dithers)), constant_values=jnp.nan)
-        return after, Innovation(value, covariance, innovation.log_likelihood)
+        return corrected, Innovation(value, covariance, innovation.log_likelihood)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the numbers."""
         return self.base.smoother_step(step._replace(z=self._convert_words_to_numbers(jnp.asarray(step.z))))
 
     def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
-        """Return q - c - E[g] d of the received words q and dithers d, with E[g] of the mode that was told.
+        """Return q - c - E[g] d for the received codewords q, their centres c and dithers d.
 
-        c are the words' centres. A dither was added before rounding, so the mean gain times the dither is subtracted.
-        `self.flag` is the index of the number that tells the mode, or None without modes. If that number is NaN, the
-        result of dithered words is NaN.
+        A dither was added before rounding, so the link's mean gain E[g] times the dither is subtracted. `self.flag` is
+        the index of the number that reports the mode on which E[g] depends, or None without modes. If that number is
+        NaN, the result is NaN.
         """
         about_centres = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
@@ -98,7 +99,7 @@ class LinearWordsFilter(AbstractWrapper):
 def build_behind_words(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, encoder: Words, make: MakeFilter
 ) -> LinearWordsFilter:
-    """Return a linear filter of words, which is one of the numbers that they stand for about the centres of the range.
+    """Return a linear filter of codewords: a filter of the numbers that they stand for, less the centres of the range.
 
     Args:
         plant: a linear plant.
@@ -117,23 +118,23 @@ def build_behind_words(
     instance("encoder", encoder, Words, "Words").check_outputs(outputs)
     check_sent(first(sensor), first(channel))
     places, numbers = find_carried_components(channel), rewrite_about_centres(encoder, channel)
-    # Laws of the words as numbers: of each mode where modes arrive with them, of each step else.
-    told_modes = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
-    laws = [first(law) for law in told_modes or unstack(numbers)]
-    # Whether the words' gain as numbers is random, given the mode where it is told: as where bits flip.
+    # The channel of codewords as numbers, z = G (y - c) + n: in each mode if modes are reported, else at each step.
+    channel_by_mode = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    channels = [first(link) for link in channel_by_mode or unstack(numbers)]
+    # Whether G is random given the reported mode, as it is if bits flip.
     remembers = first(channel).remembers
-    fades = (remembers and not told_modes) or any(has_random_gain(law, second_order(law)) for law in laws)
+    fades = (remembers and not channel_by_mode) or any(has_random_gain(link, second_order(link)) for link in channels)
     _check_rounding(sensor, encoder, remembers and fades)
-    # The sensor of y - c with rounding, and the filter of numbers behind it.
     # Whether the rounding of a Gaussian y is described exactly; filters of modes, and of past signals, use bounds.
     gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers
-    rounded = at_each_step(lambda of_step: _add_rounding_noise(of_step, encoder, gaussian, fades), sensor)
+    # The sensor of y - c with rounding, and the filter of numbers behind it.
+    rounded = at_each_step(lambda sensor: _add_rounding_noise(sensor, encoder, gaussian, fades), sensor)
     base = make(plant, rounded, numbers)
     overload = bound_overload(plant, rounded, numbers, encoder, places)
     refuse_overload(overload)
     words = tuple(i for i, place in enumerate(places) if place != FLAG)  # rows of z that are words
     centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
-    gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
+    gains = _gains_by_mode(channels if channel_by_mode else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
     claim_of_delay: Claim = "upper" if first(channel).past else "exact"
     claim = weakest([lower_claim_by_noise(base.claim, rounded), claim_of_delay, _claim_despite_overload(overload)])
@@ -142,7 +143,7 @@ def build_behind_words(
         centres=centres,
         gains=gains,
         words=words,
-        flag=len(places) - 1 if told_modes else None,
+        flag=len(places) - 1 if channel_by_mode else None,
         overload=overload,
         **make_sizes(claim, start, len(places) + gains.shape[1]),
     )
@@ -168,10 +169,14 @@ def _claim_despite_overload(overload: Overload) -> Claim:
 
 
 def _add_rounding_noise(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
-    """Return the sensor with the error of rounding y to words as a part of its noise, about the words' centre.
+    """Return the sensor of y - c, with the error of rounding y to codewords as a part of its noise, c their centre.
 
-    If `gaussian`, y is Gaussian, and the error's variance is known and not only bounded. If `matters`, the error's
-    second moment enters the claim, as it does behind a random gain.
+    Args:
+        sensor: of y.
+        encoder: rounds y to codewords.
+        gaussian: True if y is Gaussian before any data. The variance of the error is then known, else only bounded.
+        matters: True behind a random gain g. The error of g (y + e) then depends on E[(y + e)^2], so that the claim on
+            the filter's covariance holds only if the second moment of the rounded signal is right too.
     """
     m = len(sensor.outputs)
     step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
@@ -188,7 +193,10 @@ def _add_rounding_noise(sensor: LinearSensor, encoder: Words, gaussian: bool, ma
 
 
 def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
-    """Return the mean gain of each word in each mode, (modes, words)."""
+    """Return the mean gain E[g] of each codeword in each mode (modes, words).
+
+    `laws`: the channel of the numbers that codewords stand for, in each mode; `words`: outputs that are codewords.
+    """
     return np.stack([_mean_gains(law)[list(words)] for law in laws])
 
 

@@ -23,11 +23,15 @@ Carried = tuple[
 
 
 def sum_merged_words(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
-    """Return the sums over cells of 2^b fine words, an eighth to a quarter of a deviation wide, without the overloads.
+    """Return M = E L, E[t L] and E[t^2 L] over codewords far finer than the deviation of y, t = (y - mean) / deviation.
 
-    D is the step between words, l_0 and l_1 the likelihoods of a zero and a one of a bit. Within a merged cell the b
-    low bits say that y is about mu with a variance v, taken for a Gaussian as the prior is: with pi = l_1 / (l_0 +
-    l_1) of low bit j, mu = first word + D sum 2^j pi and v = D^2 (sum 4^j pi (1 - pi) + 1/12).
+    2^b neighbouring codewords, which differ in their b low bits, are taken together as a cell, an eighth to a quarter
+    of a deviation wide. In it the likelihood of the low bits is taken for a Gaussian of y: with the step D between
+    codewords, and pi_j = l_1 / (l_0 + l_1) from the likelihoods of low bit j, it has the mean and variance
+
+        mu = first codeword + D sum_j 2^j pi_j,    v = D^2 (sum_j 4^j pi_j (1 - pi_j) + 1/12)
+
+    y beyond the range is not in these sums.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit, (bits, 2).
@@ -77,12 +81,15 @@ def sum_merged_words(pairs: jax.Array, received: jax.Array, grid: WordGrid, prio
 def _sum_blocks(
     pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax.Array, wide: jax.Array
 ) -> LikelihoodSums:
-    """Return the sums over cells of likelihood times e^(-a^2 / (2 wide)), of that times a, and times a^2.
+    """Return the sums over cells of q = likelihood e^(-a^2 / (2 v)), of q a and of q a^2.
 
     a is the distance of a cell from the prior's mean, w the width of a cell, both in the prior's deviations, v =
-    `wide`. Of cell j of a block whose first is at a, e^(-(a + j w)^2 / (2 v)) is e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2
-    v)) with r = e^(-a w / v): a polynomial in r with the same coefficients in all blocks. From block to block, J cells
-    on, the first factor changes by r^J e^(-(J w)^2 / (2 v)), and r by e^(-J w^2 / v).
+    `wide`. For cell j of a block whose first cell is at a, with r = e^(-a w / v),
+
+        e^(-(a + j w)^2 / (2 v)) = e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2 v))
+
+    So the sum over a block is a polynomial in r, with the same coefficients in all blocks. From block to block, J cells
+    on, e^(-a^2 / (2 v)) changes by the factor r^J e^(-(J w)^2 / (2 v)), and r by e^(-J w^2 / v).
 
     Args:
         pairs: likelihoods of a zero and a one of each bit of the cells' numbers (bits, 2).
@@ -98,23 +105,23 @@ def _sum_blocks(
         bell.append(bell[-1] * next_factor)
         next_factor = next_factor * factor**2
     # Coefficients of the polynomials (cells of a block, 3): of likelihood, and times j and j^2.
-    places = np.arange(2.0**MERGED)
+    cell_number = np.arange(2.0**MERGED)
     table = tabulate_likelihoods(pairs[:MERGED]) * jnp.stack(bell)
-    coefficients = jnp.stack([table, table * places, table * places**2], axis=1)
+    coefficients = jnp.stack([table, table * cell_number, table * cell_number**2], axis=1)
     bell_of_next_block = bell[-1] * next_factor  # e^(-(J w)^2 / (2 v))
     ratio_change = jnp.exp(-(2**MERGED) * width**2 / wide)  # of r, from block to block
 
     def add_block(carried: Carried, block: jax.Array) -> tuple[Carried, None]:
-        """Add one block: three polynomials in r by Horner's rule, and their terms about the block's first cell.
+        """Add the sums over one block to those in `carried`, with e^(-a^2 / (2 v)), r and a of its first cell.
 
-        Closed over: `coefficients` of the polynomials by cell of a block (2^MERGED cells), `pairs` the likelihoods of
-        bits, `number` of the first block, `width` w of a cell; r is `ratio`, v the variance of prior and cell together.
+        Cell j is at a + j w. The polynomials in r, by Horner's rule, are the sums of q, q j and q j^2.
         """
         sums, density, ratio, a = carried
         polynomials = coefficients[-1]
         for cell in range(2**MERGED - 2, -1, -1):
             polynomials = polynomials * ratio + coefficients[cell]
-        # Times e^(-a^2 / (2 v)) and the likelihood of the bits above; cell j is at a + j w.
+        # Times e^(-a^2 / (2 v)) and the likelihood of the block's high bits. Then q times a + j w, and times its
+        # square.
         polynomials = polynomials * (density * multiply_bits(pairs[MERGED:], number + block))
         mass, first, second = polynomials[0], polynomials[1] * width, polynomials[2] * width**2
         sums = sums.plus(LikelihoodSums(mass, a * mass + first, a * (a * mass + 2 * first) + second))
@@ -145,15 +152,17 @@ def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
 
 
 def sum_overloads(pair: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
-    """Return the sums over y beyond both ends of the range, where all bits are zeros or ones.
+    """Return M = E L, E[t L] and E[t^2 L] over y beyond both ends of the range, for t = (y - mean) / deviation.
 
-    `pair` (bits, 2) holds the likelihoods of each bit's 0 and 1. t is (y - mean) / deviation. An overload begins half a
-    step beyond an end of the range.
+    There the likelihood L is constant: all bits of the codeword are zeros below the range, and ones above it. `pair`
+    (bits, 2) holds the likelihoods of each bit's 0 and 1.
     """
     ends = jnp.array([0.0, 2.0**grid.bits - 1])
     outwards = jnp.array([-1.0, 1.0])
+    # y is beyond the range from half a step beyond the last codeword on.
     t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation
     a, likelihood = t * outwards, jnp.prod(pair, axis=0)
+    # For t > a: E 1 = Q(a), E t = phi(a), E t^2 = Q(a) + a phi(a); for t < -a, E t has the other sign.
     tail, phi = signed_tail_and_density(a)
     mass, density = likelihood * tail, likelihood * phi
-    return LikelihoodSums(jnp.sum(mass), jnp.sum(outwards * density), jnp.sum(mass + a * density))
+    return LikelihoodSums(mass=jnp.sum(mass), first=jnp.sum(outwards * density), second=jnp.sum(mass + a * density))

@@ -36,7 +36,10 @@ class Motion(NamedTuple):
 
 
 class Sensing(NamedTuple):
-    """What is sent of x: y - c = matrix x + shift + v, `covariance` = Cov v, `rounding` that of the words' error."""
+    """The signal that is sent: y - c = matrix x + shift + v, about the centre c of the codewords.
+
+    `covariance` = Cov v, `rounding`: covariance of the error of rounding y to a codeword.
+    """
 
     matrix: np.ndarray
     shift: np.ndarray
@@ -56,17 +59,18 @@ class Overload(NamedTuple):
     bound: Float[np.ndarray, ""]
 
     def describe(self, node: str, filter: str) -> str:
-        """Return a line that says how often words are overloaded, and what that may do to the claim of a filter.
+        """Return a text that says how often codewords are overloaded, and how much a filter's error may differ for it.
 
-        A word is overloaded if its number lies beyond the range. `self.bound` bounds its effect, as a share of the rms
-        error.
+        A codeword is overloaded if the number that it stands for lies beyond the encoder's range, so that the nearest
+        number in the range is sent. `self.bound` bounds the change of the rms error, relative to the rms error that the
+        filter claims.
 
         Args:
             node: name of the sender's node.
             filter: name of the filter.
         """
-        share, bound = float(np.max(self.probability)), float(self.bound)
-        frequency = f"words of node {node!r} are overloaded in at most {share:.2g} of the steps"
+        probability, bound = float(np.max(self.probability)), float(self.bound)
+        frequency = f"words of node {node!r} are overloaded in at most {probability:.2g} of the steps"
         if not np.isfinite(bound):
             return f"{frequency}, what that does to the claim of filter {filter!r} is not bounded"
         error = f"the rms error of filter {filter!r} differs from its claim by at most {100 * bound:.2g}% for it"
@@ -76,13 +80,20 @@ class Overload(NamedTuple):
 def bound_overload(
     plant: AnyPlant, sensor: AnySensor, numbers: Channel, encoder: Words, places: tuple[int, ...]
 ) -> Overload:
-    """Return how often words overload, and a bound on what that does to a linear filter.
+    """Return how often codewords overload, and a bound on what that does to the rms error of a linear filter.
 
-    The difference of the rms errors is at most
+    y - c + d (c the centre of the codewords, d the dither) is rounded to steps D in the range [-a, a]. If it lies
+    between a + (m - 1/2) D and a + (m + 1/2) D, the end of the range is sent, with an error e = m D beside that of
+    rounding. So
 
-        sum_j |((I - K H) A)^j K| sqrt(E g^2) D sqrt(sum_{m >= 1} (2m - 1) P(|y + d - c| > a + (m - 1/2) D))
+        E e^2 = D^2 sum_{m >= 1} (2m - 1) P(|y - c + d| > a + (m - 1/2) D)
 
-    (Minkowski's inequality), with y Gaussian of the moments before any data and inputs zero, d averaged over.
+    since m^2 is the sum of the first m odd numbers. The link's gain g multiplies e, the filter's gain K adds it to the
+    estimate, and (I - K H) A takes it to the next step. By Minkowski's inequality the rms error changes by at most
+
+        sum_j |((I - K H) A)^j K| sqrt(E g^2) sqrt(E e^2)
+
+    y is taken for Gaussian, with its moments before any data and inputs zero.
 
     Args:
         plant: linear.
@@ -98,12 +109,14 @@ def bound_overload(
     step, half = encoder.each(encoder.step, outputs), encoder.each(encoder.high - encoder.low, outputs) / 2
     links = None if no_bound else _list_links(numbers, horizon)
     system, signals = _describe_system(plant, sensor, links, horizon)
-    tails = np.array([_count_beyond(mean, variance, half, step, encoder.dither) for mean, variance in signals])
+    # P(|y - c + d| > a + (m - 1/2) D) [k, m - 1, output]; m = 1 is an overload.
+    tails = np.array([_find_tails(mean, variance, half, step, encoder.dither) for mean, variance in signals])
     probability = tails[:, 0].max(axis=0)
-    excess = step * np.sqrt(np.sum((2 * np.arange(1, BEYOND + 1)[:, None] - 1) * tails, axis=1))
+    odd_numbers = 2 * np.arange(1, BEYOND + 1)[:, None] - 1
+    rms_excess = step * np.sqrt(np.sum(odd_numbers * tails, axis=1))  # sqrt(E e^2) [k, output]
     if links is None or system is None:
         return Overload(probability, np.asarray(0.0 if probability.max() < RARE else np.nan))
-    return Overload(probability, np.asarray(_bound_error(system, excess, links, places)))
+    return Overload(probability, np.asarray(_bound_error(system, rms_excess, links, places)))
 
 
 RARE = 1e-9  # probability below which an overload is left out, behind links of which the bound is not known
@@ -112,26 +125,32 @@ RARE = 1e-9  # probability below which an overload is left out, behind links of 
 def _describe_system(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, horizon: int
 ) -> tuple[LinearSystem | None, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return plant, sensor and links, where given, as a linear system, and mean and variance of y - c at each step."""
+    """Return plant, sensor and links as a linear system, and mean and variance of y - c at each of `horizon` steps.
+
+    y is the sensor's signal before any data, with inputs zero, and c the centre of the codewords. Without `links`
+    (None) there is no system.
+    """
     start = at(plant, k=0)
-    mean, covariance = np.asarray(start.initial_mean), np.asarray(start.initial_covariance)
-    x, spread = mean, covariance
-    parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
+    initial_mean, initial_covariance = np.asarray(start.initial_mean), np.asarray(start.initial_covariance)
+    mean, P = initial_mean, initial_covariance
+    steps, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     for k in range(horizon):
         motion, sensing, link = _find_models_of_step(plant, sensor, links, k)
-        x, spread = motion.matrix @ x + motion.shift, motion.matrix @ spread @ motion.matrix.T + motion.covariance
-        y, explained = sensing.matrix @ x + sensing.shift, sensing.matrix @ spread @ sensing.matrix.T
-        signals.append((y, np.diag(explained + sensing.covariance)))
+        # E x+ = A E x + b, P+ = A P A' + Q; E(y - c) = C E x + shift, Cov y = C P C' + Cov v.
+        mean, P = motion.matrix @ mean + motion.shift, motion.matrix @ P @ motion.matrix.T + motion.covariance
+        y, CPC = sensing.matrix @ mean + sensing.shift, sensing.matrix @ P @ sensing.matrix.T
+        signals.append((y, np.diag(CPC + sensing.covariance)))
         if link is not None:
-            second = explained + sensing.covariance + sensing.rounding + np.outer(y, y)
-            parts.append(_describe_step(motion, sensing, link, y, second))
-    stacked = Steps(*(np.array(field) for field in zip(*parts, strict=True))) if parts else None
-    system = None if stacked is None else LinearSystem(stacked, mean, covariance, np.eye(len(mean)))
+            second_moment = CPC + sensing.covariance + sensing.rounding + np.outer(y, y)
+            steps.append(_describe_step(motion, sensing, link, y, second_moment))
+    stacked = Steps(*(np.array(field) for field in zip(*steps, strict=True))) if steps else None
+    n = len(initial_mean)
+    system = None if stacked is None else LinearSystem(stacked, initial_mean, initial_covariance, np.eye(n))
     return system, signals
 
 
 def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
-    """Return the second moments of the channel at each step."""
+    """Return mean and covariance of gain and noise of the channel at each step."""
     links = [second_order(link) for link in unstack(numbers)]
     return links if len(links) > 1 else links * horizon
 
@@ -180,13 +199,16 @@ def _find_sensing(sensor: LinearSensor) -> Sensing:
 
 
 def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np.ndarray, second: np.ndarray) -> Steps:
-    """Return one step of the linear system; a random gain acts as a noise, by the moments of what is sent.
+    """Return one step of the linear system x+ = A x + b + w, z = E[G] (y - c) + E n + noise.
 
-    `mean` (outputs,) and `second` (outputs, outputs): E and E[.. ..'] of y - c with the error of rounding.
+    The signal is y - c = C x + shift + v about the centre c of the codewords, r the error of rounding it, and the link
+    is z = G s + n for s = y - c + r. `mean` (outputs,) and `second` (outputs, outputs) are E s and E[s s'] before any
+    data.
     """
-    # Second moments of (y - c, 1).
-    moments = np.block([[second, mean[:, None]], [mean[None], np.ones((1, 1))]])
-    gain, spread = np.asarray(link.mean_gain), np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
+    # A random gain acts as noise: Cov noise = E[G] Cov(v + r) E[G]' + Cov n + sum_kl Cov(G_ik, G_jl) E[(s, 1)(s,
+    # 1)']_kl.
+    moments = np.block([[second, mean[:, None]], [mean[None], np.ones((1, 1))]])  # E[(s, 1)(s, 1)']
+    gain, gain_noise = np.asarray(link.mean_gain), np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
     columns = np.asarray(link.noise.matrix)
     covariance = sensing.covariance + sensing.rounding
     noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T
@@ -196,54 +218,75 @@ def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np
         process=motion.covariance,
         output=gain @ sensing.matrix,
         offset=gain @ sensing.shift + np.asarray(link.offset),
-        noise=noise + spread,
+        noise=noise + gain_noise,
     )
 
 
-def _count_beyond(
+def _find_tails(
     mean: np.ndarray, variance: np.ndarray, half: np.ndarray, step: np.ndarray, dither: str
 ) -> Float[np.ndarray, "beyond outputs"]:
-    """Return P(|y + d - c| > a + (m - 1/2) D), m = 1, 2, ..., of a Gaussian y - c, averaged over the dither d.
+    """Return P(|y - c + d| > a + (m - 1/2) D), m = 1, ..., BEYOND (40), for a Gaussian y - c and the dither d.
 
-    `mean`, `variance`: of y - c (outputs,); `half`: a; `step`: D.
+    y is the signal, c the centre of the codewords, and [c - a, c + a] their range. The mean over d is a sum over nodes
+    of Gauss-Legendre quadrature.
+
+    Args:
+        mean: of y - c (outputs,).
+        variance: of y - c (outputs,).
+        half: a.
+        step: D.
+        dither: kind of the encoder's dither.
     """
     ends = half + (np.arange(1, BEYOND + 1)[:, None] - 0.5) * step
     deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+    # Nodes of d / D, and their probabilities. NODES lie in [-1, 1], with WEIGHTS that sum to 2.
     if dither == "none":
-        shifts, shares = np.zeros(1), np.ones(1)
-    elif dither == "triangular":  # density (1 - |v|) / D of d = D v
-        shifts = np.concatenate([(NODES - 1) / 2, (NODES + 1) / 2])
-        shares = np.concatenate([WEIGHTS, WEIGHTS]) / 2 * (1 - np.abs(shifts))
-    else:
-        shifts, shares = NODES / 2, WEIGHTS / 2
+        nodes, probabilities = np.zeros(1), np.ones(1)
+    elif dither == "triangular":  # density 1 - |v| of v = d / D on [-1, 0] and on [0, 1]
+        nodes = np.concatenate([(NODES - 1) / 2, (NODES + 1) / 2])
+        probabilities = np.concatenate([WEIGHTS, WEIGHTS]) / 2 * (1 - np.abs(nodes))
+    else:  # uniform on [-1/2, 1/2]
+        nodes, probabilities = NODES / 2, WEIGHTS / 2
     total: np.ndarray = np.zeros_like(ends)
-    for shift, share in zip(shifts, shares, strict=True):
-        centre = mean + shift * step
-        below, above = ((side * centre - ends) / deviation for side in (1, -1))
-        total += share * (scipy.special.ndtr(below) + scipy.special.ndtr(above))
+    for node, probability in zip(nodes, probabilities, strict=True):
+        shifted_mean = mean + node * step
+        above, below = ((side * shifted_mean - ends) / deviation for side in (1, -1))
+        total += probability * (scipy.special.ndtr(above) + scipy.special.ndtr(below))
     return total
 
 
 def _bound_error(
-    system: LinearSystem, excess: Float[np.ndarray, "steps outputs"], links: list[SecondOrder], places: tuple[int, ...]
+    system: LinearSystem,
+    rms_excess: Float[np.ndarray, "steps outputs"],
+    links: list[SecondOrder],
+    places: tuple[int, ...],
 ) -> float:
-    """Return the bound of the error relative to the rms, the largest over states and steps.
+    """Return a bound on the change of the rms error by overloads, relative to the rms error that the filter claims.
 
-    `excess`: D sqrt(sum_m (2m - 1) P(...)) of each component at each step.
+    It is the largest over states i and steps k of sum_j |((I - K H) A)^j K s|_i / sqrt(P_ii), over overloads j steps
+    ago, where P is the filter's covariance and s the rms of what an overload adds to z at each output.
+
+    Args:
+        system: plant, sensor and links.
+        rms_excess: rms of the steps by which a codeword misses the signal beyond the range, at each step k.
+        links: moments of the channel at each step.
+        places: component of each output of the channel.
     """
     gains = lmmse(system).gains
-    worst, n = 0.0, system.mean.size
-    terms = np.zeros((0, n, len(places)))  # ((I - K H) A)^j K e of each output, one row for each j
+    largest, n = 0.0, system.mean.size
+    terms = np.zeros((0, n, len(places)))  # ((I - K H) A)^j K s, a row of (n, outputs) for each j
     for k in range(system.horizon):
-        power = np.asarray(links[k].power.center)
-        root_power = np.sqrt(np.maximum(np.einsum("iikk->i", power[..., :-1, :-1]), 0.0))  # sqrt(E g^2)
-        newest = gains.gain[k] * (root_power * excess[k][list(places)])
-        # Terms that have become rounding are left out.
-        counts = np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(newest).max()
-        terms = np.concatenate([gains.transition[k] @ terms[counts], newest[None]])
-        rms, most = np.sqrt(np.diag(gains.covariance[k])), np.abs(terms).sum(axis=(0, 2))
-        worst = max(worst, float(np.max(np.divide(most, rms, out=np.zeros(n), where=rms > 0))))
-    return worst
+        # s = sqrt(E g^2) (rms excess), with the link's gain g at each output.
+        second_moment = np.asarray(links[k].power.center)
+        rms_gain = np.sqrt(np.maximum(np.einsum("iikk->i", second_moment[..., :-1, :-1]), 0.0))
+        newest = gains.gain[k] * (rms_gain * rms_excess[k][list(places)])
+        # Earlier terms move by (I - K H) A. Those that have become rounding are left out.
+        is_used = np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(newest).max()
+        terms = np.concatenate([gains.transition[k] @ terms[is_used], newest[None]])
+        claimed_rms, bound = np.sqrt(np.diag(gains.covariance[k])), np.abs(terms).sum(axis=(0, 2))
+        relative = np.divide(bound, claimed_rms, out=np.zeros(n), where=claimed_rms > 0)
+        largest = max(largest, float(np.max(relative)))
+    return largest
 
 
 def refuse_overload(overload: Overload) -> None:

@@ -41,13 +41,13 @@ class Hypotheses(NamedTuple):
 
 
 class TwoHypothesesFilter(AbstractSizedFilter):
-    """The law of the state as a mixture of two Gaussians, by whether the last words were right in their leading bits.
+    """The law of the state as two Gaussians: the last message's codewords were right in their leading bits, or not.
 
-    A word that disagrees with the prior was flipped, or the prior is wrong, as after a flip that was believed. One
-    Gaussian of these two far places forgets the less probable one: its tail there is less than any probability of a
-    flip, and words from there look like flips on and on. Here either law is conditioned on either answer, with
-    the moments of `WordFilter`, and laws of the same answer are merged by their moments, so that mean and covariance
-    are those of the four. Of several words in a message, all are right or not.
+    A codeword far from the prior had a bit flipped, or the prior is wrong, as after a flip that was taken for true. One
+    Gaussian would forget the less probable place: its tail there is smaller than the probability of a flip, so that all
+    later codewords from there look flipped. Here each Gaussian is conditioned on a codeword with its leading bits
+    right, and with them not right. Of these four the two of the same answer are merged by their moments, which leaves
+    the mean and covariance of the whole. "Right" stands for all codewords of a message.
 
     Args:
         base: the filter with one Gaussian, whose moments are used.
@@ -61,7 +61,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """Always True: a number that is no word is excluded."""
+        """Always True: codewords are finitely many or discrete, so likelihood 0 says that the model excludes z."""
         return True
 
     @compile_on_call
@@ -72,7 +72,10 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Hypotheses, u: ArrayLike = (), k: Step = 0) -> Hypotheses:
-        """Predict the Gaussians of both hypotheses: that the last words were right in their leading bits, or not."""
+        """Predict the Gaussians of both hypotheses: the last message's leading bits were all right, or not.
+
+        The hypotheses keep their probabilities.
+        """
         plant, initial_power = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
         u = jnp.asarray(u)
         predicted = jax.vmap(lambda x: predict_gaussian(plant, self.base.transform, x, u, initial_power))(state.parts)
@@ -80,31 +83,31 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Hypotheses, z: ArrayLike, k: Step = 0) -> tuple[Hypotheses, Innovation]:
-        """Correct with the words that arrived, one component of y after another."""
+        """Correct with the codewords that arrived, one component of y after another.
+
+        Each one splits both hypotheses, by whether its leading bits are right, and merges the four Gaussians to two.
+        """
         base, z, n = self.base, jnp.asarray(z), len(self.states)
         words = base.identify_received_words(z, at(base.links, k))
 
         def append_measured(x: Gaussian) -> Gaussian:
-            """Return the joint law of the state x and the signal that is measured, under one hypothesis.
-
-            A hypothesis says that the last words were right in their leading bits, or that they were not. `base` is the
-            filter of one Gaussian, and k the step.
-            """
+            """Return the joint Gaussian of the state x and the signal that is measured, under one hypothesis."""
             signal = base.predict_signal(x, k)
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
             return append_rows(x, signal.mean, signal.slopes, noise)
 
         joint = Hypotheses(jax.vmap(append_measured)(state.parts), state.weights)
-        begun, total = jnp.asarray(False), jnp.zeros(())
+        some_word_was_used, log_likelihood = jnp.asarray(False), jnp.zeros(())
         for i in range(len(base.low)):
-            joint, mass = self._split_and_merge(joint, i, words, begun)
-            total = total + jnp.where(words.present[i], jnp.log(mass), 0.0)
-            begun = begun | words.present[i]
-        total = jnp.where(words.are_words, total, -jnp.inf)
-        after = joint._replace(parts=take_leading(joint.parts, n))
-        # The innovation is about what was expected by both hypotheses together, before the words.
+            joint, probability = self._split_and_merge(joint, i, words, some_word_was_used)
+            log_likelihood = log_likelihood + jnp.where(words.present[i], jnp.log(probability), 0.0)
+            some_word_was_used = some_word_was_used | words.present[i]
+        # A received number that is no codeword is impossible.
+        log_likelihood = jnp.where(words.are_words, log_likelihood, -jnp.inf)
+        corrected = joint._replace(parts=take_leading(joint.parts, n))
+        # The innovation is z less what both hypotheses together expected.
         signal = base.predict_signal(_merge_hypotheses(state), k)
-        return after, base.compute_innovation(signal, words, z, at(base.numbers, k), total)
+        return corrected, base.compute_innovation(signal, words, z, at(base.numbers, k), log_likelihood)
 
     @estimates
     def estimate(self, state: Hypotheses) -> Estimate:
@@ -117,66 +120,68 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self.base, step.map_states(_merge_hypotheses), self.base)
 
     def _split_by_answer(self, hypothesis: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
-        """Condition one hypothesis on word i, and on each answer to the question whether its leading bits are right.
+        """Condition one Gaussian of (x, y) on codeword i in two cases: its LEADING (3) highest bits are right, or not.
 
-        A hypothesis says that the last words were right, or that they were not. Returns the hypothesis given each
-        answer (yes, no) (2, ...), and the probabilities of word and answer (2,). There are LEADING (3) leading bits. An
-        answer with a share of the probability below SURE, 1e-10, counts as impossible. `row` is that of y_i in the root
-        of the law of state and signal.
+        Returns the Gaussians in both cases (2, ...), and the probabilities of codeword and case (2,).
         """
-        row = hypothesis.root[len(self.states) + i]
+        row = hypothesis.root[len(self.states) + i]  # y_i = prior.mean + row xi
         prior = self.base.find_signal_prior(hypothesis, i)
+        # log P(codeword, case), and for y_i = mean + deviation t: E t, and Var y_i over its prior variance.
         effect = self.base.condition_by_leading_bits(i, words, prior, LEADING)
-        mass = jnp.exp(effect.log_mass)
-        is_possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
+        probability = jnp.exp(effect.log_mass)
+        # A difference of sums may be mere rounding: a case with less than SURE of the probability is impossible.
+        is_possible = (probability > SURE * jnp.sum(probability)) & (prior.deviation > 0)
 
         def impose(is_possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-            """Return the hypothesis with these moments of y_i, or unchanged if the answer is impossible."""
+            """Return the Gaussian in which y_i has the moments of one case, or unchanged if the case is impossible."""
             shift, ratio = jnp.where(is_possible, shift, 0.0), jnp.where(is_possible, ratio, 1.0)
             return impose_moments_of_combination(hypothesis, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
 
-        return jax.vmap(impose)(is_possible, effect.shift, effect.ratio), jnp.where(is_possible, mass, 0.0)
+        conditioned = jax.vmap(impose)(is_possible, effect.shift, effect.ratio)
+        return conditioned, jnp.where(is_possible, probability, 0.0)
 
     def _split_and_merge(
-        self, joint: Hypotheses, i: int, words: ReceivedWords, begun: jax.Array
+        self, joint: Hypotheses, i: int, words: ReceivedWords, some_word_was_used: jax.Array
     ) -> tuple[Hypotheses, jax.Array]:
-        """Condition both hypotheses on word i and on whether it was right; merge the four by whether all words were.
+        """Condition both hypotheses on codeword i being right, or not; merge the four by whether all words were right.
 
         Args:
-            joint: the two Gaussians of (x, y): all words of the message so far were right, or not.
+            joint: the two Gaussians of (x, y), and their probabilities: the leading bits of all codewords of the
+                message so far were right, or not.
             i: component of y.
             words: what was received.
-            begun: whether another word of the message was used before.
+            some_word_was_used: whether another codeword of the same message was used before.
 
         Returns:
-            The hypotheses after word i, and the probability of what came; as they were, if it did not come.
+            The hypotheses given codeword i, unchanged if it did not arrive, and the codeword's probability.
         """
-        # Four parts [h, a]: hypothesis h before the word; answer a to whether this word was right, 0 yes and 1 no.
-        parts, mass = jax.lax.map(lambda part: self._split_by_answer(part, i, words), joint.parts)
-        mass = mass * joint.weights[:, None]
-        total = jnp.sum(mass)
-        # All right: this word, and under the first hypothesis those before it. Before the first word of a message
-        # either hypothesis is of the message before, and only this word counts.
-        right = jnp.array([[True, False], [True, False]]) & jnp.stack([jnp.asarray(True), ~begun])[:, None]
-        four_parts = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
+        # Four Gaussians [h, a] and their probabilities (2, 2): hypothesis h before, and codeword i right (a = 0) or
+        # not.
+        gaussians, probability = jax.lax.map(lambda x: self._split_by_answer(x, i, words), joint.parts)
+        probability = probability * joint.weights[:, None]
+        total = jnp.sum(probability)
+        # All are right: codeword i, and under hypothesis 0 those before it. The first codeword of a message counts
+        # alone: both hypotheses are then on the message before.
+        all_right = jnp.array([[True, False], [True, False]])
+        all_right = all_right & jnp.stack([jnp.asarray(True), ~some_word_was_used])[:, None]
+        four_gaussians = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), gaussians)
 
         def merge_chosen(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
-            """Merge the chosen parts to one Gaussian, and return their probability; if they have none, merge all parts.
+            """Merge those of the four Gaussians that are `chosen` (2, 2), and return their probability.
 
-            There are four parts: two hypotheses on the words before, times two answers on this word. `mass` (2, 2)
-            holds their probabilities, and `total` is the sum.
+            If it is 0, all four are merged, so that there is some Gaussian.
             """
-            chosen_mass = jnp.where(chosen, mass, 0.0).ravel()
-            probability = jnp.sum(chosen_mass)
-            shares_if_none = jnp.where(total > 0, mass.ravel() / jnp.where(total > 0, total, 1.0), 0.25)
-            chosen_shares = chosen_mass / jnp.where(probability > 0, probability, 1.0)
-            shares = jnp.where(probability > 0, chosen_shares, shares_if_none)
-            return merge_mixture(four_parts, shares), probability
+            chosen_probability = jnp.where(chosen, probability, 0.0).ravel()
+            sum_of_chosen = jnp.sum(chosen_probability)
+            all_shares = jnp.where(total > 0, probability.ravel() / jnp.where(total > 0, total, 1.0), 0.25)
+            chosen_shares = chosen_probability / jnp.where(sum_of_chosen > 0, sum_of_chosen, 1.0)
+            shares = jnp.where(sum_of_chosen > 0, chosen_shares, all_shares)
+            return merge_mixture(four_gaussians, shares), sum_of_chosen
 
-        merged, weights = jax.vmap(merge_chosen)(jnp.stack([right, ~right]))
-        used = words.present[i] & (total > 0)
-        after = Hypotheses(merged, weights / jnp.where(total > 0, total, 1.0))
-        return jax.tree.map(lambda new, old: jnp.where(used, new, old), after, joint), total
+        merged, weights = jax.vmap(merge_chosen)(jnp.stack([all_right, ~all_right]))
+        is_used = words.present[i] & (total > 0)
+        corrected = Hypotheses(merged, weights / jnp.where(total > 0, total, 1.0))
+        return jax.tree.map(lambda new, old: jnp.where(is_used, new, old), corrected, joint), total
 
 
 def _merge_hypotheses(state: Hypotheses) -> Gaussian:

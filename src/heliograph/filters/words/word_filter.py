@@ -1,7 +1,7 @@
-"""Filter behind words of finite length, whose bits may flip: exact moments of a Gaussian prior given each word.
+"""Filter behind codewords of finite length, whose bits may flip: exact moments of a Gaussian prior given each word.
 
-A word is a number that was rounded to low + i D, i = 0, 1, ..., and is sent as the bits of i. A dither is a random
-number that was added before the rounding; both ends know it where it is to be taken off.
+A codeword (word, for short) is a number that was rounded to low + i D, i = 0, 1, ..., and is sent as the bits of i. A
+dither is a random number that was added before the rounding; both ends know it where it is to be subtracted again.
 """
 
 from typing import NamedTuple
@@ -35,10 +35,10 @@ OFF = 1e-6  # steps by which a received number may miss a word
 class WordFilter(AbstractGaussianStateFilter):
     """The Gaussian filter that conditions on the received words themselves.
 
-    Of y ~ N(m, S), component after component in the joint Gaussian of the state and what is measured, a word leaves the
-    mean m + S (ln M)' and the variance S + S^2 (ln M)'', by m, with M(m) the probability of what came; x follows
-    y: mean + k (E y - m), P - k k' (S - Var y), k = Cov(x, y)/S. The variance may grow, where y is on either
-    side of a flipped bit.
+    Let y ~ N(m, S) be a component of the signal, and M(m) the probability of the received codeword. Given it, y has the
+    mean m + S (ln M)' and the variance S + S^2 (ln M)'' (derivatives in m), and x has mean + k (E y - m) and
+    P - k k' (S - Var y), k = Cov(x, y) / S. One component follows after another. The variance may grow, if a flipped
+    bit leaves y on either of two sides.
 
     Args:
         sensor: h and the law of v, without rounding.
@@ -47,8 +47,8 @@ class WordFilter(AbstractGaussianStateFilter):
         low: of each component, a word.
         spacing: D of each component.
         centre: of the words of each component.
-        places: component of each output of the channel, FLAG of what is told.
-        bits: of a word; 0 without end.
+        places: component of y of each output of the channel; FLAG for an output that reports the mode.
+        bits: of a codeword; 0 for codewords without end.
         dither: of the encoder.
         certain: True if no bit flips.
     """
@@ -66,26 +66,30 @@ class WordFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the words that arrived, one component of y after another."""
+        """Correct with the codewords that arrived, one component of y after another in the joint Gaussian of (x, y)."""
         z, n = jnp.asarray(z), len(self.states)
         signal = self.predict_signal(state, k)
         noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
-        joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
+        joint, log_likelihood = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
         words = self.identify_received_words(z, at(self.links, k))
         for i in range(len(self.low)):
-            row, prior = joint.root[n + i], self.find_signal_prior(joint, i)
-            change = self._find_effect_of_word(i, words, prior)
-            changes = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
-            row = jnp.where(changes, row, 0.0)
-            shift, ratio = jnp.where(changes, change.shift, 0.0), jnp.where(changes, change.ratio, 1.0)
+            row, prior = joint.root[n + i], self.find_signal_prior(joint, i)  # y_i = prior.mean + row xi
+            # log P(codeword), and the mean and variance of y_i given it, relative to the prior's deviation and
+            # variance.
+            effect = self._find_effect_of_word(i, words, prior)
+            is_used = words.present[i] & jnp.isfinite(effect.log_mass) & (prior.deviation > 0)
+            row = jnp.where(is_used, row, 0.0)
+            shift, ratio = jnp.where(is_used, effect.shift, 0.0), jnp.where(is_used, effect.ratio, 1.0)
+            # The joint Gaussian in which y_i has these moments, and its slopes on y_i are unchanged.
             joint = impose_moments_of_combination(joint, row, shift * prior.deviation, ratio)
-            total = total + jnp.where(words.present[i], change.log_mass, 0.0)
-        total = jnp.where(words.are_words, total, -jnp.inf)
-        return take_leading(joint, n), self.compute_innovation(signal, words, z, at(self.numbers, k), total)
+            log_likelihood = log_likelihood + jnp.where(words.present[i], effect.log_mass, 0.0)
+        # A received number that is no codeword is impossible.
+        log_likelihood = jnp.where(words.are_words, log_likelihood, -jnp.inf)
+        return take_leading(joint, n), self.compute_innovation(signal, words, z, at(self.numbers, k), log_likelihood)
 
     @property
     def of_atoms(self) -> bool:
-        """Always True: a number that is no word is excluded."""
+        """Always True: codewords are finitely many or discrete, so likelihood 0 says that the model excludes z."""
         return True
 
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
@@ -94,11 +98,11 @@ class WordFilter(AbstractGaussianStateFilter):
         return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     def identify_received_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
-        """Return which word of each component was received, and what its bits say of those that were sent.
+        """Return which codeword of each component was received, and likelihoods of the bits that were sent.
 
-        z (one step) has a number for each output of the channel: a received word low + i spacing, or the mode of the
-        link (a flag), as `places` says. Where dither is subtracted, the dither of each word follows. The same component
-        may come several times, as copies over several paths. What is returned of a word is its number i.
+        z (one step) has a number for each output of the channel: a received codeword low + i spacing, or the mode of
+        the link, as `places` says. If dither is subtracted, the dither of each codeword follows. The same component may
+        come several times, as copies over several paths. A codeword is returned as its number i.
         """
         outputs = len(self.places)
         # Rows of z that are words, the component of y of each, and how many steps it lies above the lowest word.
@@ -138,42 +142,47 @@ class WordFilter(AbstractGaussianStateFilter):
         )
 
     def find_signal_prior(self, joint: Gaussian, i: int) -> SignalPrior:
-        """Return the law of y_i in that of the state and y."""
-        place = len(self.states) + i
-        return SignalPrior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
+        """Return mean and deviation of y_i, from the joint Gaussian of the state x and the signal y."""
+        index = len(self.states) + i
+        return SignalPrior(joint.mean[index], jnp.sqrt(joint.root[index] ** 2 @ joint.variances))
 
     def condition_by_leading_bits(self, i: int, words: "ReceivedWords", prior: SignalPrior, leading: int) -> WordEffect:
-        """Return what the received word of y_i says of it, if its leading bits arrived as they were sent, and if not.
+        """Return the effect of the received codeword on y_i in two cases: its leading bits arrived as sent, or not.
 
         Args:
             i: component of y.
-            words: what was received; `words.pairs` has for each law of the link the likelihoods of a sent 0 and of a
-                sent 1, (components, bits, 2).
-            prior: of y_i.
-            leading: number of the highest bits that are right together, or not.
+            words: what was received; `words.pairs` has for each combination of error rates the likelihoods of a sent 0
+                and of a sent 1, (components, bits, 2), and `words.weights` the combinations' probabilities.
+            prior: mean and deviation of y_i.
+            leading: how many of the highest bits must all be right in the first case.
 
         Returns:
-            Log probability, shift of the mean and ratio of variances, (2,) each: right, and not.
+            log P(codeword, case), shift of the mean in deviations, and ratio of variances, (2,) each: right, not right.
         """
         pairs, bits = [pair[i] for pair in words.pairs], np.arange(self.bits)
-        bit = jnp.mod(jnp.floor(words.numbers[i] / 2.0**bits), 2.0)
-        as_received = jnp.stack([1 - bit, bit], axis=-1)
-        # Likelihoods of words whose leading bits are those received: of any other leading bit zero.
-        if_right = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
-        # Both answers from the same sums, over all words and over those that are right: not right is all less right.
-        all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
-        # Weights of the sums over all words, and then of those over the right ones.
-        right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
-        weights = jnp.stack([right, wrong])
+        # P(received, all leading bits right | word sent): a leading bit other than the received one has likelihood 0.
+        received_bit = jnp.mod(jnp.floor(words.numbers[i] / 2.0**bits), 2.0)
+        equals_received = jnp.stack([1 - received_bit, received_bit], axis=-1)
+        leading_is_right = jnp.where((bits >= self.bits - leading)[:, None], equals_received, 1.0)
+        right_pairs = [pair * leading_is_right for pair in pairs]
+        # P(received, not right) = P(received) - P(received, right): weights 1 and -1 of the same sums.
+        if_right = jnp.append(0 * words.weights, words.weights)
+        if_wrong = jnp.append(words.weights, -words.weights)
         return find_effect_of_bits(
-            all_and_right, weights, words.numbers[i], self._word_grid(i, words), prior, self.dither
+            pairs=[*pairs, *right_pairs],
+            weights=jnp.stack([if_right, if_wrong]),
+            received=words.numbers[i],
+            grid=self._word_grid(i, words),
+            prior=prior,
+            dither=self.dither,
         )
 
     def _find_effect_of_word(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
-        """Return what the received word says of y_i: log probability, shift of the mean, ratio of the variances.
+        """Return log P(codeword of y_i), the shift of the mean of y_i in deviations, and the ratio of its variances.
 
-        If `self.certain`, no bit can flip, and y_i lies in the word's cell. Else the likelihoods of the bits are summed
-        over all words.
+        If no bit can flip (`self.certain`), y_i lies in the cell of numbers that are rounded to the codeword; a dither
+        makes the cell's edges smooth. Else the law of y_i is a sum over all codewords that may have been sent, each
+        with the likelihood of its bits, a product over `words.pairs`.
         """
         grid = self._word_grid(i, words)
         if self.certain:
@@ -182,20 +191,20 @@ class WordFilter(AbstractGaussianStateFilter):
         return find_effect_of_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
     def _word_grid(self, i: int, words: "ReceivedWords") -> WordGrid:
-        """Return the words of y_i as a grid: the lowest less the dither, the step, the bits."""
+        """Return the codewords of y_i, less the known dither: the lowest one, the step between them, their bits."""
         return WordGrid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
 
     def compute_innovation(
-        self, signal: Signal, words: "ReceivedWords", z: jax.Array, numbers: SecondOrder, total: jax.Array
+        self, signal: Signal, words: "ReceivedWords", z: jax.Array, numbers: SecondOrder, log_likelihood: jax.Array
     ) -> Innovation:
-        """Return the innovation of the words as numbers about their centres; NaN for flags and dithers.
+        """Return the innovation of the codewords as numbers about their centres; NaN for reported modes and dithers.
 
         Args:
             signal: moments of y before it is rounded.
             words: what was received.
-            z: received words and flags, then the dithers that are taken off.
-            numbers: mean gain and spread that words have as numbers behind the link.
-            total: log-likelihood of the words.
+            z: received codewords and reported modes, then the dithers that are subtracted.
+            numbers: mean and covariance of the gain that the codewords, as numbers, have behind the link.
+            log_likelihood: of the codewords.
         """
         # Moments of y - c, c the centres, with the error of rounding as a noise.
         rounding_variance = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
@@ -218,7 +227,7 @@ class WordFilter(AbstractGaussianStateFilter):
         return Innovation(
             value=jnp.full(len(z), jnp.nan).at[rows].set(value),
             covariance=jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance),
-            log_likelihood=total,
+            log_likelihood=log_likelihood,
         )
 
 
@@ -244,8 +253,8 @@ def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ..
     arrived overwrites all others.
     """
     some_is_present, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
-    for is_present, own_number, own_dither in reversed(copies):
+    for is_present, number_of_copy, dither_of_copy in reversed(copies):
         some_is_present = is_present | some_is_present
-        number = jnp.where(is_present, own_number, number)
-        dither = jnp.where(is_present, own_dither, dither)
+        number = jnp.where(is_present, number_of_copy, number)
+        dither = jnp.where(is_present, dither_of_copy, dither)
     return some_is_present, number, dither

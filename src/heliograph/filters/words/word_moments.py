@@ -1,4 +1,4 @@
-"""The exact moments of a Gaussian number y of which a word is received, whose bits may have flipped.
+"""The exact moments of a Gaussian number y that is sent as a codeword (word, for short), whose bits may flip.
 
 With L_i = P(received | word i sent), M = P(received) = E L(y) and t = (y - m)/s, everything follows from the sums M,
 E[t L] and E[t^2 L]: E y = m + s E[t L]/M, Var y = s^2 (E[t^2 L]/M - (E[t L]/M)^2). The variance may be larger than s^2.
@@ -38,16 +38,25 @@ def sum_by_edges(
 ) -> LikelihoodSums:
     """Return M = E L, E[t L] and E[t^2 L] of a likelihood L(t) that is constant but for jumps, with t standard normal.
 
-    The jump J at an edge is L above it less L below it. With the normal tail Q and density phi, sums over the edges t
-    give M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t).
-    `at_zero` is L(0). `width` is that of the dither that smooths the edges, in deviations, and is at least LEAST.
+    With the normal tail Q and density phi, integration by parts gives sums over the edges t_e, where L jumps by J_e:
 
-    Shapes: t (edges,), jumps (..., edges), at_zero (...), for several likelihoods at once.
+        M = L(0) + sum_{t_e >= 0} J_e Q(t_e) - sum_{t_e < 0} J_e Q(-t_e)
+        E[t L] = sum J_e phi(t_e)
+        E[t^2 L] = M + sum J_e t_e phi(t_e)
+
+    A dither smooths the edges: Q, phi and t phi are then means over it.
+
+    Args:
+        t: the edges (edges,).
+        jumps: L above each edge less L below it (..., edges), for several likelihoods at once.
+        at_zero: L(0) (...).
+        width: of the dither, in deviations.
+        smooth: returns the means of Q, phi and t phi at t >= 0 over the dither.
     """
     sign = jnp.where(t < 0, -1.0, 1.0)
-    smoothed_step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
-    mass = at_zero + jumps @ (sign * smoothed_step.beyond)
-    return LikelihoodSums(mass, jumps @ smoothed_step.density, mass + jumps @ (sign * smoothed_step.slope))
+    at_edge = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
+    mass = at_zero + jumps @ (sign * at_edge.beyond)
+    return LikelihoodSums(mass=mass, first=jumps @ at_edge.density, second=mass + jumps @ (sign * at_edge.slope))
 
 
 def sum_neighbouring_words(
@@ -59,16 +68,17 @@ def sum_neighbouring_words(
     prior: SignalPrior,
     dither: str,
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] over blocks of neighbouring words, of which the end ones are half-lines.
+    """Return M = E L, E[t L] and E[t^2 L] over blocks of neighbouring codewords, for t = (y - mean) / deviation.
 
-    L is the likelihood of the word that y is rounded to, t = (y - m) / s. That of a word is the likelihood of the bits
-    above its block times that of those in it, a table for all blocks. L is constant but at the edges between words, so
-    that the sums are over the edges (`sum_by_edges`).
+    L(t) is the likelihood of the codeword that y is rounded to. All y below the first codeword count to it, and all y
+    above the last one to that. A block is 2^BLOCK codewords that differ in their BLOCK lowest bits: the likelihood of
+    each is that of its high bits, one number for a block, times that of its low bits, a table for all blocks. L jumps
+    at the edges between codewords only, so the sums are over these edges.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
         weights: probabilities of the combinations, (..., combinations) of several likelihoods at once.
-        start: number of the first word, with which a block begins.
+        start: number of the first codeword, at which a block begins.
         blocks: how many.
         grid: the words.
         prior: of y.
@@ -78,36 +88,33 @@ def sum_neighbouring_words(
     size = tables.shape[1]
 
     def weigh_bits_above(block: jax.Array) -> jax.Array:
-        """Return the weighted likelihood of the bits that name a block, for each combination of error rates.
+        """Return the likelihood of the high bits of a block's codewords, times the probability of the error rates.
 
-        The weight is the combination's probability.
-
-        Closed over: `pairs`, likelihoods of the bits, `weights`; `start`, the first word's number; `size` of a block.
+        It has one entry for each combination of error rates; `block` counts from the first codeword, number `start`.
         """
         return weights * jnp.stack([multiply_bits(pair[BLOCK:], start / size + block) for pair in pairs])
 
     def add_block(
         carried: tuple[LikelihoodSums, jax.Array], block: jax.Array
     ) -> tuple[tuple[LikelihoodSums, jax.Array], None]:
-        """Add the sums over the edges above each word of one block; `above`: the likelihood of the bits above it.
+        """Add the sums over the upper edge of each codeword of one block.
 
-        Closed over: `tables`, likelihoods of a block's words by their low bits; `blocks`, of `size` words each, the
-        first word's number being `start`; `grid`, the words; `prior` of y; the encoder's `dither`.
+        `carried`: the sums so far, and the likelihood of the block's high bits.
         """
-        total, above = carried
-        following = weigh_bits_above(block + 1)
-        likelihood = above @ tables
-        # No edge is beyond the last word, and none before the first.
-        after = jnp.where(block < blocks - 1, following @ tables[:, 0], likelihood[..., -1])
-        jumps = jnp.concatenate([likelihood[..., 1:], after[..., None]], axis=-1) - likelihood
+        total, high_bits = carried
+        high_bits_of_next = weigh_bits_above(block + 1)
+        likelihood = high_bits @ tables
+        # The last codeword of all has no upper edge: no jump there.
+        first_of_next = jnp.where(block < blocks - 1, high_bits_of_next @ tables[:, 0], likelihood[..., -1])
+        jumps = jnp.concatenate([likelihood[..., 1:], first_of_next[..., None]], axis=-1) - likelihood
         edges = start + size * block + np.arange(-0.5, size)
         t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
-        # The word that holds t = 0: it begins below and ends above, where the end words have no end.
+        # L(0): that of the codeword whose cell holds t = 0. The cells of the end codewords are half-lines.
         begins_below = (t[:-1] < 0) | ((block == 0) & (np.arange(size) == 0))
         ends_below = (t[1:] < 0) & ((block < blocks - 1) | (np.arange(size) < size - 1))
         at_zero = jnp.sum(jnp.where(begins_below & ~ends_below, likelihood, 0.0), axis=-1)
         sums = sum_by_edges(t[1:], jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
-        return (total.plus(sums), following), None
+        return (total.plus(sums), high_bits_of_next), None
 
     zero = LikelihoodSums(*jnp.zeros((3, *weights.shape[:-1])))
     (sums, _), _ = jax.lax.scan(add_block, (zero, weigh_bits_above(jnp.zeros(()))), jnp.arange(blocks, dtype=float))
@@ -117,18 +124,26 @@ def sum_neighbouring_words(
 def sum_words_near_prior(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
+    """Return M = E L, E[t L] and E[t^2 L] over the codewords near the prior's mean, and the received one.
 
-    L is the likelihood of the word to which y is rounded, and t = (y - mean) / deviation. Beyond REACH, 8.5 deviations,
-    there is no probability, so that WINDOW blocks of 2^BLOCK words are summed. `pairs` holds the likelihoods of each
-    bit's 0 and 1 for each combination of error rates, with the probabilities `weights`. `grid` has all words.
+    L is the likelihood of the codeword to which y is rounded, and t = (y - mean) / deviation. Beyond REACH (8.5)
+    deviations there is no probability, so it is enough to sum WINDOW blocks of 2^BLOCK codewords.
+
+    Args:
+        pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
+        weights: probabilities of the combinations.
+        received: number of the received codeword.
+        grid: all codewords.
+        prior: of y.
+        dither: of the encoder.
     """
     count = WINDOW * 2**BLOCK
     lowest = prior.mean - REACH * prior.deviation
-    start = jnp.floor((lowest - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK  # of the block that holds it
+    # The first codeword of the block in which `lowest` lies; at the ends of the range the window is moved inwards.
+    start = jnp.floor((lowest - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
     sums = sum_neighbouring_words(pairs, weights, start, blocks=WINDOW, grid=grid, prior=prior, dither=dither)
-    # The received word is added if it is not among these.
+    # The received codeword may be far more likely than all others: it is added if it is not among these.
     is_outside = (received < start) | (received >= start + count)
     likelihood = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
     return sums.plus(sum_one_word(likelihood * is_outside, received, grid, prior, dither))
@@ -137,14 +152,15 @@ def sum_words_near_prior(
 def sum_one_word(
     likelihood: jax.Array, index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] of an L that is `likelihood` in the cell of one word, and 0 elsewhere.
+    """Return M = E L, E[t L] and E[t^2 L] of an L(t) that is `likelihood` in the cell of one codeword, and 0 elsewhere.
 
-    t = (y - mean) / deviation. BEYOND_ALL, 40 deviations, stands for infinity. SMOOTH holds the form of the edges for
-    each kind of dither.
+    t = (y - mean) / deviation, and the cell are the y that are rounded to codeword number `index`. L is written as two
+    jumps, which a dither smooths.
     """
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
-    if grid.bits:  # overloads: the first word has no lower edge, the last no upper one
+    # The cell of the first codeword has no lower edge and that of the last no upper one: BEYOND_ALL is infinity.
+    if grid.bits:
         is_lower, is_upper = jnp.array([True, False]), jnp.array([False, True])
         t = jnp.where(is_lower & (index <= 0), -BEYOND_ALL, t)
         t = jnp.where(is_upper & (index >= 2.0**grid.bits - 1), BEYOND_ALL, t)
@@ -155,7 +171,7 @@ def sum_one_word(
 
 
 class WordEffect(NamedTuple):
-    """What a word does to y: log M, E y - m in deviations, and Var y over s^2."""
+    """What a received codeword says of y ~ N(m, s^2): log M, its log probability; (E y - m) / s; and Var y / s^2."""
 
     log_mass: jax.Array
     shift: jax.Array
@@ -163,9 +179,10 @@ class WordEffect(NamedTuple):
 
 
 def find_effect_from_sums(sums: LikelihoodSums) -> WordEffect:
-    """Return log M, and the mean and variance of t, from the sums M = E L, E[t L], E[t^2 L] of a likelihood L.
+    """Return log M, and mean and variance of t, from M = E L, E[t L] and E[t^2 L] of a likelihood L(t).
 
-    log M is -inf if M is below the smallest normal number.
+    E t = E[t L] / M and Var t = E[t^2 L] / M - (E t)^2 given what was received. log M is -inf if M is below the
+    smallest normal number.
     """
     is_possible = sums.mass > np.finfo(float).tiny
     mass = jnp.where(is_possible, sums.mass, 1.0)
@@ -175,39 +192,47 @@ def find_effect_from_sums(sums: LikelihoodSums) -> WordEffect:
 
 
 def widen_by_dither(prior: SignalPrior, grid: WordGrid, dither: str) -> tuple[SignalPrior, jax.Array]:
-    """Return the law of y + d, taken for Gaussian as the step D is small, and its variance over that of y."""
+    """Return the law of y + d, and Var(y + d) / Var(y), for the signal y and a dither d that is not subtracted again.
+
+    Var d is ADDED in squared steps D of the codewords. y + d is taken for Gaussian, since D is small here.
+    """
     wide = 1 + ADDED[dither] * (grid.step / prior.deviation) ** 2
     return SignalPrior(prior.mean, prior.deviation * jnp.sqrt(wide)), wide
 
 
 def remove_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
-    """Return what is known of y from what is known of y + d, whose variance is `wide` times that of y."""
+    """Return the effect of a codeword on y from its effect on y + d, for a dither d, with `wide` = Var(y + d) / Var(y).
+
+    With y + d ~ N(m, wide s^2), Cov(y, y + d) = s^2, so that E y - m = (E(y + d) - m) / wide and
+    Var y = s^2 - (wide s^2 - Var(y + d)) / wide^2. Both are returned relative to s and s^2.
+    """
     return WordEffect(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
 
 
 def find_effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
-    """Return what the word of number `index` says of y, if no bit can have flipped.
+    """Return what codeword number `index` says of y if no bit can flip: the sent number lies in the codeword's cell.
 
-    ADDED holds the variance of a dither in squared steps, 0 for a dither that is subtracted again. Steps of at least
-    FINE deviations are not small. From FAR deviations on the sums over edges have no digits.
+    Without a dither, or with one that is subtracted again, y itself lies in the cell. Otherwise y + d lies in it for a
+    random d, in one of two ways: as a Gaussian y + d cut to the cell, or as a cell whose edges the dither smooths.
     """
     wider, variance_ratio = widen_by_dither(prior, grid, dither)
-    by_cell = remove_dither(_cut_to_cell(index, grid, wider), variance_ratio)
+    by_cut = remove_dither(_cut_to_cell(index, grid, wider), variance_ratio)
     if not ADDED[dither]:
-        return by_cell
-    # If steps are not small, a dither smooths the edges of the cell. Far away only the cell itself has digits.
-    away = jnp.abs((grid.low + index * grid.step - prior.mean) / prior.deviation)
+        return by_cut
+    # Smooth edges are exact, but their sums have no digits from FAR deviations on. In steps below FINE deviations y + d
+    # is close to Gaussian.
+    distance = jnp.abs((grid.low + index * grid.step - prior.mean) / prior.deviation)
     width = grid.step / prior.deviation
     by_smooth_edges = find_effect_from_sums(sum_one_word(jnp.ones(()), index, grid, prior, dither))
-    is_smooth_valid = (width >= FINE) & (away - width < FAR)
-    effect: WordEffect = jax.tree.map(lambda a, b: jnp.where(is_smooth_valid, a, b), by_smooth_edges, by_cell)
+    is_smooth_valid = (width >= FINE) & (distance - width < FAR)
+    effect: WordEffect = jax.tree.map(lambda a, b: jnp.where(is_smooth_valid, a, b), by_smooth_edges, by_cut)
     return effect
 
 
 def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEffect:
-    """Return what knowing its cell does to y: by the cell's ends, or its centre where their difference loses digits.
+    """Return what it says of y that y lies in the cell of codeword number `index`: moments of a truncated normal law.
 
-    The end cells of words of so many `bits` reach to infinity; bits 0: words without end.
+    The cells of the first and last codeword reach to infinity; with `grid.bits` 0 there is no first and last one.
     """
     centre = (grid.low + index * grid.step - prior.mean) / prior.deviation
     half = grid.step / prior.deviation / 2
@@ -217,8 +242,8 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
         upper = jnp.where(index >= 2.0**grid.bits - 1, jnp.inf, upper)
     narrow_cell = (half * (1 + jnp.abs(centre)) < NARROW) & jnp.isfinite(lower) & jnp.isfinite(upper)
     cut = truncated_normal(jnp.where(narrow_cell, -1.0, lower), jnp.where(narrow_cell, 1.0, upper))
-    # Of a short cell of half width h about c, the density is linear: mass 2 h phi(c), mean - c = -c h^2 / 3 and
-    # variance h^2 / 3.
+    # In a narrow cell a difference of its ends loses digits. But there the density is linear: for half width h about c
+    # the mass is 2 h phi(c), the mean c - c h^2 / 3 and the variance h^2 / 3.
     log_mass = -(centre**2) / 2 - np.log(ROOT_TWO_PI) + jnp.log(2 * half)
     short = WordEffect(log_mass, centre * (1 - half**2 / 3), half**2 / 3)
     return WordEffect(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
@@ -227,7 +252,7 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
 def _sum_wide_words(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return the effect of a received word on y by a sum over the words within the prior's reach, 8.5 deviations.
+    """Return the effect of a received codeword on y by a sum over the codewords within 8.5 deviations of its mean.
 
     `pairs` holds the likelihoods of each bit's 0 and 1 for each combination of error rates, with the probabilities
     `weights`. `grid` has all words, `prior` is the law of y, and `dither` the kind of the encoder's dither.
@@ -238,14 +263,16 @@ def _sum_wide_words(
 def _sum_fine_words(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return the effect of a received word on y by a sum over cells of several words, and over all beyond the range.
+    """Return the effect of a received codeword on y, if the steps between codewords are far finer than its deviation.
 
-    The dither's variance widens the prior, and is removed afterwards. `pairs` holds the likelihoods of each bit's 0 and
-    1 for each combination of error rates, with the probabilities `weights`. `grid` has all words.
+    `pairs` holds the likelihoods of each bit's 0 and 1 for each combination of error rates, with the probabilities
+    `weights`. `grid` has all codewords.
     """
+    # The number that is rounded is y + d with the dither d.
     wider, variance_ratio = widen_by_dither(prior, grid, dither)
+    # For each combination the sums over the range, neighbouring codewords taken together, and beyond its ends.
     sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
-    # Each sum is the mean over the combinations of error rates.
+    # Their mean over the combinations of error rates, from which the effect on y + d follows, and that on y.
     mean_sums = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
     return remove_dither(find_effect_from_sums(mean_sums), variance_ratio)
 
@@ -253,25 +280,25 @@ def _sum_fine_words(
 def find_effect_of_bits(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return what the received bits of a word say of y: log probability, shift of its mean, ratio of its variances.
+    """Return what a received codeword says of y: its log probability, the shift of the mean, the ratio of variances.
 
-    Words of few bits are all summed. Of others those within the prior's reach are summed, or cells of several words if
-    a step is finer than FINE deviations.
+    The law of y given the bits is a sum over the codewords that may have been sent, in one of three ways: all codewords
+    if they have at most TABLE (6) bits; else those near the prior's mean, if a step is at least FINE (a quarter) of a
+    deviation; else groups of neighbouring codewords.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
         weights: probabilities of the combinations, (..., combinations) for several likelihoods at once.
-        received: number of the received word.
-        grid: the words.
+        received: number of the received codeword.
+        grid: the codewords.
         prior: of y.
         dither: of the encoder.
     """
-    # The sum over all words of few bits is cheap and exact.
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
-    word = pairs, weights, received, grid, prior, dither
-    sum_wide_words, sum_fine_words = partial(_sum_wide_words, *word), partial(_sum_fine_words, *word)
+    arguments = pairs, weights, received, grid, prior, dither
+    sum_wide_words, sum_fine_words = partial(_sum_wide_words, *arguments), partial(_sum_fine_words, *arguments)
     effect: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, sum_wide_words, sum_fine_words)
     return effect
