@@ -290,8 +290,8 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
 
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
-        memory: share of the learned law that a step keeps, above 0 and at most 1 (never forget); so some
-            1 / (1 - memory) values decide a variance (default 0.98).
+        memory: share of the learned law that a step keeps, above 0 and at most 1 (never forget; default 0.98). About
+            1 / (1 - memory) values decide a variance.
 
     Raises:
         ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].

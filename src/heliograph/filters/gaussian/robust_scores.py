@@ -59,7 +59,8 @@ def update_by_score(before: PredictedMeasurement, z: jax.Array, law: NoiseBranch
     probability p_j, mean m_j and variance r_j. With s_j = V + r_j, u_j = (e - m_j) / s_j and q_j, the posterior
     probability of branch j, in proportion to p_j N(e; m_j, s_j):
 
-        score g = sum_j q_j u_j,  E[t_i | z_i] = E t_i + V g, Var[t_i | z_i] = V (sum_j q_j r_j / s_j + V Var_q u),
+        score g = sum_j q_j u_j,  E[t_i | z_i] = E t_i + V g,
+        Var[t_i | z_i] = V (sum_j q_j r_j / s_j + V Var_q u),
 
     a sum of positive terms, which grows with Var_q u if z_i does not decide between the branches. The law of x given
     t_i stays. The weight is sum_j q_j / s_j over its value at e = 0.
