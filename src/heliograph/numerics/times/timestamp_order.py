@@ -48,8 +48,7 @@ def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, 
 
     - it lies between two stretches that are less than a year apart and together have more messages;
     - it is the first one, its stamps are of the first year since 1970, where clocks begin to count, and all others are
-    of
-      this century.
+      of this century.
 
     Args:
         time: the stamps.
