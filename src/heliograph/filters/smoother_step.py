@@ -101,7 +101,7 @@ class SmootherStep(Module):
 
     @property
     def angles(self) -> Angles:
-        """Places of angles among the plant's states."""
+        """Indices of angles among the plant's states."""
         return self.manifold.angles
 
     @property
