@@ -55,10 +55,10 @@ class WeightedColumns(NamedTuple):
         return WeightedColumns(self.matrix, self.weights * factor)
 
 
-def join_columns(*parts: WeightedColumns) -> WeightedColumns:
+def join_columns(*covariances: WeightedColumns) -> WeightedColumns:
     """Add covariances: their columns side by side."""
-    matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
-    return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
+    matrix = jnp.concatenate([jnp.asarray(covariance.matrix) for covariance in covariances], axis=1)
+    return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(covariance.weights) for covariance in covariances]))
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:

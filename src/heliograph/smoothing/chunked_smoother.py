@@ -156,8 +156,8 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     # the chunk before it ends. Then from the last one back: each chunk whose smoothed law at its end is wrong.
     rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
     _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
-    parts = results.estimate, results.nis, results.received  # (chunks, own, ...) each
-    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], parts)
+    leaves = results.estimate, results.nis, results.received  # (chunks, own, ...) each
+    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], leaves)
     return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
 
 

@@ -113,7 +113,7 @@ class AdaptiveFilter(AbstractWrapper):
         # How outliers are weighed: a robust base filter has a rule, or the Gaussian branches of the noise's law. Any
         # other base filter weighs nothing.
         rule = base.rule if isinstance(base, RobustFilter) else None
-        law = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
+        branches = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
             predicted=predicted,
             shape_before=state.shape,
@@ -123,13 +123,13 @@ class AdaptiveFilter(AbstractWrapper):
             variance=jnp.diagonal(jnp.asarray(noise.covariance)),
             memory=jnp.asarray(self.memory),
             rule=rule,
-            law=law,
+            law=branches,
         )
         # The reported innovation is Gaussian, with the noise variances learned before z.
         value, covariance, present = z - predicted.signal - noise.center, learned.covariance, ~jnp.isnan(z)
-        both = present[:, None] & present[None]
+        both_present = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(predicted.signal))
-        innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
+        innovation = Innovation(value, jnp.where(both_present, covariance, jnp.nan), density, learned.weight)
         return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
