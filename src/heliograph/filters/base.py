@@ -281,7 +281,7 @@ class AbstractFilter(Module):
 
     @property
     def of_atoms(self) -> bool:
-        """True for a mixture (particles, modes) that excludes a value only by a likelihood of 0 in every component."""
+        """True if the law of z is a mixture over points, so that likelihood 0 says that the model excludes z."""
         return False
 
     @property
