@@ -240,11 +240,12 @@ def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np
 def find_fastest_unobserved_mode(
     matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
 ) -> UnobservedGrowth:
-    """Find the largest growth of E P a step, over eigenvalues a and sets of modes that do not observe them.
+    """Find the largest growth of the error covariance E P a step, over eigenvectors that some modes do not observe.
 
-    The growth is |a|^2 times the spectral radius of the chain within the set, by which the links stay in the set:
-    E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
-    If every mode observes every eigenvector, the growth is 0.
+    A is the plant's `matrix`, `chain` the links' transition probabilities, and `outputs` their output matrix C in each
+    mode. Let A v = a v, and C v = 0 in a set of modes. While the links stay in the set, no data show v, so
+    E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v'. This grows by |a|^2 times the spectral radius of
+    the chain within the set. If every mode observes every eigenvector, the growth is 0.
     """
     results = [
         UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)

@@ -55,10 +55,11 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
+        # The length of chunks, their own rows, is known only after their starts.
         chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, own=0), start, rows)
         if chunk_starts is None:
             return None
-        return _smooth_all(SmootherStepRecursion(filter, chunk_starts.lengths.chunk), chunk_starts, rows)
+        return _smooth_all(SmootherStepRecursion(filter, own=chunk_starts.lengths.chunk), chunk_starts, rows)
 
 
 def smooth_chunk(

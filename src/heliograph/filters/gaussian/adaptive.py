@@ -102,7 +102,7 @@ class AdaptiveFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
-        """Correct the state and the law of the noise variances with what arrived of z (m,), NaN for what did not."""
+        """Correct the state and the laws of the noise variances with z (m,), NaN where a component did not arrive."""
         # Moments of the measurement without its noise.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
