@@ -55,14 +55,14 @@ class WeightedColumns(NamedTuple):
         return WeightedColumns(self.matrix, self.weights * factor)
 
 
-def join_columns(*parts: WeightedColumns) -> WeightedColumns:
+def join_columns(*covariances: WeightedColumns) -> WeightedColumns:
     """Add covariances: their columns side by side."""
-    matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
-    return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
+    matrix = jnp.concatenate([jnp.asarray(covariance.matrix) for covariance in covariances], axis=1)
+    return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(covariance.weights) for covariance in covariances]))
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
-    """Return the columns of sum_i w_i P_i: those of all P_i (i, n, columns) in `parts`, with the `weights` w_i."""
+    """Return the columns of sum_i w_i P_i: `parts` has those of each P_i (i, n, columns), and `weights` are w_i."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     scaled_weights = (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1)
@@ -267,7 +267,7 @@ def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def columns_of(covariance: Array) -> WeightedColumns:
-    """Return W and w of P = W diag(w) W', with as many columns as the rank of a known P (NumPy's), or n of another."""
+    """Return W and w of P = W diag(w) W': as many columns as P's rank if P is known (NumPy), else n columns."""
     if isinstance(covariance, np.ndarray):
         root = find_covariance_root(covariance)
         return WeightedColumns(root, np.ones(root.shape[1]))

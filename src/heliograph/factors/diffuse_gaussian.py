@@ -198,17 +198,19 @@ def observe_diffuse(
     factors = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = decorrelate(factors.matrix, jnp.where(present[:, None], rows, 0.0))
-    shift, density, shows_unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
+    # `correction` is the change of the mean by the components so far.
+    correction, log_likelihood, shows_unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
     state = x
     for i in range(len(innovation)):
         h, noise_i = rows[i, :-1], jnp.where(present[i], factors.weights[i], 1.0)
         state, gain, s, shows = _observe_scalar(state, h, noise_i)
-        e = rows[i, -1] - h @ shift
-        shift = shift + gain * e
-        log = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
-        density = density + jnp.where(present[i], log, 0.0)
+        e = rows[i, -1] - h @ correction  # innovation of component i given those before it
+        correction = correction + gain * e
+        log_density = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
+        log_likelihood = log_likelihood + jnp.where(present[i], log_density, 0.0)
         shows_unknown.append(shows & present[i])
-    return state._replace(mean=x.mean + shift), MeasurementLikelihood(density, jnp.stack(shows_unknown))
+    likelihood = MeasurementLikelihood(log_likelihood, jnp.stack(shows_unknown))
+    return state._replace(mean=x.mean + correction), likelihood
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:

@@ -80,10 +80,10 @@ def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
-def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian:
+def from_summed_covariance(mean: jax.Array, *covariances: WeightedColumns) -> Gaussian:
     """Return the Gaussian of the summed covariances, by elimination: faster than orthogonal rows, less exact."""
-    covariance = parts[0].covariance
-    for columns in parts[1:]:
+    covariance = covariances[0].covariance
+    for columns in covariances[1:]:
         covariance = covariance + columns.covariance
     return from_covariance_by_elimination(mean, covariance)
 

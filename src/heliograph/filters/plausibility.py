@@ -136,7 +136,7 @@ class Judgement(NamedTuple):
         Args:
             innovation: of z.
             z: the measurement (m,).
-            angles: places of angles.
+            angles: indices of the components that are angles.
             eps: relative rounding of the precision in which z was sent.
         """
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))
@@ -249,7 +249,7 @@ def judge_step(
         spoilt: whether the inputs of the prediction were not finite.
     """
     (state_before, state_prior, state_after), (before, prior, after) = states, estimates
-    of_value = _judge_value(innovation, z, of_atoms, angles.received if angles else ())
+    judged = _judge_value(innovation, z, of_atoms, angles.received if angles else ())
     # States that stop being numbers, by the correction or already by the prediction.
     is_sound = _is_sound_correction(after, claim, prior)
     loses_soundness = _is_sound_correction(prior, claim, before) & ~is_sound
@@ -257,13 +257,13 @@ def judge_step(
     loses_soundness = _are_finite(before, claim) & ~_is_sound_prediction(prior, claim)
     by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
     # If several reasons apply, the last of these lines wins.
-    reason = jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE)
-    reason = jnp.where(by_correction & of_value.came, Reason.UNSOUND, reason)
-    reason = jnp.where(of_value.unreadable, Reason.UNREADABLE, reason)
-    reason = jnp.where(of_value.far, Reason.FAR, reason)
+    reason = jnp.where(judged.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE)
+    reason = jnp.where(by_correction & judged.came, Reason.UNSOUND, reason)
+    reason = jnp.where(judged.unreadable, Reason.UNREADABLE, reason)
+    reason = jnp.where(judged.far, Reason.FAR, reason)
     reason = jnp.where(by_prediction, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
-    distance, count = of_value.distance, of_value.arrived
+    distance, count = judged.distance, judged.arrived
     loses_digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(count.dtype)
     input_verdict = jnp.nan if claim == "none" else loses_digits
     # No distance if nothing arrived, or if the estimate was not finite before.
@@ -299,21 +299,23 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, 
     """
     value, covariance, z = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance), jnp.asarray(z)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
-    # Squared distance of each component given those before it, and which are determined.
+    # e_j^2 / s_j of each component given those before it, and whether these determine it.
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
-    every, certain = _squared_distance_terms_in_turn(value, covariance, present, size)
-    distance, count = jnp.sum(every), jnp.sum(present.astype(value.dtype))
-    # Far: components larger than expected, beyond the bound of this precision.
-    larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
-    squares, determined = every, certain
+    squares_of_all, is_determined = _squared_distance_terms_in_turn(value, covariance, present, size)
+    distance, count = jnp.sum(squares_of_all), jnp.sum(present.astype(value.dtype))
+    # Far: the components that are larger than expected, without the others, are beyond the limit of this precision.
+    is_larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
+    squares_of_larger, is_larger_determined = squares_of_all, is_determined
     if len(value) > 1:  # a single component has no others that are left out
-        squares, determined = _squared_distance_terms_in_turn(value, covariance, larger, size)
-    free = jnp.where(larger & ~determined, squares, 0.0)
-    most = largest_plausible_distance(value.dtype)
-    far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
+        squares_of_larger, is_larger_determined = _squared_distance_terms_in_turn(value, covariance, is_larger, size)
+    undetermined_squares = jnp.where(is_larger & ~is_larger_determined, squares_of_larger, 0.0)
+    limit = largest_plausible_distance(value.dtype)
+    far = jnp.any((undetermined_squares > limit) | (is_larger & jnp.isinf(value))) | (
+        jnp.sum(undetermined_squares) > limit
+    )
     # Excluded: all determined, and one differs; or the mixture's density is 0, though the squared distance is finite.
-    excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
+    excluded = jnp.any(jnp.isinf(squares_of_all) & is_determined) & ~jnp.any(~is_determined & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
     return _JudgedValue(

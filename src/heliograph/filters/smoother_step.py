@@ -70,10 +70,9 @@ class SmootherStep(Module):
     state is projection y + shift of the filter's state y, or y itself without them. Stacked along time, and over runs,
     it describes a whole run of a filter.
 
-    claim: what smoothed covariances are said to be. manifold: which of the plant's states are angles, wrapped to
-    between
-    -pi and pi in estimates, but never by a backward pass, and which are attitudes, whose law is that of small rotations
-    from the mean. limits: of the plant's states, on which estimates are conditioned. nis: e' S^-1 e of the step's
+    claim: what smoothed covariances are said to be. manifold: which of the plant's states are angles, which estimates
+    (but no backward pass) wrap to within -pi and pi, and which are attitudes, whose law is that of small rotations from
+    the mean. limits: of the plant's states, on which estimates are conditioned. nis: e' S^-1 e of the step's
     innovation, with mean `received`, the number of components that arrived.
 
     Shapes: projection (n, N), shift (n,).
@@ -102,7 +101,7 @@ class SmootherStep(Module):
 
     @property
     def angles(self) -> Angles:
-        """Places of angles among the plant's states."""
+        """Indices of angles among the plant's states."""
         return self.manifold.angles
 
     @property
@@ -114,7 +113,7 @@ class SmootherStep(Module):
         """Smooth the state before the step from `later`, the smoothed law of the state after it (one RTS step).
 
         Attitudes are not vectors: `unsettle` writes `later` as rotation vectors from the predicted mean, the RTS step
-        is linear in these, and `settle` turns the filtered mean before the step by its result.
+        is linear in these, and `settle` rotates the filtered mean before the step by its result.
         """
         filtered_mean, predicted_mean = self.before.left.mean, self.before.ahead
         smoothed = rts_step(self.before, unsettle(self.manifold, predicted_mean, later))
@@ -124,7 +123,7 @@ class SmootherStep(Module):
         """Return the smoothed mean m_s of the state before the step from `later` = m_s+, the one after it, (N,).
 
         m_s = m + J (m_s+ - m+), with the filtered mean m before the step and the predicted mean m+. `unsettle` writes
-        attitudes as rotation vectors from m+, and `settle` turns m by the result.
+        attitudes as rotation vectors from m+, and `settle` rotates m by the result.
         """
         filtered_mean, predicted_mean = self.before.left.mean, self.before.ahead
         mean = self.before.mean_given(self.manifold.unsettle(predicted_mean, later))

@@ -25,7 +25,7 @@ SEEN = 1e-6  # probability that a mode gets in the search for gains if the chain
 SIZE_LIMIT = 1024  # rows of the operator that acts on all entries of all covariances
 
 KindGains = tuple[Float[np.ndarray, "n _"], ...]
-Parts = Float[np.ndarray, "modes n n"]
+ModeCovariances = Float[np.ndarray, "modes n n"]
 
 
 class KnownLossSystem(NamedTuple):
@@ -62,13 +62,13 @@ class KnownLossSystem(NamedTuple):
         added = [gains[s] @ r @ gains[s].T + self.process for s, r in zip(self.known, self.noises, strict=True)]
         return JumpSystem(self.chain[None], np.array([loops]), noise * self.law[:, None, None] * np.array([added]))
 
-    def solve_steady_covariances(self, gains: KindGains) -> Parts:
+    def solve_steady_covariances(self, gains: KindGains) -> ModeCovariances:
         """Return the steady U_j = E[P 1{next mode j}] (modes, n, n) under these gains, P the error covariance.
 
         The spectral radius of the closed loop must be below 1, else there is no steady covariance.
         """
         (V,) = self.close_loop(gains).steady()
-        U: Parts = mix_moments_of_modes(self.chain, V)
+        U: ModeCovariances = mix_moments_of_modes(self.chain, V)
         return U
 
 
@@ -90,7 +90,7 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
     (V,) = jumps._replace(added=unit_noises).steady()
     # V_j+ = F_j (sum_i T_ij V_i) F_j' without noise; `jumps` has a single step.
     V_next = propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, V), 0.0)
-    decrease: Parts = V - V_next
+    decrease: ModeCovariances = V - V_next
     is_proved = min(np.linalg.eigvalsh(decrease).min(), np.linalg.eigvalsh(V).min()) > 0
     return radius if is_proved else float("inf")
 
@@ -123,7 +123,7 @@ def _iterate_covariances(system: KnownLossSystem) -> KindGains:
     the noises are divided by its growth.
     """
     size = float(np.trace(system.process)) or 1.0  # without process noise any size serves
-    V: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
+    V: ModeCovariances = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     noise, gains = 1.0, _improve_gains(system, V, noise=1.0)  # `noise` scales the covariances of all noises
     for step in range(1, ITERATIONS + 1):
         (V,) = system.close_loop(gains, noise).after(V)
@@ -164,7 +164,7 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
     return gains
 
 
-def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
+def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> ModeCovariances:
     """Return the covariances V (modes, n, n) that a step without noise multiplies by its spectral radius, of trace 1.
 
     `values` and `vectors` are the eigenvalues and eigenvectors of the step V -> V+, which acts on the entries of upper
@@ -175,17 +175,17 @@ def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vec
     return np.asarray(V / np.trace(V.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
-def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
+def _improve_gains(system: KnownLossSystem, V: ModeCovariances, noise: float) -> KindGains:
     """Return the best gain of each kind of mode s for these covariances V by mode, with R scaled by `noise`.
 
     K_s = A U C_s' (C_s U C_s' + R)^-1: U (V mixed by the chain) and R (noises, weighted by the modes' law) are summed
     over the modes that the receiver cannot distinguish from each other, those with `known` = s.
     """
     gains: list[np.ndarray] = []
-    mixed: Parts = mix_moments_of_modes(system.chain, parts)
+    U_by_mode: ModeCovariances = mix_moments_of_modes(system.chain, V)
     for s, C in enumerate(system.outputs):
         modes = np.flatnonzero(system.known == s)
-        U = mixed[modes].sum(axis=0)
+        U = U_by_mode[modes].sum(axis=0)
         R = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(C), len(C))))
         gains.append(system.transition @ observe_root(roots_of(U), C, roots_of(R)).gain)
     return tuple(gains)
@@ -240,11 +240,12 @@ def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np
 def find_fastest_unobserved_mode(
     matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
 ) -> UnobservedGrowth:
-    """Find the largest growth of E P a step, over eigenvalues a and sets of modes that do not observe them.
+    """Find the largest growth of the error covariance E P a step, over eigenvectors that some modes do not observe.
 
-    The growth is |a|^2 times the spectral radius of the chain within the set, by which the links stay in the set:
-    E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
-    If every mode observes every eigenvector, the growth is 0.
+    A is the plant's `matrix`, `chain` the links' transition probabilities, and `outputs` their output matrix C in each
+    mode. Let A v = a v, and C v = 0 in a set of modes. While the links stay in the set, no data show v, so
+    E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v'. This grows by |a|^2 times the spectral radius of
+    the chain within the set. If every mode observes every eigenvector, the growth is 0.
     """
     results = [
         UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)

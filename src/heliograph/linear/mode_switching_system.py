@@ -32,11 +32,14 @@ def modal_system(
     a chain, Pi[i, j] = P(next mode j | mode i).
 
     A plant that depends on a mode is a `move` with modes; a relay that filters behind a shared fading is a `move` of
-    (x, its estimate), and the receiver behind the same fading a `measure` with the same chain. With H_j the move in
-    mode j, F[j, i] = Pi[i, j] E H_j and Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl
-    sum_i Pi_ij Spread_j(E_i), E_i = E[y~ y~' 1{i}], where Spread_j(E[y~ y~']) is what the randomness of H_j itself adds
-    to Cov(H_j y~). The two maps of a step are independent given its modes.
-    `LinearSystemFilter` filters the result, exactly.
+    (x, its estimate), and the receiver behind the same fading a `measure` with the same chain. The two maps of a step
+    are independent given its modes. With H_j the move in mode j and E_i = E[y~ y~' 1{i}],
+
+        F[j, i] = Pi[i, j] E H_j,
+        Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl sum_i Pi_ij Spread_j(E_i),
+
+    where Spread_j(E[y~ y~']) = E[(H_j - E H_j) y~ y~' (H_j - E H_j)'] is the part of Cov(H_j y~) that the randomness of
+    H_j adds. `LinearSystemFilter` filters the result, exactly.
 
     Args:
         move: motion of y, from n to n numbers; its memories are chains.
@@ -63,7 +66,7 @@ def modal_system(
     start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
     steps = list[Steps]()
     for modes in modes_by_step:
-        # Of the pair (move, measure) in each mode: moments of either.
+        # In each mode the map is a pair (move, measure); moments of each.
         moves, measures = zip(*(m.maps for m in modes.maps if isinstance(m, Stack)), strict=True)
         transition, process, moments = _propagate_modes(_take_moments_by_mode(list(moves)), chain, moments)
         measure_mean, measure_spread = _take_moments_by_mode(list(measures))

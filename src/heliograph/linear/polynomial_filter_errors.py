@@ -255,23 +255,23 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
         states: number of components of x.
         outputs: number of components of z.
     """
-    # The place of each product by the numbers of its factors: (i,) of x_i, (i, j) of x_i x_j.
-    x_places, z_places = _place_products(states), _place_products(outputs)
+    # The index of each product, by the numbers of its factors: (i,) of x_i, (i, j) of x_i x_j.
+    x_indices, z_indices = _index_products(states), _index_products(outputs)
     state = state_moments(square)
     largest = 0.0
     for k in range(square.horizon):
         step, spread = square.step(k), state.covariance[k + 1]
         cross = step.output @ spread
-        # Joint covariance and mean of (products of x, products of z), and the places of x and z themselves in it.
+        # Joint covariance and mean of (products of x, products of z), and the indices of x and z themselves in it.
         joint = np.block([[spread, cross.T], [cross, cross @ step.output.T + step.noise]])
         mean = np.concatenate([state.mean[k + 1], step.output @ state.mean[k + 1] + step.offset])
         first_z = len(spread)
-        linear = [x_places[(i,)] for i in range(states)] + [first_z + z_places[(i,)] for i in range(outputs)]
-        for places, start in ((x_places, 0), (z_places, first_z)):
-            # Places of the product a b, of a and of b.
+        linear = [x_indices[(i,)] for i in range(states)] + [first_z + z_indices[(i,)] for i in range(outputs)]
+        for indices, start in ((x_indices, 0), (z_indices, first_z)):
+            # Indices of the product a b, of a and of b.
             pairs = [
-                (start + product, start + places[(factors[0],)], start + places[(factors[1],)])
-                for factors, product in places.items()
+                (start + product, start + indices[(factors[0],)], start + indices[(factors[1],)])
+                for factors, product in indices.items()
                 if len(factors) == 2
             ]
             largest = max([largest, *(_largest_third_moment(joint, mean, pair, linear) for pair in pairs)])
@@ -284,7 +284,7 @@ def _largest_third_moment(
     """Return the largest |k3(a, b, c)| / (sd a sd b sd c) over c, of numbers with this joint covariance and mean.
 
     k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), the third central moment; sd is a standard deviation.
-    `pair` holds the places of the product a b, of a and of b among the N numbers, and `linear` those of all c.
+    `pair` holds the indices of the product a b, of a and of b among the N numbers, and `linear` those of all c.
     """
     product, a, b = pair
     deviations = np.sqrt(np.diag(joint))
@@ -294,16 +294,16 @@ def _largest_third_moment(
     return float(np.max(ratios))
 
 
-def _place_products(variables: int) -> dict[tuple[int, ...], int]:
+def _index_products(variables: int) -> dict[tuple[int, ...], int]:
     """Return the positions of y_i, by (i,), and of y_i y_j, by (i, j), i <= j, among the monomials up to degree 2.
 
     Monomials are those of degree 2 in (y, 1): y_i is y_i times 1.
     """
     index = {powers: i for i, powers in enumerate(list_exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)
-    places: dict[tuple[int, ...], int] = {
+    indices: dict[tuple[int, ...], int] = {
         (i,): index[tuple(int(v) for v in unit[i] + unit[-1])] for i in range(variables)
     }
     for i, j in combinations_with_replacement(range(variables), 2):
-        places[(i, j)] = index[tuple(int(v) for v in unit[i] + unit[j])]
-    return places
+        indices[(i, j)] = index[tuple(int(v) for v in unit[i] + unit[j])]
+    return indices

@@ -113,15 +113,15 @@ class LinearSystem(Module):
         return max(changes)
 
 
-def repeat_last_step(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
+def repeat_last_step(first_steps: Sequence[np.ndarray], horizon: int) -> np.ndarray:
     """Stack arrays of the first steps (time, ...), and repeat the last one for all later steps of the horizon."""
-    values = np.array(parts)
+    values = np.array(first_steps)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 
 
-def _rounding_or_zero(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the rounding as an array of this shape, zeros where none is given."""
-    numbers: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
+def _rounding_or_zero(rounding: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the rounding as an array of this shape, zeros for None."""
+    numbers: np.ndarray = np.zeros(shape) if rounding is None else array("rounding", rounding, shape)
     return numbers
 
 

@@ -158,8 +158,8 @@ def cholesky(a: Float[Array, "n n"]) -> Float[jax.Array, "n n"]:
 def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[jax.Array, "n k"]:
     """Solve A X = B for a positive semidefinite A and B in its range.
 
-    A row of A that depends on those above it has the row 0 in X: B' X = B' A^+ B whatever that row is. An indefinite A
-    gives NaN.
+    If row i of A depends on those above it, row i of X is chosen as 0. Every solution has the same B' X = B' A^+ B. An
+    indefinite A gives NaN.
 
     Shapes: (n, n), (n, k) -> (n, k).
     """

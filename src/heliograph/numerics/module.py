@@ -144,7 +144,7 @@ def format_on_one_line(value: object, depth: int) -> str:
         return _format_array(value)
 
     def format_part(part: object) -> str:
-        """Return what the value holds on one line, one level deeper."""
+        """Return a part of the value (an entry or a field) on one line, one level deeper."""
         return format_on_one_line(part, depth - 1)
 
     def format_pair(pair: tuple[object, object]) -> str:

@@ -55,10 +55,11 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
+        # The length of chunks, their own rows, is known only after their starts.
         chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, own=0), start, rows)
         if chunk_starts is None:
             return None
-        return _smooth_all(SmootherStepRecursion(filter, chunk_starts.lengths.chunk), chunk_starts, rows)
+        return _smooth_all(SmootherStepRecursion(filter, own=chunk_starts.lengths.chunk), chunk_starts, rows)
 
 
 def smooth_chunk(
@@ -156,8 +157,8 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     # the chunk before it ends. Then from the last one back: each chunk whose smoothed law at its end is wrong.
     rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
     _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
-    parts = results.estimate, results.nis, results.received  # (chunks, own, ...) each
-    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], parts)
+    leaves = results.estimate, results.nis, results.received  # (chunks, own, ...) each
+    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], leaves)
     return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
 
 

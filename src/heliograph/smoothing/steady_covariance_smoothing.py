@@ -51,10 +51,13 @@ class SmootherStepRecursion(Recursion):
 class SmoothedChunk(NamedTuple):
     """Results of a chunk of rows.
 
-    end: the filter's state after its last row. law_after: smoothed law of the state after its last row, with which the
-    backward pass entered the chunk. law_before: smoothed law of the state before its first row, with which the backward
-    pass left the chunk. estimate: smoothed estimate of each row (rows, ...). nis: squared innovation e' S^-1 e of each
-    row, and `received` its number of components (rows,).
+    Attributes:
+        end: the filter's state after its last row.
+        law_after: smoothed law of the state after its last row, with which the backward pass entered the chunk.
+        law_before: smoothed law of the state before its first row, with which the backward pass left the chunk.
+        estimate: smoothed estimate of each row (rows, ...).
+        nis: squared innovation e' S^-1 e of each row (rows,).
+        received: number of components of that innovation (rows,).
     """
 
     end: PyTree

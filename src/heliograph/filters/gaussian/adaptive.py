@@ -102,7 +102,7 @@ class AdaptiveFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
-        """Correct the state and the law of the noise variances with what arrived of z (m,), NaN for what did not."""
+        """Correct the state and the laws of the noise variances with z (m,), NaN where a component did not arrive."""
         # Moments of the measurement without its noise.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
@@ -113,7 +113,7 @@ class AdaptiveFilter(AbstractWrapper):
         # How outliers are weighed: a robust base filter has a rule, or the Gaussian branches of the noise's law. Any
         # other base filter weighs nothing.
         rule = base.rule if isinstance(base, RobustFilter) else None
-        law = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
+        branches = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
             predicted=predicted,
             shape_before=state.shape,
@@ -123,13 +123,13 @@ class AdaptiveFilter(AbstractWrapper):
             variance=jnp.diagonal(jnp.asarray(noise.covariance)),
             memory=jnp.asarray(self.memory),
             rule=rule,
-            law=law,
+            law=branches,
         )
         # The reported innovation is Gaussian, with the noise variances learned before z.
         value, covariance, present = z - predicted.signal - noise.center, learned.covariance, ~jnp.isnan(z)
-        both = present[:, None] & present[None]
+        both_present = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(predicted.signal))
-        innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
+        innovation = Innovation(value, jnp.where(both_present, covariance, jnp.nan), density, learned.weight)
         return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
@@ -290,8 +290,8 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
 
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
-        memory: share of the learned law that a step keeps, above 0 and at most 1 (never forget); so some
-            1 / (1 - memory) values decide a variance (default 0.98).
+        memory: share of the learned law that a step keeps, above 0 and at most 1 (never forget; default 0.98). About
+            1 / (1 - memory) values decide a variance.
 
     Raises:
         ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].

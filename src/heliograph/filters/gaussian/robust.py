@@ -280,6 +280,6 @@ def _innovation_about_mean(
     present = ~jnp.isnan(z)
     expected = before.signal + center
     value, covariance = z - expected, before.columns.covariance + noise
-    both = present[:, None] & present[None]
+    both_present = present[:, None] & present[None]
     density = after.log_density if by_law else log_density(value, covariance, jnp.abs(z) + jnp.abs(expected))
-    return Innovation(value, jnp.where(both, covariance, jnp.nan), density, after.weight)
+    return Innovation(value, jnp.where(both_present, covariance, jnp.nan), density, after.weight)

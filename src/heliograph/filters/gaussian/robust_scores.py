@@ -59,7 +59,8 @@ def update_by_score(before: PredictedMeasurement, z: jax.Array, law: NoiseBranch
     probability p_j, mean m_j and variance r_j. With s_j = V + r_j, u_j = (e - m_j) / s_j and q_j, the posterior
     probability of branch j, in proportion to p_j N(e; m_j, s_j):
 
-        score g = sum_j q_j u_j,  E[t_i | z_i] = E t_i + V g, Var[t_i | z_i] = V (sum_j q_j r_j / s_j + V Var_q u),
+        score g = sum_j q_j u_j,  E[t_i | z_i] = E t_i + V g,
+        Var[t_i | z_i] = V (sum_j q_j r_j / s_j + V Var_q u),
 
     a sum of positive terms, which grows with Var_q u if z_i does not decide between the branches. The law of x given
     t_i stays. The weight is sum_j q_j / s_j over its value at e = 0.
@@ -206,20 +207,23 @@ def expected_squared_residuals(
 def expected_branch_precision(
     before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
 ) -> tuple[jax.Array, jax.Array]:
-    """Return each noise's expected precision sum_j q_j r / r_j (m,) and its mean weighted by precision (m,).
+    """Return each noise's expected precision sum_j q_j r / r_j (m,), and its mean weighted by precision (m,).
 
-    The noise's law is a mixture of Gaussian branches j, with means m_j, variances r_j and logarithms of shares. q_j is
-    the probability of branch j given the component alone, and r is a unit (`scale`). The mean is
-    (sum_j q_j m_j / r_j) / (sum_j q_j / r_j). `before` is the prediction without noise.
+    The noise's law is a mixture of Gaussian branches j of probability p_j, mean m_j and variance r_j. Given the
+    innovation e = t - E t + noise of its component alone, branch j has the probability q_j, in proportion to
+    p_j N(e; m_j, s_j) with s_j = Var t + r_j. r is the unit `scale` (m,). The mean is
+    (sum_j q_j m_j / r_j) / (sum_j q_j / r_j). `before` is the prediction of t, the measurement without that noise.
     """
-    log_share, mean, variance, branch_variance = law
-    total = jnp.maximum(before.columns.diagonal[:, None] + variance, branch_variance)
+    # `law.least` is r_j. `law.variance` also has the covariance of a random gain, which acts on t too, and may be
+    # lower.
+    log_share, mean, variance, least = law
+    s = jnp.maximum(before.columns.diagonal[:, None] + variance, least)
     difference = e[:, None] - mean
-    log_weight = log_share - (difference**2 / total + jnp.log(total)) / 2
-    weight = jnp.exp(log_weight - jnp.max(log_weight, axis=1, keepdims=True))  # relative to the largest
-    precision = weight * scale[:, None] / branch_variance
+    log_q = log_share - (difference**2 / s + jnp.log(s)) / 2
+    q = jnp.exp(log_q - jnp.max(log_q, axis=1, keepdims=True))  # relative to the largest, so they do not sum to 1
+    precision = q * scale[:, None] / least
     sum_of_precisions = jnp.sum(precision, axis=1)
-    return sum_of_precisions / jnp.sum(weight, axis=1), jnp.sum(precision * mean, axis=1) / sum_of_precisions
+    return sum_of_precisions / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / sum_of_precisions
 
 
 def _stack_entries(entries: list[jax.Array]) -> jax.Array:

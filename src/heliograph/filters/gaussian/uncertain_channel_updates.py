@@ -164,10 +164,7 @@ class ZeroMean(AbstractUpdate):
     scalar: np.ndarray
 
     def __init__(self, scalar: float | None = None):
-        """Keep beta, the positive scalar of the bound `P + beta Pxy Pyy^-1 Pyx ...`; None, stored as NaN, minimises it.
-
-        None means that each step takes the beta of least trace.
-        """
+        """Keep beta, the positive scalar of the bound; with None, stored as NaN, each step takes the best one."""
         self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
@@ -184,8 +181,9 @@ class ZeroMean(AbstractUpdate):
 class Interval(AbstractUpdate):
     """Young's bound with each hop's uncertainty as intervals of its moments, combined hop by hop.
 
-    With m, s = E g, E g^2 and radii r = sum |v_i| radius_i, q = sum v_i^2 radius_i of each hop:
-    var g <= s + q - max(|m| - r, 0)^2. Sound, looser than `Polytope`, and for chains of scalar hops only.
+    A hop's gain g has values v_i with probabilities that are known within radius_i. With m = E g, s = E g^2 by the
+    nominal law, r = sum |v_i| radius_i and q = sum v_i^2 radius_i, var g <= s + q - max(|m| - r, 0)^2. An upper bound
+    like `Polytope`, but looser, and for chains of scalar hops only.
 
     Args:
         scalars: beta_1 and beta_2 as in `Polytope`; None, the default, minimises the trace over them at each step.
@@ -273,7 +271,7 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
         variance: returns the bound `var` on the variance of a hop's g.
     """
     hops = [_describe_hop(hop) for hop in channel.in_series]
-    # The recursion over the hops.
+    # V (`spread`), S (`power`) and N (`noise`), hop after hop.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:
         spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread

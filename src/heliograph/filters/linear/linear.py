@@ -280,16 +280,16 @@ def linear_filter(
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
-    whole = stack_over_time(described)
+    moments = stack_over_time(described)
     start = first(plant)
     return LinearFilter(
         plant=plant,
         sensor=sensor,
         channel=described,
         rule=rule,
-        mean_known=not whole.uncertain or has_known_mean(whole),
+        mean_known=not moments.uncertain or has_known_mean(moments),
         **make_sizes(
-            lower_claim_by_noise(rule.claim(whole.uncertain), plant, sensor, channel),
+            lower_claim_by_noise(rule.claim(moments.uncertain), plant, sensor, channel),
             start,
             first(channel).outputs,
         ),
@@ -350,7 +350,7 @@ def memoryless_filter(
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
     check_linear("memoryless filter", plant, sensor)
-    forgets, matters = without_memory(channel), memory_matters(channel)
+    memoryless_channel, is_memory_relevant = without_memory(channel), memory_matters(channel)
 
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
         """Return the filter of a channel without memory.
@@ -360,11 +360,12 @@ def memoryless_filter(
         """
         filter = linear_filter(plant, sensor, channel, update)
         assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
-        return _claim_nominal(filter) if matters else filter
+        return _claim_nominal(filter) if is_memory_relevant else filter
 
     # Delays: the same filter for the system enlarged by past signals.
-    is_late = check_maps("channel", [first(forgets)])[0].past
-    return wrappers.build_behind_delays(plant, sensor, forgets, make) if is_late else make(plant, sensor, forgets)
+    if check_maps("channel", [first(memoryless_channel)])[0].past:
+        return wrappers.build_behind_delays(plant, sensor, memoryless_channel, make)
+    return make(plant, sensor, memoryless_channel)
 
 
 def as_current_filter(

@@ -6,8 +6,9 @@ subtracts nothing large. So a step is written in covariances, and each of its nu
 computed by factors. With C = P- H', S = H C + R, K = C S^-1, w = S^-1 e, a dash for the transpose and d for the
 derivative by one parameter,
 
-    dm- = F dm + dF m + db,   dP- = F dP F' + dF P F' + F P dF' + dQ, de = dz - (H dm- + dH m- + dc),   dC = dP- H' + P-
-    dH',   dS = H dC + dH C + dR, dm = dm- + K de + (dC - K dS) w,   dP = dP- - dC K' - K dC' + K dS K'.
+    dm- = F dm + dF m + db,   dP- = F dP F' + dF P F' + F P dF' + dQ,
+    de = dz - (H dm- + dH m- + dc),   dC = dP- H' + P- dH',   dS = H dC + dH C + dR,
+    dm = dm- + K de + (dC - K dS) w,   dP = dP- - dC K' - K dC' + K dS K'.
 
 The last is that of P = P- - C S^-1 C'. The log-density has the derivative -w' de - tr((S^-1 - w w') dS) / 2. The
 derivatives of m, P and the log-density are written out below; JAX derives the others, and the adjoint of all. A row of

@@ -71,7 +71,7 @@ class ClockFilter(AbstractWrapper):
 
     Args:
         base: the joint filter of plant and clocks.
-        offsets: place of each clock's offset in the state; its drift is the next state.
+        offsets: index of each clock's offset in the state; its drift is the next state.
 
     Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
     """

@@ -99,7 +99,10 @@ class FilterOfInputs(AbstractWrapper):
 def build_filter_of_inputs(
     plant: AnyPlant, sensor: AnySensor, channel: Channel | None, make: Callable[[AnySensor], AbstractFilter]
 ) -> FilterOfInputs:
-    """Build the filter of a plant, of a sensor that depends on its inputs, and of a channel.
+    """Build the filter of a plant, of a sensor that depends on the plant's inputs, and of a channel.
+
+    `make` builds the filter of a sensor without inputs. It is called once, with the sensor under typical inputs; the
+    result then gets the sensor under each step's inputs in its place.
 
     Raises:
         ValueError: inputs that the plant does not have; a link that is late, behind which a measurement is one of

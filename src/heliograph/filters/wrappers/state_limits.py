@@ -99,8 +99,9 @@ class LimitedFilter(AbstractSizedFilter):
 
         `without` is the index of a state whose limits are left out, or None.
         """
-        others = self if without is None else replace(self, limits=tuple(x for x in self.limits if x[0] != without))
-        return others._condition_with_log_probability(state)[1]
+        other_limits = tuple(limit for limit in self.limits if limit[0] != without)
+        filter = self if without is None else replace(self, limits=other_limits)
+        return filter._condition_with_log_probability(state)[1]
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the base filter, whose smoothed estimates are then conditioned on the limits.
@@ -174,22 +175,22 @@ class LimitedFilter(AbstractSizedFilter):
             return log_mass, state._replace(believed=inner)
         if isinstance(state, particles.StateParticles):
             return self._condition_particles(state)
-        held = self._hold_means(state)
-        x = Gaussian(*map(jnp.asarray, gaussian_of(held)))
+        held_state = self._hold_means(state)
+        x = Gaussian(*map(jnp.asarray, gaussian_of(held_state)))
         if x.mean.ndim == 1:
-            log_mass, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)
-            return log_mass[0], with_gaussian(held, jax.tree.map(lambda leaf: leaf[0], inside))
+            log_mass, truncated = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)
+            return log_mass[0], with_gaussian(held_state, jax.tree.map(lambda leaf: leaf[0], truncated))
         # A mixture: each Gaussian a is truncated, and its weight becomes w_a P_a(within) over their sum. If all
         # P_a(within) are 0 to rounding, the weights stay.
-        log_masses, inside = truncate_to_limits(x, self.limits)
-        weight = jnp.asarray(held.weight)
+        log_masses, truncated = truncate_to_limits(x, self.limits)
+        weight = jnp.asarray(held_state.weight)
         per_gaussian = (-1, *[1] * (weight.ndim - 1))  # one number for each Gaussian, along the first axis
         weight_within = weight * jnp.exp(log_masses).reshape(per_gaussian)
         mass = jnp.sum(weight_within)
         is_possible = mass > 0
         weight = jnp.where(is_possible, weight_within / jnp.where(is_possible, mass, 1.0), weight)
         log_mass = jnp.where(is_possible, jnp.log(jnp.where(is_possible, mass, 1.0)), -jnp.inf)
-        return log_mass, held._replace(gaussian=inside, weight=weight)
+        return log_mass, held_state._replace(gaussian=truncated, weight=weight)
 
     def _condition_particles(self, state: "particles.StateParticles") -> tuple[jax.Array, "particles.StateParticles"]:
         """Return log P(within the limits), and the particles given that: those outside get the weight 0.

@@ -254,8 +254,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         make: builds a filter from a plant, a sensor and a link of known law.
 
     Claim (what the covariance is): that of the filter for typical numbers; "nominal" if the numbers depend on the
-    state,
-    or if they leave something random that is not drawn anew with each message.
+    state, or if they leave something random that is not drawn anew with each message.
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.

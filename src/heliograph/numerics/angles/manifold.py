@@ -17,15 +17,15 @@ from heliograph.numerics.angles.rotation_vectors import turn, turn_between
 from heliograph.numerics.types import Array
 
 A = TypeVar("A", jax.Array, np.ndarray)
-Rotations = Angles  # places of rotation vectors, three after three
+Rotations = Angles  # indices of the components of rotation vectors, three for each vector
 
 
 class Manifold(NamedTuple):
     """Which states are angles, and which, three by three, are rotation vectors of attitudes; all others are real.
 
     Args:
-        angles: places of angles.
-        rotations: places of rotation vectors, three of each attitude.
+        angles: indices of angles.
+        rotations: indices of the components of rotation vectors, three for each attitude.
     """
 
     angles: Angles = ()

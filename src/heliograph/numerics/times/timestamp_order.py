@@ -19,11 +19,11 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     """
     if np.all(time[1:] >= time[:-1]):
         return np.zeros(len(time), dtype=bool)
-    # From the end, so that of equally long subsequences the one with the earlier rows is kept: negated times, last row
-    # first, do not fall along a subsequence exactly where the times do not.
+    # Searched from the end, so that of equally long subsequences the one with the earlier rows remains. Negated times,
+    # last row first, do not decrease along a subsequence if and only if the times do not.
     reversed_times = (-time.astype(np.int64) if time.dtype.kind in "Mi" else -time)[::-1].tolist()
-    # Of the subsequences of length k + 1 found so far, the least last value and its row; and for each row the one
-    # before it in the longest subsequence that ends with it, -1 for none.
+    # For each k, among the subsequences of length k + 1 found so far, the least last value and its row. And for each
+    # row the row before it in the longest subsequence that ends with it, -1 for none.
     least_ends, end_rows = list[float](), list[int]()
     previous = list[int]()
     for row, value in enumerate(reversed_times):
@@ -77,8 +77,7 @@ def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, 
 
     - it lies between two stretches that are less than a year apart and together have more messages;
     - it is the first one, its stamps are of the first year since 1970, where clocks begin to count, and all others are
-    of
-      this century.
+      of this century.
 
     Args:
         time: the stamps.
