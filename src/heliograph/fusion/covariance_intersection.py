@@ -287,12 +287,19 @@ def intersect_shares(believed: NeighbourEstimates, shares: Float[jax.Array, " de
 
 
 def intersection_weights(believed: NeighbourEstimates, shared: Shared) -> NeighbourWeights:
-    """Return the weights C_j = Pc pi_j P_j^-1 and Pc."""
+    """Return the weights C_j = P (pi_j P_j^-1) of covariance intersection with shares pi_j, and its covariance P.
+
+    `believed`: the estimates that arrived, with P_j^-1. `shared`: (shares, P).
+    """
     shares, covariance = shared
-    return NeighbourWeights(covariance, shares[:, None, None] * believed.information, covariance)
+    return NeighbourWeights(
+        common_factor=covariance,
+        neighbour_factors=shares[:, None, None] * believed.information,
+        covariance=covariance,
+    )
 
 
 def _smaller_trace(a: Shared, b: Shared) -> Shared:
-    """Return those shares, with their covariance, whose intersection has the smaller trace."""
+    """Return the one of two intersections, each (shares, covariance), whose covariance has the smaller trace."""
     is_first = jnp.trace(a[1]) <= jnp.trace(b[1])
     return jnp.where(is_first, a[0], b[0]), jnp.where(is_first, a[1], b[1])

@@ -71,11 +71,10 @@ class Fusion(Module):
         rounds: int = 1,
         alpha: Float[ArrayLike, ""] | None = None,
     ):
-        """Check the arguments, which the class describes, and that they go together.
+        """Check and store the rule, what is fused (the filter of this name), and how estimates are exchanged.
 
-        `filter` is the name of a filter, `alpha` the threshold of a node that sends only where its estimate changed.
-        Without `neighbours` the fusion is at a centre, to which the uplink belongs; links between nodes, several rounds
-        and the threshold belong to a fusion between neighbours.
+        Without `neighbours` the fusion is at a centre, to which uplinks lead. With them messages go over the `link`
+        between two nodes, in one or more `rounds` a step, perhaps only if an estimate has moved by more than `alpha`.
         """
         self.filter = instance("filter of a fusion", filter, str, "its name")
         self.rule = instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")

@@ -288,7 +288,7 @@ class EscapeQuantizer(AbstractQuantizer):
         smallest: Float[ArrayLike, "*n"],
         interval: int | None = None,
     ):
-        """Check the arguments, which the class describes; even the smallest amplitude must hold all levels apart."""
+        """Check the parameters; even at the smallest amplitude neighbouring levels must differ as numbers."""
         self.levels = check_levels(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)

@@ -130,7 +130,7 @@ class ReportLink(Module):
     every: int = eqx.field(static=True)
 
     def __init__(self, channel: Channel | None = None, delay: Float[ArrayLike, "*ages"] = 0, every: int = 1):
-        """Check the arguments, which the class describes; hold the delay as probabilities of 0, 1, ... steps."""
+        """Check the channel, the delay and every how many steps it sends; store the probability of each delay."""
         self.channel, self.every = channel, check_count("every", every)
         if channel is not None:
             instance("channel of a report link", first(channel), AbstractRandomAffine, "a random affine map")

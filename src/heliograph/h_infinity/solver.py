@@ -238,14 +238,14 @@ class HorizonProblem:
         self.places = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        # The weight before a step is `fixed` plus linear maps of unknowns, `before` by their place. At the start it is
-        # level^2 W, which is linear in an unknown, or P_0, which is fixed and must be below that.
-        largest = {0: (1 - MARGIN) * weight.ravel()[:, None]}
+        # The weight P before a step is a constant plus linear maps of unknowns, by the place of these in the vector. At
+        # the start it is nearly level^2 W, which is linear in the level squared; or it is P_0, a constant below that.
+        largest_initial = {0: (1 - MARGIN) * weight.ravel()[:, None]}
         if initial is None:
-            before, fixed = largest, np.zeros_like(weight)
+            weight_forms, weight_constant = largest_initial, np.zeros_like(weight)
         else:
-            self._require_semidefinite(largest, -initial)
-            before, fixed = dict[int, np.ndarray](), initial
+            self._require_semidefinite(largest_initial, -initial)
+            weight_forms, weight_constant = dict[int, np.ndarray](), initial
         start: np.ndarray | None = weight if initial is None else initial
         forms: LinearForms | None = None
         # Every step's inequality, from the weight before it to its own.
@@ -254,10 +254,11 @@ class HorizonProblem:
             is_like_last = forms is not None and layout.gain is None and all(map(np.array_equal, step, steps[k - 1]))
             if forms is None or not is_like_last:
                 forms = make_linear_forms(step, layout)
-            self._add_step(k, step, forms, before, fixed, start)
+            self._add_step(k, step, forms, weight_forms, weight_constant, start)
             multipliers = self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :]
             self.constraints.append(multipliers >= 0)
-            before, fixed, start = {k + 1: forms.weight}, np.zeros_like(weight), None
+            # The weight before the next step is an unknown of this one.
+            weight_forms, weight_constant, start = {k + 1: forms.weight}, np.zeros_like(weight), None
         level_squared = self.unknowns[0]
         self.problem = cp.Problem(cp.Minimize(level_squared), self.constraints)
 
@@ -266,33 +267,37 @@ class HorizonProblem:
         k: int,
         step: StepMatrices,
         forms: LinearForms,
-        before: dict[int, np.ndarray],
-        fixed: Float[np.ndarray, "w w"],
+        weight_forms: dict[int, np.ndarray],
+        weight_constant: Float[np.ndarray, "w w"],
         start: Float[np.ndarray, "w w"] | None,
     ) -> None:
         """Add the inequality -Phi >= MARGIN level^2 of step k, and that its positive matrices are positive.
 
+        eta'Phi eta = E[x+'P1 x+ + e+'P2 e+] + |M e|^2 - level^2 |(v, rho)|^2 + growth forms - (x, e)'P (x, e), for the
+        vector eta of all that the step depends on, of length q.
+
         Args:
-            k: the step; its unknowns are at place k + 1, the level squared at place 0.
+            k: the step; its unknowns are at place k + 1 of the vector, the level squared at place 0.
             step: its matrices in scaled coordinates.
             forms: matrices of the step as linear maps of its unknowns.
-            before: the weight before the step as linear maps of unknowns, by their place.
-            fixed: what of that weight is known.
+            weight_forms: P, the weight before the step, as linear maps of unknowns by their place.
+            weight_constant: the part of P without unknowns.
             start: an initial weight that may couple x and e, at the first step; else None.
         """
-        q, width = len(step.energy), len(fixed)
-        # -Phi = level^2 energy - target + weight before - next energy. It falls apart into blocks: `coupled` are the
-        # components of eta of a block, `entries` the places of the block in the flat q x q matrix.
+        q, width = len(step.energy), len(weight_constant)
+        # Phi is block-diagonal after a permutation: `block` holds the indices of eta of one block, `entries` those of
+        # its entries in the matrix (q, q) written row by row.
         constant = -step.target
-        constant[:width, :width] += fixed
-        for coupled in find_independent_parts(step, forms, start):
-            entries = (coupled[:, None] * q + coupled).ravel()
-            blocks = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
-            for index, form in before.items():
+        constant[:width, :width] += weight_constant
+        for block in find_independent_parts(step, forms, start):
+            entries = (block[:, None] * q + block).ravel()
+            # -Phi as a linear map of the unknowns at each place: of the level squared, this step's, and those of P.
+            maps = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
+            for place, form in weight_forms.items():
                 padded = np.zeros((q, q, form.shape[1]))
                 padded[:width, :width] = form.reshape(width, width, -1)
-                blocks[index] = blocks.get(index, 0.0) + padded.reshape(q * q, -1)[entries]
-            self._require_semidefinite(blocks, constant[np.ix_(coupled, coupled)])
+                maps[place] = maps.get(place, 0.0) + padded.reshape(q * q, -1)[entries]
+            self._require_semidefinite(maps, constant[np.ix_(block, block)])
         # Positive matrices of the unknowns.
         for form in forms.positive:
             size = math.isqrt(len(form))
@@ -300,19 +305,18 @@ class HorizonProblem:
                 {0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size))
             )
 
-    def _require_semidefinite(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
-        """Require sum_i blocks_i (unknowns in place i) + constant, a matrix row by row, to be positive semidefinite.
+    def _require_semidefinite(self, maps: dict[int, np.ndarray], constant: np.ndarray) -> None:
+        """Require sum_i maps_i (unknowns at place i) + constant, a matrix row by row, to be positive semidefinite.
 
-        `blocks` maps the number of a group of unknowns to its matrix. `self.places` says where each group lies in the
-        vector of all unknowns.
+        `maps` has the matrix of each place. `self.places` says where a place's unknowns lie in the vector of all.
         """
         # One sparse matrix maps the vector of all unknowns to the sum.
         values, rows, columns = [], [], []
-        for index, block in blocks.items():
-            block_rows, block_columns = np.nonzero(block)
-            values.append(block[block_rows, block_columns])
-            rows.append(block_rows)
-            columns.append(block_columns + self.places[index].start)
+        for place, matrix_of_map in maps.items():
+            map_rows, map_columns = np.nonzero(matrix_of_map)
+            values.append(matrix_of_map[map_rows, map_columns])
+            rows.append(map_rows)
+            columns.append(map_columns + self.places[place].start)
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         form = csr_array(entries, shape=(constant.size, self.unknowns.size))
         matrix = import_cvxpy().reshape(form @ self.unknowns, constant.shape, order="C") + constant

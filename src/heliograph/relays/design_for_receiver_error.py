@@ -238,14 +238,15 @@ def _choose_step_units(
     moments = jnp.asarray(propagate_error_moments(steps, start, gains).moments)
     # Cost and barrier of step k alone, by the moments after it: d/dp of -t log(limit - p) is t / (limit - p).
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
-    own_gradient = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
+    gradients_of_steps = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
         """Return the cost's gradient by the moments before a step, and the units in which the step's gains change."""
-        step, gain, moments_before, own = row  # own: the gradient of the step's own cost by the moments after it
-        lam = later + own  # the gradient of the whole cost by the moments after the step
+        step, gain, moments_before, gradient_of_step = row
+        # Lam, the gradient by the moments after the step: of the cost of later steps, and of this step's own.
+        lam = later + gradient_of_step
         uncorrected, _ = step_moments(step, moments_before)
         hessian, _ = gain_hessian(uncorrected, lam, step, DAMPING)
         # 1 for a gain on what is transmitted, else 0: such a gain stays.
@@ -255,7 +256,7 @@ def _choose_step_units(
         unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, jnp.diag(is_free))
         return moment_adjoint(step, gain, lam), is_free[:, None] * unit
 
-    items = (steps, jnp.asarray(gains), moments[:-1], own_gradient)
+    items = (steps, jnp.asarray(gains), moments[:-1], gradients_of_steps)
     _, units = jax.lax.scan(step_back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)
     return units
 

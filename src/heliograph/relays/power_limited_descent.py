@@ -115,7 +115,7 @@ def _find_largest_entries(
 
 def _penalise_power(
     traces: Float[jax.Array, "slots"],
-    sound: Bool[jax.Array, ""],
+    converges: Bool[jax.Array, ""],
     power: Float[jax.Array, "slots"],
     limit: Float[Array, "slots"],
     multipliers: Float[Array, "slots"],
@@ -123,11 +123,11 @@ def _penalise_power(
     """Return log sum_s trace_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, g = power / limit - 1, c the STIFFNESS.
 
     In slot s, trace_s is that of the receiver's error covariance, g_s the relative excess over the limit of power, and
-    lambda_s its multiplier in an augmented Lagrangian. The value is infinite if the moments are not `sound`, so that a
-    search turns back.
+    lambda_s its multiplier in an augmented Lagrangian. The value is infinite unless the errors converge (`converges`),
+    so that a search turns back.
     """
     total = jnp.sum(traces)
-    has_cost = sound & (total > 0)
+    has_cost = converges & (total > 0)
     excess = jnp.maximum(0.0, multipliers + STIFFNESS * (power / limit - 1))
     penalty = jnp.sum(excess**2) / (2 * STIFFNESS)
     return jnp.where(has_cost, jnp.log(jnp.where(has_cost, total, 1.0)) + penalty, jnp.inf)

@@ -144,51 +144,51 @@ class UsableMeasurements(NamedTuple):
     Args:
         system: the plant, measured by sums of what arrives.
         kinds: flags of the components that arrive.
-        parts: the sums that are used in each kind.
+        known_sums: the sums D z of received numbers z that are used in each kind.
     """
 
     system: KnownLossSystem
     kinds: list[tuple[bool, ...]]
-    parts: list["KnownGainSums"]
+    known_sums: list["KnownGainSums"]
 
     @property
     def exact(self) -> bool:
-        """True where nothing that arrives is left out."""
-        return all(part.exact for part in self.parts)
+        """True if the gains of all sums are known on the whole state, and their offsets: the noises are then exact."""
+        return all(sums.exact for sums in self.known_sums)
 
     @property
     def random(self) -> bool:
-        """True where random gains make something unusable."""
-        return any(part.random for part in self.parts)
+        """True if some combination of received numbers is not used, since its gain is random."""
+        return any(sums.random for sums in self.known_sums)
 
     def map_gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
         """Return K D (n, received) by kind: gains on what arrives, from gains K on its sums D z of known gain."""
-        return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
+        return {kind: k @ sums.combine for kind, k, sums in zip(self.kinds, gains, self.known_sums, strict=True)}
 
 
 def _find_usable_measurements(
-    a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]
+    a: np.ndarray, q: np.ndarray, links: JointLinks, basis: Float[np.ndarray, "n d"]
 ) -> UsableMeasurements:
-    """Return what a receiver can use in each kind of losses: the sums of what arrives of known gain on a subspace of x.
+    """Return for each pattern of what arrives the sums of received numbers whose gain on a subspace of x is known.
 
-    A kind of losses is a pattern of which components arrive, all that the receiver sees of the channel's mode. Gains
-    that differ between modes of one kind are unknown.
+    The pattern of arriving components (a kind of losses) is all that the receiver sees of the channel's mode. Gains
+    that differ between modes with one pattern are unknown to it.
 
     Args:
         a: A (n, n).
         q: Cov w (n, n).
         links: joint model of all links.
-        space: basis of the subspace, one column each.
+        basis: of the subspace, one column each.
     """
-    # All outcomes of all modes one after another: of each its mode, and its pattern of what arrives.
-    outcomes = [outcome for of_mode in links.outcomes for outcome in of_mode]
-    mode = np.array([i for i, of_mode in enumerate(links.outcomes) for _ in of_mode])
+    # All outcomes of all modes one after another, the mode of each, and its pattern of what arrives.
+    outcomes = [outcome for outcomes_of_mode in links.outcomes for outcome in outcomes_of_mode]
+    mode = np.array([i for i, outcomes_of_mode in enumerate(links.outcomes) for _ in outcomes_of_mode])
     patterns = [tuple(outcome.arrived.tolist()) for outcome in outcomes]
     # Kinds of losses, which kind each outcome is, and the sums of known gain in each kind.
     kinds = list(dict.fromkeys(patterns))
     kind_of_outcome = np.array([kinds.index(pattern) for pattern in patterns])
-    parts = [
-        _find_known_sums([o for o, pattern in zip(outcomes, patterns, strict=True) if pattern == kind], links, space)
+    known_sums = [
+        _find_known_sums([o for o, pattern in zip(outcomes, patterns, strict=True) if pattern == kind], links, basis)
         for kind in kinds
     ]
     # Chain of (mode, outcome), with its long-run law.
@@ -196,10 +196,11 @@ def _find_usable_measurements(
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
     noises = tuple(
-        parts[kind].find_noise_of_sums(outcome, links) for outcome, kind in zip(outcomes, kind_of_outcome, strict=True)
+        known_sums[kind].find_noise_of_sums(outcome, links)
+        for outcome, kind in zip(outcomes, kind_of_outcome, strict=True)
     )
-    system = KnownLossSystem(a, q, chain, law, kind_of_outcome, tuple(part.rows for part in parts), noises)
-    return UsableMeasurements(system, kinds, parts)
+    system = KnownLossSystem(a, q, chain, law, kind_of_outcome, tuple(sums.rows for sums in known_sums), noises)
+    return UsableMeasurements(system, kinds, known_sums)
 
 
 class KnownGainSums(NamedTuple):
@@ -209,8 +210,8 @@ class KnownGainSums(NamedTuple):
         combine: D, r sums of m received components.
         rows: their gain on x.
         mean: of the channel's gain and offset, over the outcomes that look the same; p: measured components.
-        exact: nothing that arrives is left out, and offsets are known.
-        random: something is left out.
+        exact: the gain is known on the whole state, and the offset too, so that the noise does not depend on the state.
+        random: some combination of what arrives is left out, since its gain is random.
     """
 
     combine: Float[np.ndarray, "r m"]
@@ -240,37 +241,38 @@ class KnownGainSums(NamedTuple):
 
 
 def _find_known_sums(
-    alike: Sequence[ArrivalOutcome], links: JointLinks, space: Float[np.ndarray, "n d"]
+    outcomes: Sequence[ArrivalOutcome], links: JointLinks, basis: Float[np.ndarray, "n d"]
 ) -> KnownGainSums:
-    """Return the sums of known gain: the null space of E[(G - M) H Y Y' H' (G - M)'] over outcomes that look the same.
+    """Return the sums D z of received numbers z = G (H x + v) whose gain D G H is the same in all these outcomes.
 
-    G is the random gain of mean M, H the sensors' matrix, Y (n, d) the basis `space` of the states that matter.
-    `alike`: the outcomes, in which the same components arrive.
+    The same components arrive in the `outcomes`, so that a receiver cannot tell them apart. G is random, of mean M over
+    them, and H the sensors' matrix. The gain is to be known on the span of Y = `basis`: it is if D (G - M) H Y = 0
+    always. So D spans the null space of V = E[(G - M) H Y Y' H' (G - M)'].
     """
     # E G, and E[G_ia G_jb] as [i, j, a, b], of each outcome; the last column of G is its offset. M is their mean.
-    moments = [second_moments(outcome.map) for outcome in alike]
+    moments = [second_moments(outcome.map) for outcome in outcomes]
     mean = np.mean([mean_of_outcome for mean_of_outcome, _ in moments], axis=0)
-    arrived = np.flatnonzero(alike[0].arrived)
+    arrived = np.flatnonzero(outcomes[0].arrived)
     rows = mean[:, :-1] @ links.sensing  # M H
-    seen = links.sensing @ space @ (links.sensing @ space).T  # H Y Y' H'
-    # Spread of the gain in mean square, E[G seen G'] - M seen M', as correlations of what arrives.
-    second = np.mean([np.einsum("ijab,ab->ij", t[..., :-1, :-1], seen) for _, t in moments], axis=0)
-    about = mean[:, :-1] @ seen @ mean[:, :-1].T
+    sensed = links.sensing @ basis @ (links.sensing @ basis).T  # S = H Y Y' H'
+    # V = E[G S G'] - M S M', scaled as the correlations of what arrives.
+    second = np.mean([np.einsum("ijab,ab->ij", t[..., :-1, :-1], sensed) for _, t in moments], axis=0)
+    of_mean = mean[:, :-1] @ sensed @ mean[:, :-1].T
     scale = np.sqrt(np.diag(second)[arrived])
     scale = np.where(scale > 0, scale, 1.0)
-    spread = (second - about)[np.ix_(arrived, arrived)] / scale / scale[:, None]
-    # Its eigenvectors of eigenvalue zero, taken back to the units of what arrives, are the sums of known gain.
-    values, vectors = np.linalg.eigh(spread)
+    variance = (second - of_mean)[np.ix_(arrived, arrived)] / scale / scale[:, None]
+    # Its eigenvectors of eigenvalue zero, taken back to the units of what arrives, are the rows of D.
+    values, vectors = np.linalg.eigh(variance)
     is_known = values <= CERTAIN
     combine = np.zeros((int(np.sum(is_known)), len(mean)))
     combine[:, arrived] = vectors[:, is_known].T / scale
     offset_is_known = all(np.array_equal(mean_of_outcome[:, -1], mean[:, -1]) for mean_of_outcome, _ in moments)
-    all_states = space.shape[1] == len(space)
+    spans_all_states = basis.shape[1] == len(basis)
     return KnownGainSums(
         combine=combine,
         rows=combine @ rows,
         mean=mean,
-        exact=all_states and offset_is_known,
+        exact=spans_all_states and offset_is_known,
         random=len(combine) < len(arrived),
     )
 

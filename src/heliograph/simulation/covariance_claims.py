@@ -53,10 +53,10 @@ class MistakenBelief(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the belief as a sentence such as "filter 'f' believes another channel than node 'a'".
+        """Return the mistake as a sentence such as "filter 'f' believes another channel than node 'a'".
 
         FUSED is the name under which central filters stand. RANGE in `self.parts` says that limits refuse some
-        readings. UNSAID says that the filter does not tell which models it believes.
+        readings. UNSAID says that the filter does not tell for which models it was made.
         """
         place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
         reason = ", where limits refuse some" if RANGE in self.parts else ""
@@ -169,7 +169,7 @@ def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilt
 
 
 def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
-    """Return the parts of the model in which a filter believes another world than that of its place, `own`."""
+    """Return in which parts of the model (such as "sensor") a filter differs from the models at its node, `own`."""
     return (UNSAID,) if filter.premise is None else list_differences(filter.premise, own)
 
 
@@ -271,7 +271,7 @@ def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) ->
     """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report.
 
     Raises:
-        ValueError: an informed rule that lacks what it has to know.
+        ValueError: a rule that needs the joint covariance of the nodes' errors, which cannot be computed here.
     """
     if isinstance(fusion, AbstractFilter):
         return fusion.claim
@@ -279,7 +279,7 @@ def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) ->
     # A rule that needs nothing but the estimates.
     if not isinstance(fusion.rule, AbstractInformedFusion):
         return fusion.claim([network.nodes[n].filters[fusion.filter].claim for n in names])
-    # An informed rule: it needs the joint moments of the errors, and so all links between them and itself.
+    # A rule that needs the joint moments of the errors, and so a model of all links from the sensors to the centre.
     rule = type(fusion.rule).__name__
     if fusion.quantizer is not None and not fusion.by_report:
         raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")

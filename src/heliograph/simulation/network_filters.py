@@ -127,14 +127,14 @@ class AllFilters(Module):
     ) -> CentreState | dict[str, LinearisedFusionState]:
         """Return a centre's state before the first step, from the initial means of the filters that it fuses.
 
-        `states`: states of the nodes' filters by kind, a stack of filters of one structure. The means of a kind are
-        rows (filter and node, n), filter after filter. `centre.sources`: (kind, number within the kind) of each filter
-        it fuses.
+        `states`: states of the nodes' filters by kind, a stack of filters of one structure. `centre.sources`: (kind,
+        number within the kind) of each filter that it fuses.
         """
         means = []
-        for kind, filter in centre.sources:
+        for kind, number in centre.sources:
+            # The rows of a stack are (filter and node), filter after filter.
             means_by_filter = gaussian_of(states[kind]).mean.reshape(self.alike[kind].count, -1, self.n)
-            means.append(means_by_filter[filter])
+            means.append(means_by_filter[number])
         return centre.init(means)
 
     @property
@@ -162,9 +162,9 @@ class AllFilters(Module):
         return matrices
 
     def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Return the states of the nodes' filters by kind after step k, for measurements of zero."""
-        kinds = enumerate(zip(self.alike, states, strict=True))
-        return tuple(alike.step(state, self._make_zeros(kind), u, k)[0] for kind, (alike, state) in kinds)
+        """Return the states of the nodes' filters by kind after step k with measurements of zero, for their gains."""
+        stacks = enumerate(zip(self.alike, states, strict=True))
+        return tuple(stack.step(state, self._make_zeros(kind), u, k)[0] for kind, (stack, state) in stacks)
 
     def _make_zeros(self, kind: int) -> jax.Array:
         """Return measurements (node, received) of zero for the nodes of a kind."""
@@ -243,14 +243,15 @@ class AllFilters(Module):
         k: jax.Array,
         skip: Mapping[str, jax.Array],
     ) -> dict[str, tuple[PyTree, StepOutput]]:
-        """Return the next state and the output of each central filter, by name, on the measurements of all groups.
+        """Return the next state and the output of each central filter, by name, on the measurements of all nodes.
 
-        Arguments as of `step`; `states` and `skip` by name of the filter.
+        `states`: before the step, by name. `z`: measurements (node, received) by group of nodes. `u`, `k`: inputs of
+        the plant over the step, and its number. `skip`: codes of reasons not to use the measurements, by name.
         """
-        joined = jnp.concatenate([jnp.ravel(values) for values in z])
-        joined = joined if self.order is None else joined[self.order]
+        z_in_order = jnp.concatenate([jnp.ravel(values) for values in z])  # group after group
+        z_in_order = z_in_order if self.order is None else z_in_order[self.order]  # node after node
         return {
-            name: filter_step(filter, states[name], joined, u, k, self.smooths, self.judges, skip.get(name))
+            name: filter_step(filter, states[name], z_in_order, u, k, self.smooths, self.judges, skip.get(name))
             for name, filter in self.central.items()
         }
 

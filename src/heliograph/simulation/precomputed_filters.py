@@ -39,19 +39,20 @@ def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
 
     One program computes all filters: this library's native code, or XLA if native code refuses them.
     """
-    count = alike.count * alike.nodes
+    count = alike.count * alike.nodes  # of filters in the stack
     arguments = alike.filters, u, alike.smooths
     with jax.enable_x64(True):
+        # Native code runs once for each filter, as it does elsewhere for each run.
         choice = choose_code(_precompute_filter, arguments, differs_by_run=(True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
-    # What is the same for all filters was computed once, and is repeated for each filter.
+    # A result that is the same for all filters was computed once, and is repeated for each filter.
     planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 
 
 def _precompute_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
-    """Return a filter planned for inputs u, also for smoothing where it `smooths`."""
+    """Return a filter with its gains computed for inputs u, and with its smoother's gains if it `smooths`."""
     return plan_with_smoother_steps(filter, u) if smooths else filter.planned(u)
 
 
@@ -60,7 +61,7 @@ _precompute_by_xla = quickly_compiled(_precompute_filter)
 
 @quickly_compiled
 def _precompute_all_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
-    """Return `count` stacked filters, each planned for inputs u."""
+    """Return `count` stacked filters, each with its gains computed for inputs u."""
     return map_all(lambda filter: _precompute_filter(filter, u, smooths), count)(filters)
 
 

@@ -180,7 +180,7 @@ def fused_covariances(
 ) -> dict[str, Float[np.ndarray, "time n n"]]:
     """Return the covariances (time, n, n) of the errors of the network's informed fusions, by name, for complete data.
 
-    An informed fusion is one that knows how the errors of its estimates are correlated.
+    An informed fusion is one by a rule that needs the joint covariance of its estimates' errors, as `MatrixWeights`.
 
     Args:
         network: a network with informed fusions of linear filters.

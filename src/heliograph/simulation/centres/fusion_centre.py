@@ -290,7 +290,7 @@ def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complet
 def _has_uncertain_law(channel: Channel) -> bool:
     """Return whether the channel's laws have probabilities that are known only up to a radius.
 
-    Each extreme law within the radius is a corner, so an uncertain law has more than one.
+    The set of possible laws then has several extreme laws (its vertices), and a law that is known has one.
     """
     try:
         return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))

@@ -186,7 +186,7 @@ def build_report_fusions(
 ) -> dict[str, ReportFusion]:
     """Return the network's fusions by reports, by name, each with its uplinks and its centre.
 
-    `step_filters`: as of `build_centre_filter`.
+    `step_filters`: makes all filters of a network, which a centre steps without data for the moments of their errors.
     """
     results = {}
     for name, fusion in network.fused.items():
@@ -244,9 +244,9 @@ def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingN
 
 
 def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
-    """Return the network's fusions whose rules need no model of the nodes, with fusions of one structure stacked.
+    """Return the network's fusions by rules that need nothing but the estimates, those of one structure stacked.
 
-    Rules that know how the nodes' errors are correlated are called informed; they have centres (`list_centres`).
+    Rules that need the joint covariance of the nodes' errors (`AbstractInformedFusion`) are left out.
     """
     names_by_structure: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
@@ -289,9 +289,9 @@ def _stack_fusions(
 
 
 def list_centres(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...]:
-    """Return one centre for each filter that some informed rule fuses.
+    """Return one centre for each filter whose estimates are fused by rules that need their errors' joint covariance.
 
-    A rule is informed if it needs to know how the nodes' errors are correlated; the centre keeps that knowledge.
+    The centre propagates that covariance for all of these rules. Fusions of reports have centres of their own.
     """
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, fusion in network.fused.items():
@@ -349,12 +349,12 @@ def find_source_filters(
         nodes: names of the nodes, each of which has the filter.
         name: of the filter.
     """
-    places_of_nodes = [places[node, name] for node in nodes]
-    sources = tuple(dict.fromkeys((place.kind, place.filter) for place in places_of_nodes))  # each once, in order
+    indices = [places[node, name] for node in nodes]
+    sources = tuple(dict.fromkeys((index.kind, index.filter) for index in indices))  # each once, in order
+    # The row of each node, if the sources' rows stand one source after another.
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
-    # Nodes in the order in which the sources hold them.
-    positions = {node: i for i, node in enumerate(node for names in groups for node in names)}
-    return sources, np.array([positions[node] for node in nodes])
+    row_of_node = {node: row for row, node in enumerate(node for names in groups for node in names)}
+    return sources, np.array([row_of_node[node] for node in nodes])
 
 
 def _model_measurements(

@@ -43,8 +43,8 @@ class LinearisedCentre(Module):
     fusion's last estimate: with each filter's A, nodes that share an error would seem to differ by their linearisations
     alone, and weights of such differences claim information that is not there.
 
-    Fields as of `FusionCentre`: `sources` are the stacked filters, `order` the nodes' order in what is gathered from
-    them, `size` the length of the longest measurement.
+    `sources` are (stack, number in the stack) of the filters that are fused, `order` brings their nodes, one source
+    after another, into the order of the nodes; `size` is the length of the longest measurement.
     """
 
     plant: AnyPlant

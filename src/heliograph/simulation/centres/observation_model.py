@@ -61,9 +61,9 @@ def _linearise_observation(
     signal_moments = augmented_second_moment(second, signal, last=1.0)
     gain = jnp.asarray(channel.mean_gain)
     all_arrive = jnp.ones(len(gain), dtype=bool)
-    spread = channel.nominal.evaluate_center(signal_moments, all_arrive)
+    noise_of_random_gains = channel.nominal.evaluate_center(signal_moments, all_arrive)
     offset = gain @ sensor.noise.mean + channel.offset
-    return JointObservation(gain=gain @ matrix, offset=offset, noise=gain @ noise @ gain.T + spread)
+    return JointObservation(gain=gain @ matrix, offset=offset, noise=gain @ noise @ gain.T + noise_of_random_gains)
 
 
 class SeparateObservations(Module):

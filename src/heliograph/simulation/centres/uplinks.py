@@ -112,21 +112,22 @@ class Uplinks(Module):
     def draw(self, key: jax.Array, k: jax.Array) -> UplinkDraws:
         """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes.
 
-        Each channel at step k is a random matrix h = [gain, offset; 0, 1] of (m + 1, n + 1).
+        A report m of n numbers arrives as G m + b, of up to `max(self.received)` numbers; G and b are drawn, and so is
+        the delay.
         """
         nodes, m, n = len(self.received), max(self.received), self.n
-        # Lossless links, where nothing is random.
+        # Lossless links, where nothing is random; NaN in rows that a node lacks.
         gain = jnp.zeros((nodes, m, n)) if self.groups else jnp.tile(jnp.eye(n), (nodes, 1, 1))
         offset = jnp.where(np.arange(m) < np.array(self.received)[:, None], 0.0, jnp.nan)
         delay = self.fixed_delay
-        # Channels and delays, independently for each node.
+        # A group holds nodes whose channels have one structure: `group.places` are their numbers.
         for group in self.groups:
-            places = jnp.asarray(group.places)
-            h, late = _draw_links(group, jnp.asarray(self.delay)[places], key, k)
-            size = h.shape[1] - 1
-            gain = gain.at[places, :size].set(h[:, :-1, :-1])
-            offset = offset.at[places, :size].set(h[:, :-1, -1])
-            delay = delay.at[places].set(late)
+            node_numbers = jnp.asarray(group.places)
+            matrices, delays = _draw_links(group, jnp.asarray(self.delay)[node_numbers], key, k)  # [G b; 0 1]
+            size = matrices.shape[1] - 1
+            gain = gain.at[node_numbers, :size].set(matrices[:, :-1, :-1])
+            offset = offset.at[node_numbers, :size].set(matrices[:, :-1, -1])
+            delay = delay.at[node_numbers].set(delays)
         return UplinkDraws(gain, offset, delay)
 
     def lossless(self) -> UplinkDraws:
@@ -188,10 +189,10 @@ class Uplinks(Module):
     def send(
         self, state: ReportsInTransit, means: jax.Array, drawn: UplinkDraws, k: jax.Array
     ) -> tuple[ReportsInTransit, jax.Array, dict[str, jax.Array]]:
-        """Send the reports of step k: return the next state, what arrives of them, now or later, and their traffic.
+        """Send the reports of step k: return the next state, their values as they arrive, and what the quantizers did.
 
-        A value that saturates a quantizer becomes an infinite number: nothing is known of it, and the estimate shows
-        that.
+        A report in which a component saturates its quantizer becomes infinite: no bound of its error is known, and an
+        estimate that is no number shows that.
 
         Args:
             state: of reports in transit and of quantizers, before the step.
@@ -200,14 +201,15 @@ class Uplinks(Module):
             k: number of the step.
 
         Returns:
-            The state with the quantizers' next states; values that arrive (node, m); which components saturated a
-            quantizer, and how many symbols were sent for them (node, n), by these names; empty without quantizers.
+            The state with the quantizers' next states; values that arrive, now or after a delay (node, m), NaN where
+            nothing does; {"saturated": which components saturated a quantizer, "symbols": how many symbols were sent
+            for each} (node, n), empty without quantizers.
         """
         # A node sends at steps d, 2 d, ... counted from 1, d = `every`; a quotient of multiples is exact, and native
         # code has no remainder by a variable.
         step = jnp.asarray(k + 1, means.dtype)
-        sending = (jnp.floor(step / self.every) * self.every == step)[:, None]
-        values, traffic = jnp.where(sending, means, jnp.nan), {}
+        is_sending = (jnp.floor(step / self.every) * self.every == step)[:, None]
+        values, quantizer_outcome = jnp.where(is_sending, means, jnp.nan), {}
         saturated = jnp.zeros(len(means), dtype=bool)
         # Quantized reports.
         if self.quantizers is not None:
@@ -215,9 +217,10 @@ class Uplinks(Module):
             quantizers, sent = quantize(self.quantizers, state.quantizers, values)
             state, values = state._replace(quantizers=quantizers), sent.value
             saturated = jnp.any(sent.saturated, axis=1)
-            traffic = {"saturated": sent.saturated, "symbols": jnp.where(sending, sent.symbols, 0)}
+            quantizer_outcome = {"saturated": sent.saturated, "symbols": jnp.where(is_sending, sent.symbols, 0)}
+        # The links: G m + b.
         z = jnp.einsum("imn,in->im", drawn.gain, values) + drawn.offset
-        return state, jnp.where(saturated[:, None], jnp.inf, z), traffic
+        return state, jnp.where(saturated[:, None], jnp.inf, z), quantizer_outcome
 
     def arrive(self, state: ReportsInTransit, sent: jax.Array, delay: Array) -> tuple[ReportsInTransit, jax.Array]:
         """Return the next state, and what arrives now of this report and of earlier ones, by age (age, node, m).
@@ -288,17 +291,20 @@ def _make_link_models(
 
 
 def _gather_link_moments(links: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
-    """Return the moments of all uplinks as arrays, padded with zeros where a node's report has fewer numbers.
+    """Return the moments of all uplinks z_i = G_i m_i + b_i as arrays, padded with zeros where z_i has fewer numbers.
 
-    `links`: the moments of each node's channel at one step. Other arguments are those of `_make_link_models`.
+    Args:
+        links: moments of each node's channel at one step: the means E G and E b, and the covariance of (G, b).
+        received: how many numbers arrive of each node's report.
+        error: a bound on the error of each node's quantizer (node, n).
     """
-    gains, offsets, spreads = [], [], []
+    gains, offsets, covariances = [], [], []
     for link, size in zip(links, received, strict=True):
         padding = (0, max(received) - size)
         gains.append(np.pad(link.mean_gain, (padding, (0, 0))))
         offsets.append(np.pad(link.offset, padding))
-        spreads.append(np.pad(link.nominal.center, (padding, padding, (0, 0), (0, 0))))
-    return ReportModel(np.stack(gains), np.stack(offsets), np.stack(spreads), error)
+        covariances.append(np.pad(link.nominal.center, (padding, padding, (0, 0), (0, 0))))
+    return ReportModel(gain=np.stack(gains), offset=np.stack(offsets), spread=np.stack(covariances), error=error)
 
 
 @readable

@@ -50,8 +50,8 @@ def step_plausibly(
 ) -> Stepped:
     """Step all filters with all data, which they judge; where some is implausible, step again without it.
 
-    In the second turn each filter skips what it judged implausible in the first; the judgements of the first stay. A
-    loop of at most two turns, so that the second is left out where it is not needed.
+    In the second pass each filter leaves out what it judged implausible in the first, and the judgements of the first
+    are returned. The passes are iterations of a loop, so that the second is left out where it is not needed.
 
     Args:
         filters: of the network.
@@ -62,37 +62,36 @@ def step_plausibly(
         drawn: what uplinks and links between neighbours do, by fusion; without, nothing is lost.
 
     Returns:
-        The states after the step, and its outputs, as of `AllFilters.step`.
+        The states after the step, and its outputs by name: estimates, and judgements of the measurements.
     """
     # The loop begins with outputs of zeros, in which nothing is implausible; their shapes are those of a step's.
     by_kind = [jnp.zeros((stacked.count, stacked.nodes)) for stacked in filters.alike]
     none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
     _, output_shapes = eqx.filter_eval_shape(_step_filters, filters, states, z, u, k, drawn, none_skipped)
 
-    def needs_turn(carry: tuple[jax.Array, Stepped]) -> jax.Array:
-        """Return whether to step: in turn 0 always, in turn 1 where something was implausible."""
-        turn, (_, outputs) = carry
-        return (turn == 0) | (turn == 1) & is_implausible(outputs)
+    def needs_pass(carry: tuple[jax.Array, Stepped]) -> jax.Array:
+        """Return whether to step: in pass 0 always, in pass 1 if something was implausible in pass 0."""
+        number, (_, outputs) = carry
+        return (number == 0) | (number == 1) & is_implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
-        """Return the next turn's number, and all filters stepped without what the previous turn judged implausible.
+        """Return the next pass's number, and all filters stepped without what the pass before judged implausible.
 
-        In turn 0 nothing is skipped. From outside, the same in every turn: the network's `filters`, their `states`
-        before the step, its measurements z, inputs u and number k, and the losses `drawn` of the uplinks.
+        Pass 0 leaves nothing out. Both passes start from the same states before the step.
         """
-        turn, (_, outputs_before) = carry
+        number, (_, outputs_before) = carry
         skip = read_refusal_reasons(outputs_before)
         after, outputs = _step_filters(filters, states, z, u, k, drawn, skip)
-        # Keep the judgements of the first turn, since only it judges all data.
+        # Keep the judgements of the first pass, since only it judges all data.
         for name in ("judged", "judged_centrally"):
             outputs[name] = jax.tree.map(
-                lambda first, now: jnp.where(turn == 0, now, first), outputs_before[name], outputs[name]
+                lambda first, now: jnp.where(number == 0, now, first), outputs_before[name], outputs[name]
             )
-        return turn + 1, (after, outputs)
+        return number + 1, (after, outputs)
 
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), output_shapes)
     stepped: Stepped
-    _, stepped = jax.lax.while_loop(needs_turn, step, (jnp.asarray(0), (states, start)))
+    _, stepped = jax.lax.while_loop(needs_pass, step, (jnp.asarray(0), (states, start)))
     return stepped
 
 

@@ -170,9 +170,10 @@ class NetworkRecursion(Recursion):
 
 
 def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree | None:
-    """Return what `filter_rows` does, computed in chunks of rows side by side, or None if that is not possible.
+    """Return the outputs of all filters for all rows, computed in chunks of rows side by side; None if that can't be.
 
-    It needs linear filters whose estimates are not fused, no smoothing, and many rows.
+    It needs linear filters whose estimates are not fused, no smoothing, and many rows. `z`: measurements (steps, node,
+    received) by group.
     """
     if task.smoother is not None or not task.filters.are_linear_and_unfused:
         return None
@@ -215,7 +216,10 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
 
 
 def _scan_all_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
-    """Return what `filter_rows` does, of all rows in one scan."""
+    """Return the outputs of all filters for all rows by one scan over these, smoothed if the task has a smoother.
+
+    `z`: measurements (steps, node, received) by group. `judged`: leave out measurements that are judged implausible.
+    """
     return _collect_results(task.smoother, z, *_scan_to_the_end(task, z, judged))
 
 
@@ -258,18 +262,21 @@ def _scan_rows(
 def _collect_results(
     smoother: NetworkSmoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
 ) -> PyTree:
-    """Return what `filter_rows` does, from the filters' `results` by row, the measurements z and the last `state`.
+    """Return the filters' `results` by row, smoothed if there is a smoother, with measurements z and the last `state`.
 
-    A smoother smooths the results, except for the judgements of measurements ("judged"), which stay as they are.
+    Judgements of measurements ("judged") are not smoothed: they stay as they are.
     """
     results = {"measurements": z, **results}
-    judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
+    judgements = {name: results.pop(name) for name in ("judged", "judged_centrally")}
     smoothed = results if smoother is None else smoother.smooth_run(results)
-    return smoothed | judged | {"state": state}
+    return smoothed | judgements | {"state": state}
 
 
 def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
-    """Return the states of the central filters before each row (steps, ...), by name; z as of `filter_rows`."""
+    """Return the states of the central filters before each row (steps, ...), by name of the filter.
+
+    `z`: measurements (steps, node, received) by group of nodes.
+    """
     rows = task.number_rows(), task.u, z, task.arrivals
     fixed = task.filters, None if task.begin is None else task.begin.states
     return scan_rows(_begin, _step_central, fixed, rows, lambda: _central_states_by_xla(fixed, rows))[1]

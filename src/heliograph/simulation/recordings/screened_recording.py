@@ -41,41 +41,42 @@ def screen_recording(
     u: np.ndarray,
     before: Mapping[str, Repeats],
 ) -> ScreenedRecording:
-    """Return the measurements without readings that their nodes refuse, with the reason of each.
+    """Return the measurements without readings that their nodes refuse, with the reason of each refusal.
+
+    A node with limits refuses readings beyond them, error codes of the sensor, and readings of a sensor that is stuck.
 
     Args:
         nodes: of the network, by name.
-        inputs: names of the plant's.
-        z: by node, (steps, received), NaN where nothing arrived.
+        inputs: names of the plant's inputs.
+        z: measurements by node, (steps, received), NaN where nothing arrived.
         u: inputs (steps, inputs).
         before: the runs of equal readings with which the rows before these ended, by node; {} before the first ones.
     """
-    kept, refused, said = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
+    accepted, refused, lines_to_say = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
     repeats = dict[str, Repeats]()
     for name, node in nodes.items():
-        # Readings beyond limits, codes, and readings that are stuck; none of a node without limits.
-        kept[name], refused[name] = z[name], np.zeros(z[name].shape, dtype=np.int8)
+        accepted[name], refused[name] = z[name], np.zeros(z[name].shape, dtype=np.int8)
         lines = list[str]()
         if node.limits is not None:
             screened = node.limits.screen(z[name], before.get(name, Repeats()))
             repeats[name] = screened.repeats
-            kept[name], refused[name] = screened.values, screened.refused.astype(np.int8)
+            accepted[name], refused[name] = screened.values, screened.refused.astype(np.int8)
             lines = [
                 _describe_refused(reason, node.limits, z[name], refused[name], node)
                 for reason in count_by_reason(refused[name])
             ]
         # Values that their sender should not have sent stay.
-        if rows := find_forbidden_rows(node, kept[name]):
+        if rows := find_forbidden_rows(node, accepted[name]):
             lines.append(
                 f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
                 "within delta of the value before, and no heartbeat due"
             )
-        said += [f"node {name!r}: {line}" for line in lines]
+        lines_to_say += [f"node {name!r}: {line}" for line in lines]
     # Silences longer than a node's timeout.
     timeouts = {name: node.timeout for name, node in nodes.items()}
-    silences = find_long_silences(timeouts, kept, u, inputs)
-    said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
-    return ScreenedRecording(kept, refused, said, repeats)
+    silences = find_long_silences(timeouts, accepted, u, inputs)
+    lines_to_say += [f"node {name!r}: {silence.describe()}" for name, silence in silences.items()]
+    return ScreenedRecording(measurements=accepted, refused=refused, said=lines_to_say, repeats=repeats)
 
 
 def _describe_refused(

@@ -51,10 +51,11 @@ class NetworkSmoother(Module):
     groups: tuple[int, ...] = eqx.field(static=True)
 
     def smooth_run(self, outputs: PyTree) -> PyTree:
-        """Return a run's results "filtered" and "smoothed", as a reducer takes them, and sums of the "nis".
+        """Return a run's results "filtered" and "smoothed", each as a reducer reads a step, and sums of the "nis".
 
         NIS: e' S^-1 e of an innovation e of covariance S, which is about its number of components if a filter is
-        consistent. `outputs` (time, ...): of `AllFilters.step`, with smoother steps.
+        consistent. `outputs` (time, ...): all that the filters' steps put out, with the terms of the backward pass
+        ("smoother_steps", "central_steps").
         """
         steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
@@ -65,7 +66,7 @@ class NetworkSmoother(Module):
         fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
         for fusion in self.fusions:
             fused |= _fuse_at_each_time(fusion, estimates)
-        # The filtered values that stand beside them: a smoothing may leave out the first steps of a run.
+        # Measurements of the same steps: a smoothing may leave out the first steps of a run.
         length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
             "measurements": tuple(outputs["measurements"][g][-length:] for g in self.groups),
@@ -98,7 +99,7 @@ def _turn_angles_to_truth(
         angles_of_kinds: which states are angles for the filters of each kind.
     """
 
-    def turn(estimate: Estimate, angles: Angles) -> Estimate:
+    def wrap(estimate: Estimate, angles: Angles) -> Estimate:
         """Return an estimate (time, ..., n) with its angles within half a turn of those of the truth (time, n)."""
         mean = jnp.asarray(estimate.mean)
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
@@ -106,8 +107,8 @@ def _turn_angles_to_truth(
 
     # All kinds that have angles have the plant's.
     of_plant = next((angles for angles in angles_of_kinds if angles), ())
-    estimates = tuple(turn(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_kinds, strict=True))
-    return {"estimates": estimates, "fused": {name: turn(e, of_plant) for name, e in smoothed["fused"].items()}}
+    estimates = tuple(wrap(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_kinds, strict=True))
+    return {"estimates": estimates, "fused": {name: wrap(e, of_plant) for name, e in smoothed["fused"].items()}}
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
@@ -271,24 +272,25 @@ def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: Py
 def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
     """Return the record of a recording with its true states (time, n), NaN where unknown, also in its smoothed part.
 
-    Angles of estimates are then within half a turn of them.
+    Angles of estimates are moved by whole turns to within half a turn of the true ones, so that x - xhat is the error.
     """
 
-    def turn(estimate: Estimate, x: np.ndarray) -> Estimate:
+    def wrap(estimate: Estimate, x: np.ndarray) -> Estimate:
         """Return an estimate with its angles within half a turn of those of the true state x, where x is known."""
         mean = np.asarray(estimate.mean)
         truth_or_mean = np.where(np.isnan(x), mean, x)
         return replace(estimate, mean=first(plant).near(mean, truth_or_mean))
 
-    later = record.smoothed
-    if later is not None and smoothing is not None:
-        reference = np.broadcast_to(smoothing.select_reference(truth), (len(later.time), truth.shape[1]))
-        later = add_truth(later, plant, reference, smoothing=None)
+    smoothed = record.smoothed
+    if smoothed is not None and smoothing is not None:
+        # The true states of the times of which smoothed estimates are made.
+        reference = np.broadcast_to(smoothing.select_reference(truth), (len(smoothed.time), truth.shape[1]))
+        smoothed = add_truth(smoothed, plant, reference, smoothing=None)
     estimates = {
-        node: {name: turn(estimate, truth) for name, estimate in by_filter.items()}
+        node: {name: wrap(estimate, truth) for name, estimate in by_filter.items()}
         for node, by_filter in record.estimates.items()
     }
-    return replace(record, truth=truth, estimates=estimates, smoothed=later)
+    return replace(record, truth=truth, estimates=estimates, smoothed=smoothed)
 
 
 class ReducedRuns(NamedTuple):
@@ -319,10 +321,10 @@ def finish_result(
         smoothing: its smoothed part; None where nothing was smoothed.
     """
     sums, common, count, collected = recorded
-    # Without smoothing the result of the network alone.
     if smoothing is None:
         return reducer.finish(reducer.summed(sums, common, count), collected, network)
-    # Sums are three, as `reduce_run` has them: of filtered estimates, of smoothed ones, and of the NIS.
+    # With smoothing there are three sums: of filtered estimates, of smoothed ones, and of the normalised innovations
+    # squared (NIS).
     _, _, nis_sums_by_batch = sums.sums
     _, _, is_common = common.sums
     # Summed over all runs: what all runs share counts once for each.

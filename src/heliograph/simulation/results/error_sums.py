@@ -93,7 +93,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> RunSums:
         """Return the sums over all runs, with filters whose covariance differs between runs first, the others last.
 
-        Each estimate is one place on the axis `part`: those of a kind of filters stand side by side, kind after kind.
+        Each estimate has one index of the axis `part`. Filters of one structure (a kind) have consecutive indices.
 
         Args:
             sums: what was summed over runs: "pairs" (time, part, pair, batch), "nees" (time, part, batch), "failed"
@@ -102,7 +102,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
             common: for each array whether all runs share it: then it is the value of one run, without a batch axis.
             count: number of runs in each batch.
         """
-        # A value that all runs share counts once for each run of a batch. Claimed covariances, left out as (), follow.
+        # A value that all runs share counts once for each run of a batch. Claimed covariances are not among these, but
+        # are treated below, since they need not be held by batch.
         is_shared = common.sums["claimed"]
         totals, ever = jax.tree.map(
             lambda leaf, is_common: leaf[..., None] * count if is_common else leaf,
@@ -139,11 +140,11 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
         `carry`: what `summed` returned.
         """
-        # Sums by kind and fusion, then by name.
+        # Sums of each kind (a stack of filters of one structure) and of each fused estimate, then by name.
         all_kinds = network.kinds + network.mesh_kinds
-        count, parts = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
-        of_kinds, of_fused = parts[: len(all_kinds)], parts[len(all_kinds) :]
-        named = {"estimates": of_kinds, "fused": dict(zip(sorted(network.fused), of_fused, strict=True))}
+        count, sums = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
+        sums_of_kinds, sums_of_fused = sums[: len(all_kinds)], sums[len(all_kinds) :]
+        named = {"estimates": sums_of_kinds, "fused": dict(zip(sorted(network.fused), sums_of_fused, strict=True))}
         # Each sum by node and filter. Of a sum (..., filter, node, pair) the axis of filters is -3, without pairs -2.
         filter_axes = _FilterSums(pairs=-3, nees=-2, claimed=-3, failed=-2, failed_runs=-2)
         sums_by_name = [split_by_name(network, named, itemgetter(i), axis) for i, axis in enumerate(filter_axes)]
@@ -222,9 +223,11 @@ def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> Erro
 def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[_FilterSums]]:
     """Return the number of runs in each batch, and the sums of each kind and then of each fused estimate, as views.
 
-    `kinds`: numbers of filters and of nodes of each kind; estimates beyond them are fused ones.
+    A kind is a stack of filters of one structure. `kinds`: numbers of filters and of nodes of each kind. Along their
+    axis `part` the sums have filters times nodes estimates for each kind, kinds in the order `carry.order`, in which
+    fused estimates follow the kinds; those whose covariance differs between runs (`carry.by_run` of them) come first.
     """
-    # The axis of batches first, then time, then parts; of failures their two sorts stand in place of batches.
+    # Axes (batch, time, part, ...); failures have their two sorts in place of batches.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed
     count, pairs, nees, varying = (np.moveaxis(np.asarray(values), -1, 0) for values in sums)
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
@@ -232,26 +235,27 @@ def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarra
     varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
     first_shared = varying.shape[2]  # the first part whose covariances all runs share
-    split, start = {}, 0
-    # Each kind, in the order of the sums, has the next filters times nodes parts; a fused estimate has one.
-    for position, i in enumerate(carry.order):
-        axes = kinds[i] if i < len(kinds) else ()
+    sums_of_kind, start = {}, 0
+    for position, kind in enumerate(carry.order):
+        axes = kinds[kind] if kind < len(kinds) else ()  # a fused estimate has no axes of filters and nodes
         parts = slice(start, start + int(np.prod(axes)))
         if position < carry.by_run:
             claimed = varying[:, :, parts]
         else:
             claimed = shared[:, :, parts.start - first_shared : parts.stop - first_shared]
-        of_kind = _FilterSums(
+        flat = _FilterSums(
             pairs=pairs[:, :, parts],
             nees=nees[:, :, parts],
             claimed=claimed,
             failed=failed[:, :, parts],
             failed_runs=failed_runs[:, :, parts],
         )
-        # The axis of parts becomes those of filters and nodes, or none of what is fused.
-        split[i] = _FilterSums(*(values.reshape(*values.shape[:2], *axes, *values.shape[3:]) for values in of_kind))
+        # The axis `part` becomes those of filters and nodes.
+        sums_of_kind[kind] = _FilterSums(
+            *(values.reshape(*values.shape[:2], *axes, *values.shape[3:]) for values in flat)
+        )
         start = parts.stop
-    return count, [split[i] for i in range(len(split))]
+    return count, [sums_of_kind[kind] for kind in range(len(sums_of_kind))]
 
 
 def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:

@@ -287,7 +287,9 @@ def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.n
 def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
     """Return what nodes sent to fusions (uplinks) in a dataset, by the fusion's name.
 
-    `lead`: the axes of rows. SENT: the fields of an uplink, whether a quantizer saturated and how many symbols it sent.
+    `lead`: names of the axes of rows, such as run and time. SENT names the fields of an uplink: whether a quantizer
+    saturated, and how many symbols it sent. "place" (fusion, sender) is the number of the sender among the fusion's
+    nodes, -1 where it is none of them.
     """
     if "place" not in dataset:
         return {}
@@ -295,7 +297,7 @@ def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
     saturated, symbols = (read_values(dataset, name, lead) for name in SENT)
     uplinks = {}
     for i, name in enumerate(read_labels(dataset, "fusion")):
-        # The senders of this fusion in their order. Others have the place -1.
+        # The fusion's nodes, in their order.
         order = np.array([j for j in np.argsort(places[i], kind="stable") if places[i, j] >= 0], dtype=int)
         nodes = tuple(senders[j] for j in order)
         uplinks[name] = Uplink(nodes, saturated[..., i, order, :], symbols[..., i, order, :])

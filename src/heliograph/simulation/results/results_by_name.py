@@ -84,10 +84,10 @@ def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> di
 
 
 def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
-    """Return the probabilities of modes (..., M) of the filters that weigh modes, by (node, filter).
+    """Return the probabilities of the plant's modes (..., M), by (node, filter), of the filters that estimate them.
 
-    `batch`: estimates of many steps, stacked by kind of filter, and fused estimates by name. Fused ones have the node
-    FUSED.
+    `batch`: "estimates" of many steps, in one stack (..., filter, node, M) for filters of one structure (a kind), and
+    "fused" estimates by name. Fused estimates have FUSED in place of a node.
     """
     estimates_by_kind = batch["estimates"]
     fused = batch["fused"] if network.fused else {}
@@ -102,16 +102,17 @@ def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[st
 
 
 def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
-    """Return the innovations of the filters that weigh what arrives, by node and filter; centrally the node is FUSED.
+    """Return innovations with the weight that each component got, by node and filter, of filters that weigh components.
 
-    `batch["weighed"]` has the innovations by kind of filter (time, filter, node, m), or None for kinds that do not
-    weigh.
+    `batch["weighed"]` has them by kind, a stack of filters of one structure (time, filter, node, m), with None for
+    kinds that do not weigh. Those of central filters are under "weighed_centrally" by name, and under FUSED in the
+    result.
     """
     weighed_by_kind = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
-    for (node, name), place in network.places.items() if weighed_by_kind else ():
-        if weighed_by_kind[place.kind] is not None:
-            fields = [np.asarray(field)[:, place.filter, place.node] for field in weighed_by_kind[place.kind]]
+    for (node, name), index in network.places.items() if weighed_by_kind else ():
+        if weighed_by_kind[index.kind] is not None:
+            fields = [np.asarray(field)[:, index.filter, index.node] for field in weighed_by_kind[index.kind]]
             weighed.setdefault(node, {})[name] = Weighed(*fields)
     central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
     return weighed | ({FUSED: central} if central else {})

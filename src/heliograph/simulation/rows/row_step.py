@@ -26,9 +26,9 @@ from heliograph.simulation.rows.row_history import RowHistory
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each
-TOGETHER = 16  # rows of one turn of XLA's loop, which fill the vectors of a processor
+TOGETHER = 16  # rows of one iteration of XLA's loop, which fill the vectors of a processor
 WIDTH = 512  # rows of one call, at most
-NUMBERS_TOGETHER, NUMBERS = 2**14, 2**18  # in the rows of a turn and of a call: of long rows fewer are taken
+NUMBERS_TOGETHER, NUMBERS = 2**14, 2**18  # in the rows of an iteration and of a call: of long rows fewer are taken
 
 
 class NetworkStep(Module):
@@ -188,14 +188,14 @@ class RowStep:
         step: Float[np.ndarray, " row"],
         outputs: Float[np.ndarray, "row output"],
     ) -> RowHistory:
-        """Return rows in order, with the states and outputs after each as trees, for a `RowSmoother`.
+        """Return the history of rows that a `RowSmoother` reads, with states and outputs as trees instead of rows.
 
         Args:
-            rows: measurements of all nodes, inputs, and the time.
+            rows: measurements of all nodes, inputs, and the time, one row after another in time.
             state: the filters' states after each row.
-            held: inputs held after each row.
+            held: inputs that apply from each row to the next.
             step: number of each row's step.
-            outputs: what `RowStep` returned for each row.
+            outputs: the outputs after each row, as this step returned them.
         """
         return RowHistory(rows, self.state.tree(state), held, step.astype(int), self.outputs.tree(outputs))
 
@@ -241,9 +241,9 @@ class OneRowStep:
         self._steps, self._code = steps, code
 
     def __call__(self, *parts: Float[np.ndarray, "1 columns"]) -> Float[np.ndarray, "1 column"]:
-        """Return the states and outputs after a row, given in parts that stand side by side.
+        """Return the states and outputs after one row, whose columns are those of `parts`, one part after another.
 
-        By native code, or by XLA where there is none (`_code` is None). The next call overwrites the result.
+        Native code computes them, or XLA where there is none (`_code` is None). The next call overwrites the result.
         """
         if self._code is None:
             return self._steps(np.concatenate(parts, axis=1), alone=True)

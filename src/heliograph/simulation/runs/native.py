@@ -230,8 +230,9 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
     result_trees: list[Any] = []  # one, which is found when `run` is traced
 
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
-        """Return what is summed over runs, and what is kept of this run, from all arrays and, last, its number."""
+        """Return ((sums, flags) to be summed over runs, what is collected) of one run; `leaves`: arrays, its number."""
         *arrays, number = leaves
+        # The world's arrays come first, then those of (smoother, inputs, reducer).
         remaining = iter(arrays)
         world, (smoother, inputs, reducer) = of_world.restore(remaining), of_rest.restore(remaining)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
@@ -279,13 +280,13 @@ def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any]
 def _simulate_smoothed_run(
     world: World, smoother: NetworkSmoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
-    """Return what the reducer makes of one run's filtered and smoothed estimates, as `reduce_run` does.
+    """Return what the reducer makes of one run: of its filtered estimates and of its smoothed ones, a pair of each.
 
     The world is plant, channels and filters. `smoother` smooths their estimates when the run is over.
     """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """Step the world; the step is reduced later, with what comes after it."""
+        """Step the world, and return all outputs of the step: they are reduced when the whole run is smoothed."""
         return _step_world(world, state, key, row)
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
@@ -347,8 +348,8 @@ def _simulate_in_parts(
     """Simulate a network of many independent nodes, a few at a time, by one program with other numbers for each few.
 
     The result is the same: draws depend on names, and these nodes share nothing but the plant, which is simulated
-    again. `span`: number of the first run, how many there are, and how many between two reports of progress. Other
-    arguments and the result as of `simulate_natively`.
+    again. `span`: number of the first run, how many there are, and how many between two reports of progress. The result
+    is None if native code does not support the network or the reducer.
     """
     first_run, runs, chunk = span
     parts, memory = count_parts(network), list[list[np.ndarray]]()

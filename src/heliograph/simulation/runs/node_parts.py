@@ -42,7 +42,7 @@ def is_apart(network: Network) -> bool:
 def build_world(network: Network, smoothed_kinds: tuple[int, ...] | None = None) -> World:
     """Return the world of a network, plant, transmission and filters, once for all simulations of it.
 
-    `smoothed_kinds`: as of `AllFilters`.
+    `smoothed_kinds`: numbers of the kinds of filters (stacks of one structure) that are smoothed; None: no smoothing.
     """
     return World(number_unnamed_memories(network.plant), make_reception(network), AllFilters(network, smoothed_kinds))
 
@@ -108,7 +108,10 @@ def _with_fields(module: M, **changed: object) -> M:
 
 
 def _select_rows(world: World, nodes: slice) -> World:
-    """Return the world of some nodes, from one whose nodes all have one structure: their rows of stacked arrays."""
+    """Return the world (plant, channels and filters) of some nodes, from one whose nodes all have one structure.
+
+    All arrays of channels and filters are stacked by node, so that these nodes have some rows of each.
+    """
     assert isinstance(world.medium, SeparateChannels)
 
     def select(leaf: PyTree) -> PyTree:
@@ -116,8 +119,8 @@ def _select_rows(world: World, nodes: slice) -> World:
         return leaf[nodes] if eqx.is_array(leaf) else leaf
 
     medium = SeparateChannels(jax.tree.map(select, world.medium.groups))
-    alike = tuple(_select_filters(stacked, nodes) for stacked in world.filters.alike)
-    return World(world.plant, medium, _with_fields(world.filters, alike=alike))
+    stacks = tuple(_select_filters(stacked, nodes) for stacked in world.filters.alike)
+    return World(world.plant, medium, _with_fields(world.filters, alike=stacks))
 
 
 def _select_filters(stacked: StackedFilters, nodes: slice) -> StackedFilters:

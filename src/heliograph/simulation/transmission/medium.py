@@ -151,14 +151,19 @@ class SeparateChannels(AbstractMedium):
     ) -> tuple[PyTree, Measurements]:
         """Return the links' next states, and what each node receives of its measurement of x through its own channel.
 
-        Arguments and results as of `AbstractMedium`.
+        Args:
+            state: of the links by group of nodes, before the step.
+            x: the plant's state after the step.
+            u: inputs of the plant over the step.
+            key: of the run.
+            k: number of the step.
+
+        Returns:
+            The links' next states, and the measurements (node, received), both by group.
         """
 
         def receive_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> tuple[PyTree, jax.Array]:
-            """Return the links of one group of nodes after the step, and what its nodes receive.
-
-            From outside: x, the plant's state, and u, its inputs. A node without a sensor receives no numbers.
-            """
+            """Return the links of one group of nodes after the step, and what its nodes receive of x."""
             if isinstance(group, NodesWithoutSensor):
                 return link, jnp.zeros((group.count, 0))
             nodes = len(group.checksums)
@@ -236,15 +241,15 @@ def _send_through_channel(
 ) -> tuple[jax.Array, jax.Array, PyTree]:
     """Return what was sent of y, what is received of it, and the channel's memory after step k.
 
-    With an encoder, y is sent as words of few bits. The channel carries them as numbers, of which `group.reader` makes
-    words again.
+    With an encoder, y is sent as codewords of few bits. The channel carries the bits as numbers, from which
+    `group.reader` reads the codewords.
     """
     if group.encoder is None or group.reader is None:
         memory, z = deliver_signal(group.channel, memory, y, key, k, group.checksums, group.memories)
         return y, z, memory
-    words, numbers = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
-    memory, received = deliver_signal(group.channel, memory, numbers, key, k, group.checksums, group.memories)
-    return words, group.reader.read_words(group.encoder, len(y), received), memory
+    codewords, bits = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
+    memory, received = deliver_signal(group.channel, memory, bits, key, k, group.checksums, group.memories)
+    return codewords, group.reader.read_words(group.encoder, len(y), received), memory
 
 
 def _get_initial_mean(filter: AbstractFilter) -> jax.Array:
@@ -273,7 +278,8 @@ class CommonChannel(AbstractMedium):
     ) -> tuple[PyTree, Measurements]:
         """Return the channel's next state, and what each node receives through the one channel of all nodes, by group.
 
-        Each node gets its own rows of it (`self.rows`). The arguments are those of `AbstractMedium.receive`.
+        Each node gets its own rows of its output (`self.rows`). `x`, `u`: the plant's state after the step, and its
+        inputs over it. `key`: of the run.
         """
         sensor, source = at(self.sensor, k), checksum(SENDER)
         y = measure(sensor, x, draw_key(key, k, source, SENSOR))
