@@ -234,7 +234,7 @@ def _condition_on_limits(filter: AbstractFilter, state: PyTree) -> tuple[Abstrac
 
 
 def _measure_in_each_mode(filter: MultipleModelFilter, prior: PyTree, k: jax.Array) -> Moments:
-    """Return the moments of the outputs at step k, a part for each mode."""
+    """Return the moments of the outputs at step k, a mixture with a Gaussian for each mode of the filter."""
     signal, weights = filter.prior_signals(prior, k)
     covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
     return Moments(weights=weights, means=signal.mean, covariances=covariances)

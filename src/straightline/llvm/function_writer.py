@@ -348,7 +348,7 @@ class FunctionWriter:
     def _write_conditional_loop(self, loop: Loop, name: str, carried: list[int]) -> tuple[list[str], list[str]]:
         """Write the body of a loop that ends when no lane's condition holds.
 
-        Returns the names of the carried numbers in the next turn, and of those that are left at the loop's end.
+        Return the names of the carried numbers in the next iteration, and those of the same numbers after the loop.
         """
         # The body up to the loop's check, and what follows it in a turn.
         check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, LoopExit) and s.loop is loop)

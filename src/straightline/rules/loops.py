@@ -45,7 +45,7 @@ def repeat_turns(
 def _lower_loop(
     lowering: Lowering, length: int | None, carry: Sequence[np.ndarray], body: Callable[[Loop, list[np.ndarray]], Any]
 ) -> tuple[list[np.ndarray], Any]:
-    """Lower a loop; return the carry after it, and what the body returns beside its carry.
+    """Lower a loop; return the carry after it, and what the body returns in addition to its carry.
 
     A matrix that is symmetric before the loop is taken for symmetric within it: the loop carries its upper triangle.
     Where the body does not keep a matrix symmetric, the body is lowered once more, with all its entries carried.
@@ -54,8 +54,8 @@ def _lower_loop(
         lowering: the program.
         length: how many turns; None of a loop that ends by its condition.
         carry: the arrays of nodes that the first turn begins with.
-        body: lowers one turn into the open block: of the loop and of the carry before a turn it returns the carry after
-            it and, beside that, anything.
+        body: function of the loop and of the carry before a turn. It lowers one turn into the open block, and returns
+            the carry after it, and something else.
     """
     graph, outer = lowering.graph, lowering.graph.current
     by_triangle = [is_symmetric(x) for x in carry]  # which carried arrays are carried as their upper triangle
