@@ -237,8 +237,8 @@ def list_used_nodes(node: Any) -> Sequence[Node]:
 def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
     """Return items sorted so that each comes after those that it is computed from; buffers come first.
 
-    Nodes are numbered (`serial`) as they are made, so a node has a higher number than its arguments. Only what a loop
-    carries to its next turn may come after its use.
+    Nodes are numbered (`serial`) as they are made, so a node has a higher number than its arguments. Only a number that
+    a loop carries to its next iteration may come after its use.
     """
 
     def position(x: Any) -> int:

@@ -128,7 +128,7 @@ class MultistepPredictor(Module):
     def predict_measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
         """Return the moments of what the sensor would measure at step k, as a mixture; None where there is no sensor.
 
-        There is a part for each part of the states, or if modes change what is measured for each mode.
+        It has a Gaussian for each one of the states' mixture, or for each mode if modes change what is measured.
 
         Args:
             prior: the filter's state, predicted for step k.

@@ -284,8 +284,8 @@ class FunctionWriter:
     def _write_loop(self, loop: Loop) -> None:
         """Write a loop as basic blocks: phi nodes for the numbers that it carries, the body, and the jump back.
 
-        A phi node stands at the beginning of a turn: it has the initial number if control comes from before the loop,
-        and the next turn's number if it comes from the end of the body. A counted loop has at least one turn.
+        A phi node stands at the beginning of an iteration. It has the initial number if control comes from before the
+        loop, and else that from the end of the body. A counted loop has at least one iteration.
         """
         self.count += 1
         name, label_before = f"loop{self.count}", self.label
@@ -335,7 +335,7 @@ class FunctionWriter:
             self._note_name(loop.counter, self.write_operand(loop.counter))
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
-        """Write a counted loop's body and the jump to its next turn; return the names of what that turn is carried."""
+        """Write a counted loop's body and the jump back; return the names of the next iteration's carried numbers."""
         self.write_block(loop.body)
         following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")
