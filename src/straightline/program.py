@@ -237,8 +237,8 @@ def list_used_nodes(node: Any) -> Sequence[Node]:
 def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
     """Return items sorted so that each comes after those that it is computed from; buffers come first.
 
-    Nodes are numbered (`serial`) as they are made, so a node has a higher number than its arguments. Only what a loop
-    carries to its next turn may come after its use.
+    Nodes are numbered (`serial`) as they are made, so a node has a higher number than its arguments. Only a number that
+    a loop carries to its next iteration may come after its use.
     """
 
     def position(x: Any) -> int:
@@ -258,8 +258,7 @@ def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
 def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
 
-    The input buffers are among them. What differs is spread step by step, from each item to those that are computed
-    of it.
+    The input buffers are among them. From each item that differs, all items that are computed from it are found.
     """
 
     @cache
@@ -343,9 +342,9 @@ def find_crossing_items(items: Iterable[Any], differing: set[Any]) -> set[Any]:
 
 
 def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:
-    """Return the items each of which makes this node, buffer or statement differ between runs if it does itself.
+    """Return the items on which a node, buffer or statement depends: it differs between runs if one of them does.
 
-    `list_owners` returns the loops and guards around a block that may make what is in it differ.
+    `list_owners` returns the loops and guards around a block on whose conditions its contents depend.
     """
     # Memory inside other memory differs with it.
     if isinstance(item, Buffer):

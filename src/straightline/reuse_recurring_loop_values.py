@@ -328,9 +328,9 @@ def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], restar
 
 
 def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
-    """Let the loop carry one more integer, which is `start` before the first turn.
+    """Let the loop carry one more integer, which is `start` before the first iteration.
 
-    Returns its parameter: the node that stands for the integer within a turn.
+    Return its parameter: the node that stands for the integer within an iteration.
     """
     place = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))

@@ -99,8 +99,8 @@ class SummingProgram:
     ) -> list[Any]:
         """Return each result, leaf by leaf, from the sums of parts of the runs and from what each part collected.
 
-        A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
-        runs share is repeated for each run, or counts once for each run of a batch.
+        A summed result is the sum over all parts of the runs. A collected result has the parts one behind another. A
+        result that all runs share is repeated for each run, or if it is summed, multiplied by the runs of each batch.
         """
         totals = iter(bound.add_partial_sums(sums))
         runs_by_batch = _count_runs_by_batch(first, runs, self.summed.batches)

@@ -128,7 +128,7 @@ class MultistepPredictor(Module):
     def predict_measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
         """Return the moments of what the sensor would measure at step k, as a mixture; None where there is no sensor.
 
-        There is a part for each part of the states, or if modes change what is measured for each mode.
+        It has a Gaussian for each one of the states' mixture, or for each mode if modes change what is measured.
 
         Args:
             prior: the filter's state, predicted for step k.
@@ -234,7 +234,7 @@ def _condition_on_limits(filter: AbstractFilter, state: PyTree) -> tuple[Abstrac
 
 
 def _measure_in_each_mode(filter: MultipleModelFilter, prior: PyTree, k: jax.Array) -> Moments:
-    """Return the moments of the outputs at step k, a part for each mode."""
+    """Return the moments of the outputs at step k, a mixture with a Gaussian for each mode of the filter."""
     signal, weights = filter.prior_signals(prior, k)
     covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
     return Moments(weights=weights, means=signal.mean, covariances=covariances)

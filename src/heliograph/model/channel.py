@@ -45,7 +45,7 @@ from heliograph.random_affine.sum_of_maps import Superposed
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
 
-# The result's type by the arguments. Without delay, z = amplification sqrt(power) g y + n is a `GainAndNoise`.
+# The type of the result by the arguments.
 @overload
 def hop(
     gain: LawLike,
@@ -54,8 +54,10 @@ def hop(
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
     delay: None = None,
-) -> GainAndNoise: ...
-# With a delay of d steps, z_k = amplification sqrt(power) g_k y_{k-d} + n_k is a `DelayedLink`.
+) -> GainAndNoise:
+    """Without a delay, return z = a sqrt(E) g y + n, with `power` E and the relay's `amplification` a."""
+
+
 @overload
 def hop(
     gain: LawLike,
@@ -65,8 +67,10 @@ def hop(
     dimension: int = 1,
     *,
     delay: Delay,
-) -> DelayedLink: ...
-# With the gain g, or a pilot's reading of it, reported with each message, (z, g) is a `Stack`.
+) -> DelayedLink:
+    """With a delay d, return z_k = a sqrt(E) g_k y_{k-d} + n_k, with `power` E and the relay's `amplification` a."""
+
+
 @overload
 def hop(
     gain: LawLike,
@@ -77,7 +81,8 @@ def hop(
     delay: None = None,
     *,
     known: Literal[True] | Pilot,
-) -> Stack: ...
+) -> Stack:
+    """With a gain g, or a pilot's reading of it, in each message, return (a sqrt(E) g y + n, this number)."""
 
 
 def hop(
@@ -102,9 +107,9 @@ def hop(
         amplification: of a relay, z per unit of what it receives (default 1).
         dimension: number of components where `noise` is a variance (default 1).
         delay: in steps, or its law (default: none).
-        known: True for a coherent receiver, which is told the gain with each message, z = (a sqrt(E) g y + n, g); a
-            `Pilot` for one that is told a reading of it. What is told passes by all that the hop is built into, and
-            stands after all of z. False unless given.
+        known: True for a coherent receiver, to which each message reports the gain, z = (a sqrt(E) g y + n, g); a
+            `Pilot` if it reports a reading of the gain. Reported numbers pass unchanged through all that the hop is
+            built into, and stand at the end of z. False unless given.
 
     Raises:
         ValueError: a negative power, a noise that is no covariance, numbers that are not finite.

@@ -44,9 +44,9 @@ class Pilot(Module):
 
     Args:
         noise: variance of e, positive.
-        fresh: whether what the reading leaves open of the gain is drawn anew with each message, whatever is lost.
-            False (of a gain that drifts, or of packets that are lost since their gain is small) makes claims
-            nominal. True unless given.
+        fresh: whether the gain, given its reading, is drawn independently with each message, whatever is lost. False
+            (of a gain that drifts, or of packets that are lost since their gain is small) makes claims nominal. True
+            unless given.
 
     Raises:
         ValueError: a variance that is not positive (`known=True` is a gain that is told exactly).
@@ -71,23 +71,24 @@ def told(
 ) -> Stack:
     """Return a link whose law is a function of numbers that come with each message: z = (link's z, numbers).
 
-    `told(lambda a: hop(1., a[0]), ["variance"], typical=[0.1])` has the noise that each message declares; a gain, a
-    scatter or the chance of a zero may depend on what is told likewise. A filter made for it uses each message by the
-    law that its numbers give. The numbers are never lost with z; where one is missing, z is not used.
+    `told(lambda a: hop(1., a[0]), ["variance"], typical=[0.1])` has the noise variance that each message reports; a
+    gain, a scatter or the chance of a zero may depend on reported numbers in the same way. A filter made for the link
+    uses each message by the law that its numbers give. The numbers are never lost with z; where one is missing, z is
+    not used.
 
     Args:
         link: function of the numbers (count,) that returns a link, of the same sizes for all numbers.
         about: names of the numbers.
         law: of the numbers, to simulate them: a noise law, a law of gains for one number, or a `MarkovChain` whose
             mode is told; none by default: then recorded and live data are filtered, and nothing can be simulated.
-        typical: numbers as they may come (count,); the mean of their law unless given.
-        exogenous: whether the numbers are independent of the state; False (as of a strength that falls with the
-            distance) makes claims nominal. True unless given.
-        fresh: whether what they leave open is drawn anew with each message, whatever is lost; False (of fading that
-            drifts beside them) makes claims nominal. True unless given.
+        typical: an example of the numbers (count,), used where none was reported; the mean of their law unless given.
+        exogenous: whether the numbers are independent of the plant's state; False (as of a strength that falls with
+            the distance) makes claims nominal. True unless given.
+        fresh: whether the link, given its numbers, is drawn independently with each message, whatever is lost; False
+            (as of a fading that drifts and is not reported) makes claims nominal. True unless given.
 
-    Claim: what the filter's would be behind a link of known law, given all numbers told; "nominal" if they are not
-    exogenous, or what they leave open is not fresh.
+    Claim: that of the same filter behind a link of known law, given all reported numbers; "nominal" if the numbers are
+    not exogenous, or the link is not fresh.
 
     Raises:
         ValueError: no function, neither a law nor typical numbers, numbers that are not as many as their names, a link
@@ -108,14 +109,14 @@ def told(
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
-    """Return a law of the numbers that a link tells, or None, as it is; raise ValueError for anything else."""
+    """Return a law of reported numbers, or None, as it is; raise ValueError for anything else."""
     if law is None or isinstance(law, AbstractLaw | AbstractNoise):
         return law
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))
 
 
 def _average_law(law: object, memory: AbstractMemory) -> ArrayLike:
-    """Return typical values of the numbers that a link tells: the mean of their law, or zeros for modes of a memory.
+    """Return an example of reported numbers: the mean of their law, or zeros if they are the mode of a memory.
 
     Zeros mean the first mode. Without a law (None) it raises ValueError, since the user must then give the numbers.
     """

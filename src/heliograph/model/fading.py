@@ -190,7 +190,7 @@ def shared(link: Channel, name: str) -> Channel:
 
 
 def without_memory(channel: Channel) -> Channel:
-    """Return the channel with its modes drawn anew at each step, as a filter believes that assumes no memory.
+    """Return the channel with its modes drawn anew at each step: what a filter assumes that knows no memory.
 
     Draws at different steps are independent. At each step they have the law that they have in the channel (in the long
     run if the channel is constant). A channel without memory is returned as it is.

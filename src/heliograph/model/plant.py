@@ -160,7 +160,7 @@ class AbstractPlant(Module):
 
 
 def split_inputs(u: Array, places: Sequence[Sequence[int]]) -> list[jax.Array]:
-    """Return the inputs of each part of a model, from those of all (inputs,) and each part's places among these."""
+    """Return the inputs of each part of a model, from all inputs u (inputs,) and the indices of each part's own."""
     return [jnp.asarray(u)[np.array(own, int)] for own in places]
 
 

@@ -243,7 +243,7 @@ class LinearSensor(AbstractSensor):
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the sensor's matrix has as many columns as the state is long.
 
-        Its shape says so at once; only a matrix that depends on inputs is traced.
+        The shape of a constant matrix is known. Only a matrix that is a function of inputs is traced.
         """
         if self.inputs:
             super().check_states(states)

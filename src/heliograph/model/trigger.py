@@ -114,10 +114,16 @@ class AbstractTrigger(Module):
         return SendReason.EVENT
 
     def after(self, sender: SenderState, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> SenderState:
-        """Return the sender after it sent the components with a reason, of which those in `arrived` arrived (m,).
+        """Return the state of the sender after a step.
 
         `lost` counts the transmissions lost since the last one that arrived. The reference is the value sent last, or
         the last one acknowledged. A reason is stored with a minus sign if the transmission was lost.
+
+        Args:
+            sender: the state before the step.
+            y: the measurement (m,).
+            reason: why each component is sent (m,), 0 if it is not.
+            arrived: whether each component arrives if it is sent (m,).
         """
         sent = reason > 0
         arrived = arrived & sent

@@ -41,8 +41,8 @@ def check_turn_invariance(
 ) -> None:
     """Raise ValueError where a full turn of an angle or an attitude changes f(center), but for full turns of results.
 
-    Tried at the center and at one state that is no special case: what differs elsewhere alone is not found. What
-    depends on a traced number has no value to judge: it was judged where its numbers were known.
+    f is computed at the center and at one general state. A change that only other states show is not found. A function
+    of traced numbers has no value to compare: it was compared before, when its numbers were known.
 
     Args:
         name: of what has the function, for the error.

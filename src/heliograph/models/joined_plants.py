@@ -144,7 +144,7 @@ def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count:
 
     Args:
         parts: the plants, each with its own states and inputs.
-        places: places of each plant's inputs among all inputs.
+        places: for each plant, the indices of its inputs among all inputs.
         count: number of all inputs.
     """
     if any(isinstance(value, MatrixOfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):

@@ -284,5 +284,5 @@ def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
 
 
 def _wrap_degrees(degrees: np.ndarray) -> np.ndarray:
-    """Return degrees between -180 and 180; those that are there stay as they are, to the bit."""
+    """Return angles in degrees, turned to the range -180 to 180; an angle within it is returned to the bit."""
     return np.where(np.abs(degrees) <= 180, degrees, degrees - 360 * np.round(degrees / 360))

@@ -142,7 +142,7 @@ class AbstractRandomAffine(Module):
     # The laws that are possible where probabilities are known within a radius.
 
     def extremes(self) -> tuple["AbstractRandomAffine", ...]:
-        """Return the maps at the corners of the set of possible laws; the map itself when probabilities are known."""
+        """Return the maps with the extreme laws, vertices of the set of possible laws; itself if its law is known."""
         return (self,)
 
     def corner_count(self) -> int:
@@ -167,7 +167,7 @@ class AbstractRandomAffine(Module):
         return matrices.min(axis=0), matrices.max(axis=0)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the interval of E[Sym^order(H)] made of those of the parts; by default raise ValueError."""
+        """Return an interval of each entry of E[Sym^order(H)], from those of the maps inside; by default, refuse."""
         raise fail("uncertain channel", f"at most {CORNERS} corner laws", count_corners(self))
 
     def mean_gain(self) -> "AbstractRandomAffine":
@@ -346,7 +346,7 @@ def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util
 
 @cache_by_object
 def count_corners(channel: AbstractRandomAffine) -> int | None:
-    """Return the number of corner laws, the extreme ones of all possible laws; None if there are too many to count."""
+    """Return the number of extreme laws ("corners") of a map's possible laws; None if there are too many to count."""
     try:
         return channel.corner_count()
     except ValueError:  # a law has too many uncertain atoms for a list of its corners

@@ -355,7 +355,7 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
 def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Return links in series, of which only the first may have a random delay, as one series behind one delay.
 
-    A constant delay may be moved to the front past links that forget: their gains and noises are independent over time.
+    A constant delay may be moved before links without memory: their gains and noises are independent over time.
     """
     # Links each late by itself, if at all.
     delays = [link for link in links if isinstance(link, DelayedLink)]
@@ -387,8 +387,8 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
 def _lengthen_delay(link: DelayedLink, added_steps: int) -> Delay:
     """Return a link's delay, longer by `added_steps`.
 
-    A random delay is held as a choice among maps, or as modes of maps. `link.times` are the possible delays. A chain of
-    modes is returned as it is, since its mode is the number of steps.
+    `link.times` are the possible delays. `link.delay` is a mixture of selections if the delay is drawn at each step,
+    and modes of selections if a Markov chain gives it. A chain is returned as it is: its mode is the number of steps.
     """
     match link.delay:
         case Mixture():

@@ -173,13 +173,13 @@ class GainAndNoise(AbstractHop):
         return equal_to_rounding(self.matrix, actual.matrix) and same_noise(self.noise, actual.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return which outputs have a known gain: those that use only `known` inputs, by a constant gain."""
+        """Return which outputs (m,) have a known gain: an output must use only `known` inputs, by a constant gain g."""
         is_used = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
         are_known: KnownGains = (self.law.constant is not None) & ~np.any(is_used & ~known, axis=1)
         return are_known
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the outputs that are angles: those that take one angle by a gain of 1, and nothing else."""
+        """Return the indices of the outputs that are angles: each must take one angle by a gain of 1, and no more."""
         if not sent:
             return ()
         if is_traced(self.matrix):

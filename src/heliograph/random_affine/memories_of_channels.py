@@ -153,7 +153,7 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 
 
 def replace_memories(channel: T, replacements: Mapping[str, AbstractMemory]) -> T:
-    """Return the map with other memories; `replacements` holds them by the identity of those that they replace."""
+    """Return the map with some memories replaced: `replacements` has the new memory by the identity of the old one."""
 
     def replace(leaf: PyTree) -> PyTree:
         """Return a map with its memory replaced; return anything else unchanged."""

@@ -63,7 +63,7 @@ class AbstractNoise(Module):
 
     @property
     def has_outliers(self) -> bool:
-        """True if the law says that there are outliers."""
+        """True if the law is one with outliers, such as Student's t; by default it is not."""
         return False
 
     @property
@@ -294,7 +294,7 @@ class Independent(AbstractNoise):
         return all(component.is_symmetric for component in self.parts)
 
     def branches(self) -> GaussianBranches:
-        """Return the branches of the parts, one above the other."""
+        """Return each component as a mixture of Gaussian branches about its mean: those of the independent parts."""
         return stack_branches([component.branches() for component in self.parts])
 
     def branches_through(self, matrix: Matrix) -> GaussianBranches:

@@ -224,7 +224,7 @@ class Series(AbstractCombination):
 
 
 def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """Return the map y after x, and which of its outputs arrive: those that use nothing that x lost."""
+    """Return the map y after x, and which of its outputs arrive: each must use no output that x lost."""
     received = known(np.diag(x.arrived.astype(float)))  # puts zero in place of what x lost
     gain_moments = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
     uses = np.einsum("iiaa->ia", gain_moments) > 0  # E[G_ia^2]

@@ -284,8 +284,8 @@ class FunctionWriter:
     def _write_loop(self, loop: Loop) -> None:
         """Write a loop as basic blocks: phi nodes for the numbers that it carries, the body, and the jump back.
 
-        A phi node stands at the beginning of a turn: it has the initial number if control comes from before the loop,
-        and the next turn's number if it comes from the end of the body. A counted loop has at least one turn.
+        A phi node stands at the beginning of an iteration. It has the initial number if control comes from before the
+        loop, and else that from the end of the body. A counted loop has at least one iteration.
         """
         self.count += 1
         name, label_before = f"loop{self.count}", self.label
@@ -335,7 +335,7 @@ class FunctionWriter:
             self._note_name(loop.counter, self.write_operand(loop.counter))
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
-        """Write a counted loop's body and the jump to its next turn; return the names of what that turn is carried."""
+        """Write a counted loop's body and the jump back; return the names of the next iteration's carried numbers."""
         self.write_block(loop.body)
         following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")
@@ -349,7 +349,7 @@ class FunctionWriter:
     def _write_conditional_loop(self, loop: Loop, name: str, carried: list[int]) -> tuple[list[str], list[str]]:
         """Write the body of a loop that ends when no lane's condition holds.
 
-        Returns the names of the carried numbers in the next turn, and of those that are left at the loop's end.
+        Return the names of the carried numbers in the next iteration, and those of the same numbers after the loop.
         """
         # The body up to the loop's check, and what follows it in a turn.
         check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, LoopExit) and s.loop is loop)

@@ -69,7 +69,7 @@ def split_shared_from_differing(
     alone: bool,
     summed: SummedOutputs | None,
 ) -> ProgramParts:
-    """Return the parts of a program for its two functions, of what differs between runs and of what they share.
+    """Decide which items of a program differ between runs: one function computes these, and another one the others.
 
     Args:
         program: the program of one run.

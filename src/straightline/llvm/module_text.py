@@ -326,9 +326,9 @@ def _add_to_sums(
 ) -> None:
     """Make the writer's stores to these outputs add to sums over runs.
 
-    A row of sums has a place for each batch and some more (`row_length_of_sums`). Of each `width` consecutive runs, the
-    most that a vector has, the first adds to the place of its batch, run number mod batches, and the others to the
-    places behind it: so sums have the same bits however many runs a vector has.
+    Run r belongs to batch r mod batches. A row has a sum for each batch and some more (`row_length_of_sums`). The first
+    of each `width` consecutive runs, the most that a vector has, adds to the sum of its batch, and the others to those
+    behind it, also beyond the last batch. So sums have the same bits however many runs a vector has.
 
     Args:
         writer: of the function of blocks, at the beginning of a block.

@@ -221,7 +221,7 @@ def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
-    """Return the sum over the `count` turns of a loop of the number that each turn would stack."""
+    """Return the sum of the numbers that `turn` returns to be stacked, over the `count` iterations of a loop."""
     sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:

@@ -21,18 +21,18 @@ Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[n
 def repeat_turns(
     lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
 ) -> tuple[list[np.ndarray], list[StridedArray]]:
-    """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
+    """Make a loop of `length` iterations of `turn`; return the carry after it, and the stacked results in memory.
 
-    turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or `backwards` down to
-    0. `carry` has the arrays of nodes that a turn hands to the next.
+    turn(row, carry) lowers one iteration, and returns the next carry and what is stored in this row of the stacked
+    results. Rows run from 0 up, or `backwards` down to 0. `carry` has the arrays of nodes before the first iteration.
     """
     graph, outer = lowering.graph, lowering.graph.current
 
     def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
-        """Lower the body of a loop of `length` turns by `turn`; return the next carry and the stacked arrays.
+        """Lower the body of a loop by `turn`; return the next carry and the stacked arrays.
 
-        A stacked array (length, ...) lies in memory of the block `outer` around the loop. Each turn stores one row, and
-        if `backwards` the first turn stores the last row.
+        A stacked array (length, ...) lies in memory of the block `outer` around the loop. Each iteration stores one
+        row; if `backwards`, the first one stores the last row.
         """
         loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
@@ -45,17 +45,17 @@ def repeat_turns(
 def _lower_loop(
     lowering: Lowering, length: int | None, carry: Sequence[np.ndarray], body: Callable[[Loop, list[np.ndarray]], Any]
 ) -> tuple[list[np.ndarray], Any]:
-    """Lower a loop; return the carry after it, and what the body returns beside its carry.
+    """Lower a loop; return the carry after it, and what the body returns in addition to its carry.
 
     A matrix that is symmetric before the loop is taken for symmetric within it: the loop carries its upper triangle.
     Where the body does not keep a matrix symmetric, the body is lowered once more, with all its entries carried.
 
     Args:
         lowering: the program.
-        length: how many turns; None of a loop that ends by its condition.
-        carry: the arrays of nodes that the first turn begins with.
-        body: lowers one turn into the open block: of the loop and of the carry before a turn it returns the carry after
-            it and, beside that, anything.
+        length: how many iterations; None of a loop that ends by its condition.
+        carry: the arrays of nodes before the first iteration.
+        body: function of the loop and of the carry before an iteration. It lowers the iteration into the open block,
+            and returns the carry after it, and something else.
     """
     graph, outer = lowering.graph, lowering.graph.current
     by_triangle = [is_symmetric(x) for x in carry]  # which carried arrays are carried as their upper triangle
@@ -101,10 +101,10 @@ def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list
 def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> StridedArray:
-    """Store one turn's array as one row of new memory; return the array (length, ...) of all turns.
+    """Store one iteration's array as a row of new memory; return the array (length, ...) of all iterations.
 
-    The memory belongs to the block `outer`. The row's number is that of the turn, `counter`. If `backwards`, turn 0
-    has the last row.
+    The memory belongs to the block `outer`. The row's number is that of the iteration, `counter`. If `backwards`,
+    iteration 0 has the last row.
     """
     nodes = _list_nodes_of_numbers(value)
     type: Type = nodes[0].type if nodes else "f64"
@@ -159,8 +159,8 @@ def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower `scan`, and return its carry and then what it stacks.
 
-    It is written out turn by turn if all turns compute at most `written_out` numbers, else it becomes a loop. The
-    arguments are constants, the carry, and arrays of which each turn gets a row.
+    If all iterations together compute at most `written_out` numbers, they are written out one after another. Else the
+    scan becomes a loop. The arguments are constants, the carry, and arrays of which each iteration gets a row.
     """
     params = equation.params
     (consts, carried), length = _count_scan_arguments(params), params["length"]
@@ -176,9 +176,9 @@ def _lower_long_scan(
 ) -> list[Value]:
     """Lower a scan as a loop, whose long arrays stay in memory; return its carry, then what it stacks.
 
-    `fixed` are arguments that are the same in each turn, `rows` arrays of which a turn has one row. Of the carried
-    arrays, by number: one that the body returns unchanged is a constant of the loop; a long one is carried in memory
-    (`in_memory`); all others are carried as numbers (`as_numbers`).
+    `fixed` are arguments that are the same in each iteration, `rows` arrays of which an iteration has one row. A
+    carried array that the body returns unchanged is a constant of the loop. A long one is carried in memory
+    (`in_memory`). All others are carried as numbers, a node for each entry (`as_numbers`).
     """
     params, program = equation.params, equation.params["jaxpr"]
     carried_in, carried_out = program.jaxpr.invars[len(fixed) :], program.jaxpr.outvars
@@ -294,7 +294,7 @@ def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
 def _write_out_scan(
     lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
 ) -> list[Value]:
-    """Lower a short `scan` as its turns one after another; return its carry, then what it stacks."""
+    """Lower a short `scan` as its iterations, one after another; return its carry, then the results that it stacks."""
     params = equation.params
     stacked: list[list[Value]] = []
     turns = range(params["length"])
@@ -347,11 +347,9 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
 
     def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
-        """Lower the check of the condition and then one turn; return the next carry. Nothing is stacked.
+        """Lower the check of the condition and then one iteration; return the next carry. Nothing is stacked.
 
-        `params` holds JAX's programs of the condition and of the body. `of_condition` and `of_body` are their arguments
-        before the carry. The loop goes on while any run's condition holds. A run whose condition fails keeps its
-        numbers.
+        The loop goes on while any run's condition holds. A run whose condition does not hold keeps its carry.
         """
         active = lowering.nodes(lowering.inline_program(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), list_nodes(active))

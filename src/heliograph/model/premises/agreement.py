@@ -248,10 +248,10 @@ def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
 
 
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
-    """Return whether the sender's rule is the one that the filter believes.
+    """Return whether the sender's actual rule, `own`, is the one that the filter assumes, `believed`.
 
-    A filter that believes in no rule agrees with a schedule (Periodic): a schedule leaves values out whatever they are,
-    so that a missing value says nothing.
+    A filter that assumes no rule is also right for a schedule (Periodic), which leaves out values whatever they are, so
+    that a missing value has no information.
     """
     if believed is None:
         return own is None or isinstance(own, Periodic)
@@ -259,7 +259,7 @@ def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None)
 
 
 def _same_gains(believed: Premise, own: Premise) -> bool:
-    """Decide whether the relays that are there run the believed gains; others were left out of a recording."""
+    """Return whether each relay that a recording has runs with the gain that the filter assumes for it."""
     return all(equal_to_rounding(gain, own.gains[name]) for name, gain in believed.gains.items() if name in own.gains)
 
 

@@ -70,7 +70,7 @@ class Premise:
         self.encoder = encoder
 
     def replaced(self, **parts: Any) -> "Premise":
-        """Return the premise, the models that a filter was made for, with other parts: plant=..., sensor=..., ..."""
+        """Return the premise, the models that a filter was made for, with some of them replaced, such as plant=..."""
         other = copy(self)
         other.__dict__.update(parts)
         return other
@@ -141,7 +141,7 @@ def with_premise(made: B, premise: Premise | None) -> B:
 
 
 def believes(make: Callable[P, B]) -> Callable[P, B]:
-    """Let the filter that a function makes say what it believes: its plant, sensor, channel, trigger, encoder.
+    """Let the filter that a function makes keep the models for which it is made: plant, sensor, channel and so on.
 
     In a network a claim holds where these are the node's own. Without a channel, the sensor is received as it is.
 
@@ -151,7 +151,7 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
     Raises:
         ValueError: no function, or one whose parameters nobody can know.
     """
-    parts = ("plant", "sensor", "channel", "trigger", "encoder")
+    model_names = ("plant", "sensor", "channel", "trigger", "encoder")
     try:
         parameters = inspect.signature(make)
     except (TypeError, ValueError) as error:
@@ -159,12 +159,12 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:
-        """Make the filter, and store with it the plant, sensor, channel, trigger and encoder among the arguments.
+        """Make the filter by the decorated function `make`, and store the models among the arguments as its premise.
 
-        From outside: `make`, the decorated function, `parameters`, its signature, and `parts`, the names of these five.
+        The models are the arguments of these names: plant, sensor, channel, trigger and encoder.
         """
-        given = parameters.bind(*args, **kwargs).arguments
-        premise = Premise(**{name: given[name] for name in parts if name in given})
+        arguments = parameters.bind(*args, **kwargs).arguments
+        premise = Premise(**{name: arguments[name] for name in model_names if name in arguments})
         if premise.sensor is not None and premise.channel is None:
             # Without a channel the sensor's outputs are received as they are.
             premise.channel = perfect(len(first(premise.sensor).outputs))

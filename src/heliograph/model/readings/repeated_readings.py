@@ -154,9 +154,9 @@ def find_stuck_counts(
 
     Args:
         received: how many numbers are received.
-        stuck: True for what noise and resolution of the sensor make once in 10^9 readings, a whole number, None or
-            False for a number that may repeat; or one of these for each.
-        sensor: the sensor, of which True asks.
+        stuck: True for as many as noise and resolution of the sensor give once in 10^9 readings; or a whole number; or
+            None or False for a number that may repeat; or a list with one of these for each.
+        sensor: the sensor, whose noise and resolution are needed if `stuck` is True.
         channel: its channel, which must deliver the outputs as they were sent.
 
     Returns:

@@ -57,7 +57,7 @@ class AbstractLaw(Module):
         raise unwritten(self, "moment")
 
     def extremes(self) -> tuple["AbstractLaw", ...]:
-        """Return the laws at the corners of the set of possible laws; the law itself when it is known."""
+        """Return the extreme laws, vertices ("corners") of the set of possible laws; itself alone when it is known."""
         return (self,)
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
@@ -189,8 +189,8 @@ class Discrete(AbstractLaw):
     def worst(self, payoff: ArrayLike) -> float:
         """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
-        |dp_i| is at most the radius. Every probability begins at its lower end, and the mass that is left goes to the
-        largest payoffs first. This is the fractional knapsack, which solves the linear programme.
+        |dp_i| is at most the radius. Every probability begins at its lower end. The mass that is missing to a sum of 1
+        goes to the largest payoffs first. This is the fractional knapsack, which solves the linear programme.
         """
         gain = array("payoff", payoff, self.values.shape)
         low = np.maximum(self.probabilities - self.radius, 0.0)

@@ -110,12 +110,13 @@ def mix_gains(gains: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts
     return DisturbedGain(mean, second, inputs)
 
 
-def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGain], index: int) -> DisturbedGain:
-    """Return the same map in the joint columns of `parts`: the `shared` columns first, then those of each part.
+def _place_columns(gain: DisturbedGain, shared: int, gains: Sequence[DisturbedGain], index: int) -> DisturbedGain:
+    """Return the moments of one map H = [G, N] among several, as a map of the signal and of the disturbances of all.
 
-    The map is the part with this `index`, and is zero in the columns of the other parts.
+    The first `shared` columns of every map take the signal. The joint map has them first, and then the disturbance
+    columns of each map in turn. The map `gain` is gains[index], and is zero in the columns of the other maps.
     """
-    private_widths = [part.mean.shape[1] - shared for part in parts]
+    private_widths = [other.mean.shape[1] - shared for other in gains]
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]
     m, total = gain.mean.shape[0], shared + sum(private_widths)
@@ -125,13 +126,13 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
     return DisturbedGain(mean, second, shared)
 
 
-def stack_on_shared_inputs(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
+def stack_on_shared_inputs(gains: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
     """Return the moments E[H] and E[H_ab H_ij] of independent maps one above the other, with common first inputs.
 
     The first `shared` columns of each map take the common inputs. Its other columns belong to its own noises. For rows
     of two different maps E[H_ab H_ij] is the product of the means.
     """
-    placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]
+    placed = [_place_columns(gain, shared, gains, i) for i, gain in enumerate(gains)]
     mean = np.concatenate([gain.mean for gain in placed])
     second = np.multiply.outer(mean, mean)
     row = 0

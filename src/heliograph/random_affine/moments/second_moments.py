@@ -247,9 +247,9 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
 
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
-    """Return the spread with exact zeros for known gains, where a difference of moments leaves rounding.
+    """Return the covariances `spread` of the entries of (G, n), with exact zeros for the entries of G that are known.
 
-    The spread (m, m, p + 1, p + 1) has at [i, j, a, b] the covariance of entries (i, a) and (j, b) of (G, n).
+    As differences of moments they have rounding there. `spread` has at [i, j, a, b] that of entries (i, a) and (j, b).
     """
     is_random = ~channel.known_gains
     gain_varies = np.outer(is_random, np.ones(channel.inputs))
@@ -259,11 +259,11 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
 
 
 def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
-    """Return bounds of spread, shift and power of a stack of independent maps H_i, of nominal means M_i.
+    """Return bounds of spread, shift and power of a stack of independent maps z_i = H_i Y, Y = (y, 1), M_i = E[H_i].
 
-    Diagonal blocks are those of each part. Off the diagonal, parts meet through their means only, Y = (y, 1):
-    E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j', D_i = E H_i - M_i at most the `reach` of part i in each entry. A
-    bound is a map with a center, and a radius of each entry.
+    The spread is E_v[(H_i - M_i) Y Y' (H_j - M_j)'] under any possible law v. It is bounded for each map alone, and for
+    different maps, which are independent, it is D_i Y Y' D_j', D_i = E_v[H_i] - M_i, with |D_i| at most the `reach` of
+    map i in each entry. A bound has a center, and a radius for each entry.
     """
     n, mean = channel.outputs, channel.moments(1).mean[:-1]
     blocks: list[list[QuadraticMap]] = []  # (spread, shift, power) of each part
@@ -329,9 +329,9 @@ def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.nda
 
 
 def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
-    """Return the spread of all outputs of independent maps of one y, with the maps' spreads as diagonal blocks.
+    """Return the covariances of the entries of (G, n) of a stack, from those of its independent maps of one y.
 
-    A spread (m, m, p + 1, p + 1) is the covariance of the entries of (G, n) with z = G y + n.
+    `spreads` has for each map the covariances (m, m, p + 1, p + 1) of its (G, n); they are diagonal blocks.
     """
     outputs_by_map, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
     outputs = sum(outputs_by_map)

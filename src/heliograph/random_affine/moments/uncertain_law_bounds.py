@@ -19,10 +19,14 @@ PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from di
 
 
 def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tensors of one possible law: spread about the nominal mean H0, shift of the mean, and power.
+    """Return three maps from Y Y', Y = (y, 1), to second moments given y under one possible law of z = (G, n) Y.
 
-    Applied to (y, 1)(y, 1)' they give second moments of parts of z = G y + n: the spread that of ((G, n) - H0)(y, 1),
-    the shift that of (E(G, n) - H0)(y, 1), and the power that of G y. `mean` is H0.
+    They are the spread E[e e'], e = ((G, n) - H0) Y, about the nominal mean H0; the shift, the same with E[(G, n)] in
+    place of (G, n); and the power E[G y y' G']. A map T (m, m, p + 1, p + 1) gives sum_ab T[i, j, a, b] Y_a Y_b.
+
+    Args:
+        moments: moments of (G, n) up to the second, under the law.
+        mean: H0 = E[(G, n)] under the nominal law (m, p + 1).
     """
     second_moment = moments.second
     law_mean = moments.mean[:-1]
@@ -53,10 +57,10 @@ def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
 
 
 def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
-    """Return the tensor max_v s_v M y y' M' + N_max, and whether it dominates the tensors of all laws v.
+    """Return the second moment max_v s_v M y y' M' + N_max of z = G y + n, and whether it is above those of all laws v.
 
-    N_max is the largest noise. It dominates if the gain's part of the tensor of law v is s_v M y y' M', to rounding,
-    gain and noise are uncorrelated, and N_max - N_v >= 0.
+    s_v is a number, M the nominal E[G], and N_max the noise covariance of the largest trace. It is above all if each
+    law v has s_v M y y' M' + N_v, to rounding, without a correlation of gain and noise, and if N_max - N_v >= 0.
 
     Args:
         tensors: (law, m, m, p + 1, p + 1), maps of (y, 1) (y, 1)' to a second moment of z.
@@ -115,9 +119,9 @@ def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:
     """Return bounds of spread, shift and power of a channel, from the interval in which each of its moments lies.
 
-    With the nominal mean H0, and raw second moments and means m of any law, the spread is raw - H0 m' - m H0' + H0 H0',
-    the shift (m - H0)(m - H0)', and the power raw without the constant. A bound is a map: a center, and a radius of
-    each entry.
+    Let H = (G, n), H0 its nominal mean, m = E[H] and `raw` E[H_ia H_jb] under any possible law. The spread, of H about
+    H0, is raw - H0 m' - m H0' + H0 H0', the shift (m - H0) (m - H0)', and the power `raw` of G alone. A bound has a
+    center, the value at the middle of all intervals, and a radius for each entry.
 
     Args:
         channel: the channel.

@@ -118,9 +118,10 @@ class BitFlips(AbstractRandomAffine):
         return self.outputs
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw p for the message or for each word, and the bits that flip; return H, diagonal with -1 at these, else 1.
+        """Return a drawn H, a diagonal matrix with -1 for each bit that is flipped, and else 1.
 
-        Each word has `bits` numbers -1 or 1, and then `beside` numbers that never flip. The constant 1 is last.
+        First the probability p of a flip is drawn, once for the message or once for each codeword, and then each bit's
+        flip. A codeword has `bits` signs, and then `beside` numbers that are never flipped. The constant 1 is last.
         """
         rate_key, bit_key = jax.random.split(key)
         if self.per_message:
