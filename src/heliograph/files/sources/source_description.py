@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 from heliograph.files.device_availability import Available
 from heliograph.files.sources.derived_values import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.sources.message_fields import TimeUnit, convert_name, convert_time, field_at, parse_start
-from heliograph.files.sources.message_reading import is_allowed
+from heliograph.files.sources.message_reading import is_allowed, read_texts
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
@@ -173,6 +173,7 @@ class Source:
         available: conditions on what the device says of itself on another topic.
         valid: the values that the field at each dotted path has where the message can be trusted.
         quoted: whether numbers may be texts.
+        marks: whether a message of ROS may say that a value is none.
     """
 
     paths: "tuple[Path, ...]"
@@ -189,6 +190,7 @@ class Source:
     available: "Devices"
     valid: "Allowed"
     quoted: bool
+    marks: bool
 
     @property
     def fields(self) -> list[str]:
@@ -228,6 +230,7 @@ def json_field(
     where: "Where" = None,
     valid: "Valid" = None,
     quoted: bool = False,
+    marks: bool = True,
 ) -> "Source":
     """Map a field of a topic's messages, or several, to a node's outputs or to inputs of the plant.
 
@@ -267,6 +270,8 @@ def json_field(
             right: true or 1; or for each path the values that say so, as in `where`. Any other message is refused, by
             its reason, and counts as none that was lost. None for no such flag.
         quoted: whether numbers in quotes are numbers too (default False: they are refused).
+        marks: whether values did not arrive of which a message of ROS says itself that they are none, as an `Imu` by a
+            -1 in its covariance (default True). False for a driver that sets such marks beside values.
 
     Raises:
         ValueError: no path, as many outputs as paths expected and others given, numbers that are not finite, another
@@ -305,6 +310,7 @@ def json_field(
         available=available,
         valid=_read_valid_flags(valid),
         quoted=flag("json_field, quoted", quoted),
+        marks=flag("json_field, marks", marks),
     )
 
 
@@ -370,14 +376,6 @@ def _read_valid_flags(valid: object) -> Allowed:
     if not isinstance(valid, Mapping | None):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
     return _split_conditions(valid)[0]  # those on fields of the message
-
-
-def read_texts(name: str, value: object) -> tuple[str, ...]:
-    """Return a text or a sequence of texts as a tuple; `name` is the option's name, for errors."""
-    items = [value] if isinstance(value, str) else value
-    if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
-        raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))
-    return tuple(items)
 
 
 def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:
