@@ -15,8 +15,16 @@ def estimate_long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
 
 
 def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float, float]:
-    """Return the mean of a series (steps,), and its standard error."""
-    return float(values.mean()), estimate_long_run_deviation(values) / float(np.sqrt(len(values)))
+    """Return the mean of a series (steps,), and its standard error, which is NaN of one value.
+
+    Deviations from the mean of the series itself are too small: of n independent ones the long-run variance is
+    n - 1' W 1 / n of n parts, W being Bartlett's weights over L lags; this is made good.
+    """
+    n = len(values)
+    if n < 2:
+        return float(values.mean()), float("nan")
+    weights = estimate_by_bartlett([np.ones((n, 1))]).covariance[0, 0] / n  # 1' W 1 / n
+    return float(values.mean()), estimate_long_run_deviation(values) / float(np.sqrt(n - weights))
 
 
 Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profile"]

@@ -59,17 +59,21 @@ def count_independent(values: Float[np.ndarray, " time"]) -> float:
 def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """Return the mean of correlated values that are not NaN, and its standard error by Bartlett's weights.
 
-    The weights reach over the cube root of the length.
+    The weights W reach over the cube root of the length. Deviations from the mean of these very values are too small:
+    of n independent ones e' W e is n - 1' W 1 / n variances in the mean, and not n, which is made good. The error of a
+    single value is not known, NaN.
     """
     is_known = ~np.isnan(values)
     count = max(int(is_known.sum()), 1)
     mean = float(values[is_known].sum() / count)
+    if count == 1:
+        return mean, float("nan")
     deviations = np.where(is_known, values - mean, 0.0)
     # The variance of the sum of all values is sum_t (1 - |t| / width) sum_k e_k e_(k+t), with the deviations e. This
-    # equals the sum of squares of all moving sums of `width` deviations, divided by the width.
+    # equals the sum of squares of all moving sums of `width` deviations, divided by the width; 1' W 1 likewise.
     width = int(np.ceil(len(values) ** (1 / 3))) + 1
-    moving_sums = np.convolve(deviations, np.ones(width))
-    return mean, float(np.sqrt(np.mean(moving_sums**2) * (len(moving_sums) / width)) / count)
+    total, ones = (np.sum(np.convolve(x, np.ones(width)) ** 2) / width for x in (deviations, is_known.astype(float)))
+    return mean, float(np.sqrt(total * count / (count - ones / count)) / count)
 
 
 def correlate_over_steps(

@@ -55,6 +55,17 @@ def test_loud_bursts_alone_are_no_memory(seed):
     assert memory.p_value > 0.001 and memory.standard_error[0] > 1 / np.sqrt(10_000)
 
 
+def test_one_pair_is_no_evidence_of_memory():
+    """Every third row, and one more: its one product had the error 0, and was significant with p = 0."""
+    z = np.full((300, 1), np.nan)
+    z[::3, 0] = np.random.default_rng(0).normal(size=100)
+    z[1, 0] = 0.5
+    found = hg.simulation.memory_test(z, lags=3)
+    assert np.isnan(found.standard_error[:2]).all() and found.standard_error[2] > 0
+    assert found.p_value == 1.0 and not found.significant
+    assert found.p_value_of_all > 0.1
+
+
 def test_bad_input():
     with pytest.raises(ValueError, match=r"^data: expected at least 100 steps for 10 lags, got 50"):
         hg.simulation.memory_test(np.zeros(50))

@@ -77,15 +77,15 @@ class MemoryTest:
         size, size_error = average_correlated(_average_components(white**2))
         by_lag = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
         correlation, error = (np.array(column) / size for column in zip(*by_lag, strict=True))
-        # Lag 1 by itself: Gaussian. Without an error it is known, and is 0 or not.
+        # Lag 1 by itself: Gaussian. Without an error it is known, and is 0 or not; of one pair nothing is known.
         if error[0] > 0:
             p_value = float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
         else:
-            p_value = float(correlation[0] == 0)
+            p_value = float(correlation[0] == 0 or np.isnan(error[0]))
         # All lags together: their squares in units of their errors have a chi-squared sum. No error is taken to be
         # below that of as many independent rows.
         rows = np.count_nonzero(~np.isnan(white).all(axis=1))
-        in_errors = correlation / np.maximum(error, 1 / np.sqrt(rows))
+        in_errors = np.where(np.isnan(error), 0.0, correlation / np.fmax(error, 1 / np.sqrt(rows)))
         # Share of the variance that the best linear prediction from earlier ones takes (Yule and Walker).
         share = correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0]
         return MemoryTest(
