@@ -251,8 +251,7 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
     for name, mesh in network.meshes.items():
         claim_of_mesh = find_claim_of_mesh(name, mesh, network)
         claims |= {(node, name): claim_of_mesh for node in network.mesh_nodes(name)}
-    # If a node sends or uses a message only for some of its values, the errors depend on the data in a way that no
-    # fusion follows: it can claim "nominal" at most, neither an exact covariance nor a bound.
+    # Where data decide what arrives, no fusion can claim more than "nominal".
     do_data_decide = any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
     for name, fusion in network.fused.items():
         claim = _find_claim_of_fusion(network, fusion)
