@@ -20,13 +20,12 @@ from heliograph.factors.covariance_factors import (
     eliminate,
     factor_known_covariance,
     join_columns,
-    reciprocal_or_one,
-    reciprocal_or_zero,
-    rounding_of_pivots,
     triangularise,
     unit_lower,
     zero_covariance,
 )
+from heliograph.factors.noise_columns import measure_beside_noises, measure_uncorrelated
+from heliograph.factors.pivots import reciprocal_or_one, reciprocal_or_zero, rounding_of_pivots, spoils_what_is_known
 from heliograph.factors.repeated_measurements import (
     rounding_of_products,
     rounding_of_slopes,
@@ -35,14 +34,13 @@ from heliograph.factors.repeated_measurements import (
 from heliograph.factors.scalar_update import (
     update_by_parts,
     update_by_row,
-    update_by_rows,
     update_by_scalar_given_products,
     update_root_columns,
 )
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.numpy_or_jax import is_traced, library
-from heliograph.numerics.trace_settings import writes_short_programs
+from heliograph.numerics.trace_settings import writes_for_derivatives, writes_short_programs
 from heliograph.numerics.types import Array, Float
 
 
@@ -231,11 +229,9 @@ def condition_on_observation(
     rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = jnp.where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
-    rows, variance = decorrelate(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
     least = rounding_of_slopes(n, fresh.matrix, whole)
-    # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
-    root, news = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
-    root, d, news, values, totals = update_by_rows(root, x.variances, news, variance, least)
+    measure = measure_beside_noises if writes_for_derivatives() else measure_uncorrelated
+    root, d, news, values, totals = measure(x.root, x.variances, x.mean, rows, fresh, present, least)
     return Gaussian(news[:n], below_diagonal(root[:n]), d), Innovations(values, totals, whole)
 
 
@@ -372,9 +368,9 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         product = d * f
         power = f * product
         # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.
-        depends_on_xi = jnp.sum(power) > rounding
-        products = jnp.append(jnp.where(depends_on_xi, product, 0.0), r)
-        powers = jnp.append(jnp.where(depends_on_xi, power, 0.0), r)
+        is_rounding = spoils_what_is_known(jnp.sum(power), rounding, r)
+        products = jnp.append(jnp.where(is_rounding, 0.0, product), r)
+        powers = jnp.append(jnp.where(is_rounding, 0.0, power), r)
         rows = jnp.concatenate([root, column[:, None]], axis=1)
         rows, d, gain, _ = update_by_scalar_given_products(
             rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.factors.covariance_factors import is_positive, reciprocal_or_one
+from heliograph.factors.pivots import is_positive, reciprocal_or_one, spoils_what_is_known
 from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN
 from heliograph.numerics.trace_settings import writes_short_programs
@@ -129,7 +129,7 @@ def update_by_row(
     power = f * product
     if least is None:
         return update_by_scalar_given_products(root, d, f, (product, power), noise)
-    is_rounding = jnp.sum(power) <= least
+    is_rounding = spoils_what_is_known(jnp.sum(power), least, noise)
     noise_or_large = jnp.where(is_rounding, noise + noise_beside_rounding(len(d), least), noise)
     root, d, gain, variance = update_by_scalar_given_products(root, d, f, (product, power), noise_or_large)
     return root, d, gain, jnp.where(is_rounding, noise, variance)
@@ -171,7 +171,7 @@ def _update_by_rows_one_by_one(
         variances.append(total)
         news = news + gain * innovations[i]
         least = propagate_slope_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
-    return root, d, news, _stack_numbers(innovations), _stack_numbers(variances)
+    return root, d, news, stack_numbers(innovations), stack_numbers(variances)
 
 
 def _update_by_rows_in_loop(
@@ -211,6 +211,6 @@ def _move_row_to_end(rows: jax.Array, i: int) -> jax.Array:
     return jnp.concatenate([rows[:i], rows[i + 1 :], rows[i : i + 1]])
 
 
-def _stack_numbers(entries: list[jax.Array]) -> jax.Array:
+def stack_numbers(entries: list[jax.Array]) -> jax.Array:
     """Return numbers as a vector, of none an empty one."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

@@ -138,7 +138,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
     ) -> jax.Array:
         """Return plain(self, z, u), the log-likelihood; of the Kalman filter with derivatives by its covariances."""
         if not self.linear or stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor):
-            return plain(self, z, u)
+            return super().trace_log_likelihood(plain, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
 
         return trace_log_likelihood(plain, self, z, u)

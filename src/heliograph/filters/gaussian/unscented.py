@@ -2,11 +2,13 @@
 
 import jax.numpy as jnp
 
-from heliograph.factors.covariance_factors import WeightedColumns, square_root
-from heliograph.factors.factored_gaussian import Gaussian, Image
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian, Image, image_by_slopes
+from heliograph.factors.pivots import square_root
 from heliograph.filters.gaussian.factories import gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Function, evaluate_beside_mean
+from heliograph.filters.gaussian.moments_for_derivatives import find_odd_and_even_parts
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.wrappers.accepted_models import accept_limits
 from heliograph.model.channel import Channel
@@ -15,6 +17,7 @@ from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Float, Scalar
 
 ROUNDING = 1e-12  # relative, of a condition on parameters that holds with equality
@@ -83,14 +86,20 @@ class Unscented(AbstractTransform):
         self.check(n)
         alpha, beta, kappa = (jnp.asarray(number) for number in (self.alpha, self.beta, self.kappa))
         scale = alpha**2 * (n + kappa)
+        weights = jnp.full(n, 1 / (4 * scale))
+        with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
+        if writes_for_derivatives():
+            parts = find_odd_and_even_parts(function, x, scale)
+            middle = jnp.sum(parts.even, axis=1) * (1 / n)
+            shift = middle * (n / (2 * scale))
+            columns = jnp.concatenate([parts.even - middle[:, None], shift[:, None]], axis=1)
+            return image_by_slopes(parts.here + shift, parts.slopes, x, WeightedColumns(columns, with_shift))
         steps, here = square_root(scale * x.variances), function(x.mean)
         ahead, behind = (values - here[:, None] for values in evaluate_beside_mean(function, x, steps))
         # Sums and differences are twice a_j and b_j.
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
         shift = middle * (n / (2 * scale))
-        weights = jnp.full(n, 1 / (4 * scale))
-        with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
         curvature = WeightedColumns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), with_shift)
         return Image(here + shift, WeightedColumns(ahead - behind, weights), 2 * steps, curvature)
 

@@ -154,7 +154,7 @@ class LinearFilter(AbstractSizedFilter):
     ) -> jax.Array:
         """Return plain(self, z, u), the log-likelihood, with derivatives by covariances where the law is known."""
         if not self.has_score_recursion:
-            return plain(self, z, u)
+            return super().trace_log_likelihood(plain, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
 
         return trace_log_likelihood(plain, self, z, u)

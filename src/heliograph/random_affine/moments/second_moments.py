@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.factors.covariance_factors import WeightedColumns, columns_of
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, columns_with_derivatives
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
@@ -72,15 +72,15 @@ def describe_second_moments(
     Each map takes W = E (y, 1)(y, 1)' to a second moment: that of z about its nominal mean (`spread`), that of the
     mean's shift, that of G y (`power`), and the spread under the `nominal` law. `uncertain`: several laws are possible.
     """
-    gain, noise = split_off_noise(nominal.center)
+    gain, noise = split_off_noise(nominal.center, columns_of)
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
 
 
-def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
+def split_off_noise(spread: Tensor, factor: Any = columns_with_derivatives) -> tuple[Tensor, WeightedColumns]:
     """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
 
     spread (m, m, p + 1, p + 1) has the covariance of the rows i and j of (A, n) at [i, j], with that of n last. If A
-    and n are correlated, nothing is split: the covariances are returned as they are, with columns of zeros.
+    and n are correlated, nothing is split: they are returned as they are, with columns of zeros. `factor` is for Cov n.
     """
     xp, covariance = library(spread), spread[..., -1, -1]
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
@@ -88,7 +88,7 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     at_noise[-1, -1] = 1.0
     # `at_noise` is 1 at the entry of the covariance of n.
     split = xp.where(uncorrelated, covariance, 0.0)
-    noise = _pad_columns(columns_of(split))  # m columns, some of them zero if the covariance has fewer
+    noise = _pad_columns(factor(split))  # m columns, some of them zero if the covariance has fewer
     return spread - split[..., None, None] * at_noise, noise
 
 
