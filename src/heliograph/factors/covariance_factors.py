@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from heliograph.factors.pivots import is_positive, reciprocal_or_one, take_pivot, unit_of
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.linalg import WRITTEN, diagonal, outer, scale, symmetric
 from heliograph.numerics.numpy_or_jax import library
-from heliograph.numerics.trace_settings import precision_in_use
+from heliograph.numerics.trace_settings import write_for_derivatives, writes_for_derivatives
 from heliograph.numerics.types import Array
 from straightline import operation
 
@@ -107,31 +108,6 @@ def _take_entries(entries: jax.Array, indices: np.ndarray) -> jax.Array:
     return lax.gather(entries, indices[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
 
 
-def is_positive(x: jax.Array) -> jax.Array:
-    """Return whether x is a positive normal number: of smaller ones 1 / x may be infinite, so that they count as 0."""
-    return lax.gt(x, lax.full_like(x, np.finfo(np.dtype(x.dtype)).tiny))
-
-
-@jax.jit
-def reciprocal_or_one(x: jax.Array) -> jax.Array:
-    """Return 1 / x of a positive number, and 1 of 0: for a numerator that is 0 where x is, so that 0 / 0 is 0."""
-    return lax.div(lax.full_like(x, 1.0), lax.select(is_positive(x), x, lax.full_like(x, 1.0)))
-
-
-@jax.jit
-def reciprocal_or_zero(x: jax.Array) -> jax.Array:
-    """Return 1 / x of a positive number, and 0 of 0."""
-    positive, one = is_positive(x), lax.full_like(x, 1.0)
-    return lax.select(positive, lax.div(one, lax.select(positive, x, one)), lax.full_like(x, 0.0))
-
-
-@jax.jit
-def square_root(x: jax.Array) -> jax.Array:
-    """Return the root of x, with the derivative 0 at 0: times the infinite one a derivative of 0 would be NaN."""
-    positive = lax.gt(x, lax.full_like(x, 0.0))
-    return lax.select(positive, lax.sqrt(lax.select(positive, x, lax.full_like(x, 1.0))), lax.full_like(x, 0.0))
-
-
 def triangularise(columns: WeightedColumns) -> WeightedColumns:
     """Find L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
 
@@ -202,7 +178,10 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     Rounding may make a pivot d_j negative, so each pivot is raised to at least `least` times |P_jj|.
     """
     least_pivots = least * lax.abs(diagonal(covariance))
-    factor = _eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column
+    if len(covariance) <= WRITTEN:
+        return _eliminate_column_by_column(covariance, least_pivots)
+    # What is to be differentiated is another program of the loop, which an operation would not know.
+    factor = _eliminate_in_loop if writes_for_derivatives() else _eliminate_by_loop
     return factor(covariance, least_pivots)
 
 
@@ -211,9 +190,9 @@ def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> Weig
     n, remainder, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(remainder, j, axis=1, keepdims=False)
-        variances.append(_bound_below(column[j], least[j]))
-        reciprocal = lax.reshape(reciprocal_or_zero(variances[j]), (1,))
-        multiples = column_below_diagonal(j, outer(column, reciprocal))  # column j of L
+        d, column, reciprocal = take_pivot(column, j, least, covariance)
+        variances.append(d)
+        multiples = column_below_diagonal(j, outer(column, lax.reshape(reciprocal, (1,))))  # column j of L
         remainder = symmetric(remainder - outer(multiples, column))
         lower.append(multiples)
     return assemble_factors(lower, variances, covariance.dtype)
@@ -274,6 +253,12 @@ def columns_of(covariance: Array) -> WeightedColumns:
     return eliminate(jnp.asarray(covariance))
 
 
+def columns_with_derivatives(covariance: Array) -> WeightedColumns:
+    """Return `columns_of` a covariance; of a traced one with its derivatives, also where it is zero or singular."""
+    with write_for_derivatives():
+        return columns_of(covariance)
+
+
 def factor_covariances(covariances: Array) -> WeightedColumns:
     """Return the columns W (count, n, n) and weights w (count, n) of covariances P = W diag(w) W' (count, n, n).
 
@@ -306,11 +291,6 @@ def rounding_of(second_moments: Array) -> WeightedColumns:
     return WeightedColumns(np.eye(len(second_moments)), library(second_moments).minimum(variances, LARGEST))
 
 
-def rounding_of_pivots(covariance: Array) -> float:
-    """Return the share of its variance to which elimination of n columns knows a pivot: n eps, one for each column."""
-    return len(covariance) * unit_of(covariance)
-
-
 def rounding_of_variances(variances: Array, products: int) -> Array:
     """Return the rounding of variances that are sums of `products` products: ROUNDING_UNITS products eps of each."""
     return ROUNDING_UNITS * products * unit_of(variances) * variances
@@ -323,16 +303,6 @@ def noise_beside_repeated(sizes: Array) -> Array:
     would count as information. With this one, their square (eps s)^2 is eps times the noise, and so small is the gain.
     """
     return unit_of(sizes) * sizes**2
-
-
-def unit_of(numbers: Array) -> float:
-    """Return eps of the precision in which these numbers are computed."""
-    return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(precision_in_use()).eps))
-
-
-def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
-    """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
-    return lax.select(lax.ge(pivot, floor), pivot, floor)
 
 
 def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
@@ -373,21 +343,23 @@ def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
     return WeightedColumns(lower, variances)
 
 
-@operation(_eliminate_column_by_column)
-def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
+def _eliminate_in_loop(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
     """Return L and d with L diag(d) L' = P, no d below `least` (n,), as a loop over the columns: a short program."""
     n = len(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Subtract d_j L_j L_j' from the remainder of P; put column L_j into L, and d_j >= `least[j]` into d."""
         remainder, lower, variances = carry
-        d = _bound_below(remainder[j, j], least[j])
-        multiples = jnp.where(np.arange(n) > j, remainder[:, j] * reciprocal_or_zero(d), 0.0)
-        return remainder - jnp.outer(multiples, remainder[j]), *insert_column(j, lower, multiples, variances, d)
+        d, column, reciprocal = take_pivot(remainder[:, j], j, least, covariance)
+        multiples = jnp.where(np.arange(n) > j, column * reciprocal, 0.0)
+        return remainder - jnp.outer(multiples, column), *insert_column(j, lower, multiples, variances, d)
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
     return WeightedColumns(lower, variances)
+
+
+_eliminate_by_loop = operation(_eliminate_column_by_column)(_eliminate_in_loop)
 
 
 def insert_column(

@@ -11,16 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import (
-    WeightedColumns,
-    below_diagonal,
-    decorrelate,
-    reciprocal_or_zero,
-    unit_lower,
-)
+from heliograph.factors.covariance_factors import WeightedColumns, below_diagonal, decorrelate, unit_lower
 from heliograph.factors.factored_gaussian import BackwardGain, Gaussian
+from heliograph.factors.pivots import reciprocal_or_zero
 from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.numerics.gaussian_density import LOG_TURN
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import Float
 
 FALLEN = 1e-12  # a row's square in the infinite columns below this share of its first value is rounding
@@ -196,21 +192,53 @@ def observe_diffuse(
     # Components with uncorrelated noises: (H, innovation) times the inverse of the noise's unit lower factor. A
     # component that did not arrive becomes a row of zeros with the noise variance 1, which carries no information.
     factors = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
-    rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
-    rows = decorrelate(factors.matrix, jnp.where(present[:, None], rows, 0.0))
+    state, rows, noises = _decorrelate_measurement(x, matrix, jnp.where(present, innovation, 0.0), factors, present)
     # `correction` is the change of the mean by the components so far.
-    correction, log_likelihood, shows_unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
-    state = x
+    correction, log_likelihood, shows_unknown = jnp.zeros_like(state.mean), jnp.asarray(0.0), []
     for i in range(len(innovation)):
-        h, noise_i = rows[i, :-1], jnp.where(present[i], factors.weights[i], 1.0)
-        state, gain, s, shows = _observe_scalar(state, h, noise_i)
+        h = rows[i, :-1]
+        state, gain, s, shows = _observe_scalar(state, h, noises[i])
         e = rows[i, -1] - h @ correction  # innovation of component i given those before it
         correction = correction + gain * e
         log_density = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
         log_likelihood = log_likelihood + jnp.where(present[i], log_density, 0.0)
         shows_unknown.append(shows & present[i])
-    likelihood = MeasurementLikelihood(log_likelihood, jnp.stack(shows_unknown))
-    return state._replace(mean=x.mean + correction), likelihood
+    n = len(x.mean)
+    mean = x.mean + correction[:n]
+    posterior = Diffuse(mean, state.lower[: len(x.lower)], state.variances[:n], state.infinite[:n])
+    return posterior, MeasurementLikelihood(log_likelihood, jnp.stack(shows_unknown))
+
+
+def _decorrelate_measurement(
+    x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns, present: jax.Array
+) -> tuple[Diffuse, jax.Array, jax.Array]:
+    """Return the state, rows (h, e) of scalar measurements e = h'x + v, and the variances (m,) of v, uncorrelated.
+
+    Where the program is differentiated, the noises become states of their own, measured without a noise: the inverse of
+    their factor N would spread derivatives that are as large as a noise is small.
+
+    Args:
+        x: the state.
+        matrix: H (m, n).
+        innovation: e (m,), 0 of what is missing.
+        noise: N (m, m), unit lower triangular, and weights.
+        present: which components arrived (m,); the others get rows of zeros and the noise 1.
+    """
+    variances = jnp.where(present, noise.weights, 1.0)
+    rows = jnp.where(present[:, None], jnp.concatenate([matrix, innovation[:, None]], axis=1), 0.0)
+    if not writes_for_derivatives():
+        return x, decorrelate(noise.matrix, rows), variances
+    n, m = len(x.mean), len(innovation)
+    root = jnp.zeros((n + m, n + m)).at[:n, :n].set(x.root).at[n:, n:].set(noise.matrix)
+    none, of_noise = jnp.zeros(m), jnp.where(present[:, None], jnp.eye(m), 0.0)
+    state = Diffuse(
+        jnp.concatenate([x.mean, none]),
+        below_diagonal(root),
+        jnp.concatenate([x.variances, jnp.where(present, noise.weights, 0.0)]),
+        jnp.concatenate([x.infinite, none]),
+    )
+    rows = jnp.concatenate([rows[:, :-1], of_noise, rows[:, -1:]], axis=1)
+    return state, rows, jnp.where(present, 0.0, 1.0)
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
@@ -252,7 +280,8 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
         finite_part = jnp.where(is_unknown | (s_inf > 0), 0.0, d[j] * f)
         cross = jnp.where(is_first_unknown, 0.0, cross) + column * jnp.where(shows_unknown, d_inf[j] * f, finite_part)
         # d_j s_{j+1} / s_j, of either part; the first unknown direction that z shows has the variance s / f^2 after it.
-        shrunk = jnp.where(s_inf > 0, d[j], d[j] * s * reciprocal_or_zero(next_s))
+        # As long as s_j is 0, z shows nothing.
+        shrunk = jnp.where((s_inf > 0) | (next_s == 0), d[j], d[j] * s * reciprocal_or_zero(next_s))
         d[j] = jnp.where(is_unknown, jnp.where(is_first_unknown, s * reciprocal_or_zero(f**2), 0.0), shrunk)
         shrunk_inf = jnp.where(shows_unknown, d_inf[j] * s_inf * reciprocal_or_zero(next_s_inf), d_inf[j])
         d_inf[j] = jnp.where(is_first_unknown, 0.0, shrunk_inf)

@@ -20,25 +20,23 @@ from heliograph.factors.covariance_factors import (
     eliminate,
     factor_known_covariance,
     join_columns,
-    reciprocal_or_one,
-    reciprocal_or_zero,
-    rounding_of_pivots,
     triangularise,
     unit_lower,
     zero_covariance,
 )
+from heliograph.factors.noise_columns import measure_beside_noises, measure_uncorrelated
+from heliograph.factors.pivots import reciprocal_or_one, reciprocal_or_zero, rounding_of_pivots, spoils_what_is_known
 from heliograph.factors.repeated_measurements import rounding_of_products, rounding_of_slopes, triangularise_noise
 from heliograph.factors.scalar_update import (
     update_by_parts,
     update_by_row,
-    update_by_rows,
     update_by_scalar_given_products,
     update_root_columns,
 )
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric, where
 from heliograph.numerics.numpy_or_jax import is_traced, library
-from heliograph.numerics.trace_settings import writes_short_programs
+from heliograph.numerics.trace_settings import writes_for_derivatives, writes_short_programs
 from heliograph.numerics.types import Array, Float
 
 
@@ -228,12 +226,9 @@ def condition_on_observation(
     rows = jnp.concatenate([slopes, where(present, innovation, 0.0)[:, None]], axis=1)
     rows = where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + factors.matrix**2 @ factors.weights
-    rows, variance = decorrelate(factors.matrix, rows), where(present, factors.weights, 1.0)
     rounding_variance = rounding_of_slopes(n, factors.matrix, whole)
-    # One measurement changes the rows of L and the slopes of the components after it by the same formula, and also the
-    # mean of x and the mean of (component - its measured value), the innovation times -1. So each pair is one array.
-    root, means = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
-    root, d, means, values, variances = update_by_rows(root, x.variances, means, variance, rounding_variance)
+    measure = measure_beside_noises if writes_for_derivatives() else measure_uncorrelated
+    root, d, means, values, variances = measure(x.root, x.variances, x.mean, rows, factors, present, rounding_variance)
     return Gaussian(means[:n], below_diagonal(root[:n]), d), Innovations(values, variances, whole)
 
 
@@ -373,9 +368,9 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         product = d * f
         power = f * product
         # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.
-        depends_on_xi = jnp.sum(power) > rounding
-        products = jnp.append(where(depends_on_xi, product, 0.0), r)
-        powers = jnp.append(where(depends_on_xi, power, 0.0), r)
+        is_rounding = spoils_what_is_known(jnp.sum(power), rounding, r)
+        products = jnp.append(where(is_rounding, 0.0, product), r)
+        powers = jnp.append(where(is_rounding, 0.0, power), r)
         rows = jnp.concatenate([root, column[:, None]], axis=1)
         rows, d, gain, _ = update_by_scalar_given_products(
             rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)

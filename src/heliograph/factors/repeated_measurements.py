@@ -17,11 +17,11 @@ from heliograph.factors.covariance_factors import (
     assemble_factors,
     column_below_diagonal,
     insert_column,
-    reciprocal_or_one,
     triangularise,
-    unit_of,
 )
+from heliograph.factors.pivots import reciprocal_or_one, set_to_zero, unit_of
 from heliograph.numerics.linalg import WRITTEN, outer, scale, where
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from straightline import operation
 
 
@@ -36,7 +36,10 @@ def triangularise_noise(noise: WeightedColumns) -> WeightedColumns:
     if len(noise.matrix) < 3:
         return triangularise(noise)
     matrix, weights = jnp.asarray(noise.matrix), jnp.asarray(noise.weights)
-    factor = _triangularise_in_loop if len(matrix) > WRITTEN else _triangularise_row_by_row
+    if len(matrix) <= WRITTEN:
+        return _triangularise_row_by_row(matrix, weights)
+    # What is to be differentiated is another program of the loop, which an operation would not know.
+    factor = _triangularise_in_loop if writes_for_derivatives() else _triangularise_by_loop
     return factor(matrix, weights)
 
 
@@ -73,11 +76,6 @@ def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
     return 1024 / (ROUNDING_UNITS * n * unit_of(least)) ** 2 * least
 
 
-def _set_rounding_to_zero(numbers: jax.Array, least: jax.Array) -> jax.Array:
-    """Return numbers, and zero where they are no larger than `least`; NaN stays."""
-    return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
-
-
 def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
     """Factor L diag(d) L' = A diag(w) A' by Gram-Schmidt, row by row, with entries that are only rounding set to 0.
 
@@ -93,7 +91,7 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedCo
     for j in range(m):
         row = lax.index_in_dim(rows, j, keepdims=False)
         if 0 < j < m - 1:  # nothing was subtracted from the first row, and no row follows the last
-            row = _set_rounding_to_zero(row, share * lax.index_in_dim(size, j, keepdims=False))
+            row = set_to_zero(row, jnp.abs(row) <= share * lax.index_in_dim(size, j, keepdims=False))
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
         # Column j of L: L_ij = (row i, row j) / d_j. Then row i loses L_ij row j.
@@ -104,7 +102,6 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedCo
     return assemble_factors(lower, variances, rows.dtype)
 
 
-@operation(_triangularise_row_by_row)
 def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
     """Factor L diag(d) L' = A diag(w) A' by the steps of `_triangularise_row_by_row` in a loop, of many rows."""
     m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
@@ -117,7 +114,7 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
         entry is rounding.
         """
         rows, size, lower, variances = carry
-        row = _set_rounding_to_zero(rows[j], share * size[j])
+        row = set_to_zero(rows[j], jnp.abs(rows[j]) <= share * size[j])
         weighted = weights * row
         d = row @ weighted
         column = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
@@ -128,3 +125,6 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
     start = rows, jnp.abs(rows), jnp.eye(m, dtype=rows.dtype), jnp.zeros(m, rows.dtype)
     _, _, lower, variances = lax.fori_loop(0, m, eliminate_row, start)
     return WeightedColumns(lower, variances)
+
+
+_triangularise_by_loop = operation(_triangularise_row_by_row)(_triangularise_in_loop)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.factors.covariance_factors import is_positive, reciprocal_or_one
+from heliograph.factors.pivots import is_positive, reciprocal_or_one, spoils_what_is_known
 from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN, where
 from heliograph.numerics.trace_settings import writes_short_programs
@@ -148,7 +148,7 @@ def update_by_row(
     power = f * product
     if rounding_variance is None:
         return update_by_scalar_given_products(root, d, f, (product, power), noise)
-    is_rounding = jnp.sum(power) <= rounding_variance
+    is_rounding = spoils_what_is_known(jnp.sum(power), rounding_variance, noise)
     noise_or_large = where(is_rounding, noise + noise_beside_rounding(len(d), rounding_variance), noise)
     root, d, gain, variance = update_by_scalar_given_products(root, d, f, (product, power), noise_or_large)
     return root, d, gain, where(is_rounding, noise, variance)
@@ -200,7 +200,7 @@ def _update_by_rows_one_by_one(
         rounding_variance = propagate_slope_rounding(
             rounding_variance, gain[n:], rounding_variance[i] if i else rounding_of_products(n, innovation_variance)
         )
-    return root, d, means, _stack_numbers(innovations), _stack_numbers(variances)
+    return root, d, means, stack_numbers(innovations), stack_numbers(variances)
 
 
 def _update_by_rows_in_loop(
@@ -240,6 +240,6 @@ def _move_row_to_end(rows: jax.Array, i: int) -> jax.Array:
     return jnp.concatenate([rows[:i], rows[i + 1 :], rows[i : i + 1]])
 
 
-def _stack_numbers(entries: list[jax.Array]) -> jax.Array:
+def stack_numbers(entries: list[jax.Array]) -> jax.Array:
     """Return numbers as a vector, of none an empty one."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

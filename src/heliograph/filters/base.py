@@ -13,6 +13,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.filters.call_checks import call_with_inputs, call_with_state
 from heliograph.filters.chunks import ScanResult
+from heliograph.filters.derivatives_of_likelihood import evaluate_for_derivatives, take_derivatives_from
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
 from heliograph.filters.run_over_data import Filtered, run_over_data, scan_inside_jit
@@ -242,8 +243,8 @@ class AbstractFilter(Module):
         return False
 
     def trace_log_likelihood(self, plain: Callable[..., jax.Array], z: Array, u: Array) -> jax.Array:
-        """Return the log-likelihood of rows in a trace, plain(self, z, u); a linear filter has faster derivatives."""
-        return plain(self, z, u)
+        """Return plain(self, z, u), the log-likelihood of rows, with derivatives also where covariances are zero."""
+        return take_derivatives_from(plain, evaluate_for_derivatives(plain), (self, z, u))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
         """Return the same filter for these inputs and complete data, with covariances and gains computed in advance."""

@@ -13,7 +13,6 @@ from heliograph.factors.covariance_factors import (
     join_columns,
     noise_beside_repeated,
     rounding_of,
-    square_root,
 )
 from heliograph.factors.factored_gaussian import (
     Gaussian,
@@ -23,6 +22,7 @@ from heliograph.factors.factored_gaussian import (
     predict_affine,
     take_leading,
 )
+from heliograph.factors.pivots import square_root
 from heliograph.filters.gaussian.signal_moments import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep

@@ -8,7 +8,8 @@ import numpy as np
 
 from heliograph.numerics.check import covariance, fail, name_list
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Array, ArrayLike, Float
 
 TAKEN_BY = "a known law of x_0 here (hg.kalman_filter takes an unknown one; a large covariance elsewhere)"
 
@@ -50,9 +51,9 @@ class DiffuseStart(Module):
             if name not in states:
                 raise fail("states with an unknown start", f"some of {list(states)}", name)
         is_unknown = np.array([name in unknown_states for name in states])
-        known_covariance = np.array(covariance("known part of the initial covariance", self.known, len(states)), float)
-        known_covariance[is_unknown, :] = known_covariance[:, is_unknown] = 0.0
-        return UnknownStart(known_covariance, tuple(is_unknown.tolist()))
+        given = covariance("known part of the initial covariance", self.known, len(states))
+        known = library(given).where(is_unknown[:, None] | is_unknown, 0.0, given)
+        return UnknownStart(known, tuple(is_unknown.tolist()))
 
 
 class UnknownStart(Module):
@@ -63,7 +64,7 @@ class UnknownStart(Module):
         unknown: which states are unknown (n,).
     """
 
-    known: Float[np.ndarray, "n n"]
+    known: Float[Array, "n n"]
     unknown: tuple[bool, ...] = eqx.field(static=True)
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:

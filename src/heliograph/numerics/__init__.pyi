@@ -173,6 +173,7 @@ from .trace_settings import evaluate_at_points as evaluate_at_points
 from .trace_settings import keep_for_derivatives as keep_for_derivatives
 from .trace_settings import precision_in_use as precision_in_use
 from .trace_settings import use_precision as use_precision
+from .trace_settings import write_for_derivatives as write_for_derivatives
 from .trace_settings import write_short_programs as write_short_programs
 from .trace_settings import writes_short_programs as writes_short_programs
 from .trees.flattened_trees import FlatLayout as FlatLayout

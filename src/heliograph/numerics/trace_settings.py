@@ -1,4 +1,4 @@
-"""Settings of what is traced: programs that are to be short rather than fast, and the precision numbers are rounded to.
+"""Settings of what is traced: programs to be short rather than fast, or to be differentiated, and numbers' precision.
 
 A trace that is kept holds for the settings it was made under (`trace_settings`).
 """
@@ -17,12 +17,13 @@ from heliograph.numerics.types import PyTree
 KEPT = "kept"  # name of numbers that `keep_for_derivatives` marks
 
 _short: ContextVar[bool] = ContextVar("short", default=False)
+_differentiated: ContextVar[bool] = ContextVar("differentiated", default=False)
 _precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default=np.float64)
 
 
 def trace_settings() -> tuple[object, ...]:
     """Return all settings now, as part of the key of a trace that is kept."""
-    return _short.get(), _precision.get()
+    return _short.get(), _differentiated.get(), _precision.get()
 
 
 @contextmanager
@@ -48,6 +49,24 @@ def evaluate_at_points(function: Callable[[jax.Array], jax.Array], points: jax.A
 def writes_short_programs() -> bool:
     """Return whether what is traced is written as short programs."""
     return _short.get()
+
+
+@contextmanager
+def write_for_derivatives() -> Iterator[None]:
+    """Within the block, trace covariances so that derivatives are right also where a variance is zero.
+
+    The numbers themselves are the same to rounding, by more operations: it is only for what is differentiated.
+    """
+    token = _differentiated.set(True)
+    try:
+        yield
+    finally:
+        _differentiated.reset(token)
+
+
+def writes_for_derivatives() -> bool:
+    """Return whether what is traced is written so that it can be differentiated where variances are zero."""
+    return _differentiated.get()
 
 
 def keep_for_derivatives(numbers: PyTree) -> PyTree:

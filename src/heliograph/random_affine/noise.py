@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.covariance_factors import WeightedColumns, columns_of, eliminate, square_root
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, columns_with_derivatives
+from heliograph.factors.pivots import square_root
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import (
@@ -140,7 +142,7 @@ class Gaussian(AbstractNoise):
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
-            self.factor, self.weights = eliminate(jnp.asarray(self.covariance))
+            self.factor, self.weights = columns_of(self.covariance)
             return
         self.factor = _factor_by_eigenvectors(self.covariance)
         self.weights = np.ones(n)
@@ -148,9 +150,10 @@ class Gaussian(AbstractNoise):
     @property
     def columns(self) -> WeightedColumns:
         """Covariance A diag(w) A' as columns A with weights w."""
-        # A traced covariance was put in place of that of numbers (`eqx.tree_at`): the factor is of another one.
-        if is_traced(self.covariance) and not is_traced(self.factor):
-            return eliminate(jnp.asarray(self.covariance))
+        # A traced covariance was put in place of that of numbers (`eqx.tree_at`): the factor is of another one. And the
+        # factor of a traced covariance lacks its derivatives where it is zero.
+        if is_traced(self.covariance) and (writes_for_derivatives() or not is_traced(self.factor)):
+            return columns_with_derivatives(self.covariance)
         return WeightedColumns(self.factor, self.weights)
 
     @property

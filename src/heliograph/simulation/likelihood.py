@@ -25,9 +25,10 @@ def log_likelihood(
     It is exact for the Kalman filter of a linear Gaussian system. For other filters it is nominal, but a fit can still
     maximise it.
     `jax.grad` passes through it, in any number that the filter is made of, in the precision of the trace
-    (`jax.enable_x64`). Derivatives are right also where covariances are zero by the filters of `hg.kalman_filter` and
-    `hg.linear_filter` themselves (known start, known law of a link without memory, no limits of states, no inputs of
-    the sensor); they have that in a noise's covariance, and none in the factor that the noise holds beside it.
+    (`jax.enable_x64`). Derivatives are those of covariances, right also where these are zero or singular, in double
+    precision: there one-sided, as no variance is negative. Where components of z are determined by others, they are
+    those of the density of the free ones. They are NaN, not wrong, where a state is known by `side_information_filter`,
+    or by a transform of one's own that has `apply` alone.
     Many rows are taken in chunks side by side, as by `filter.run`.
 
     Args:

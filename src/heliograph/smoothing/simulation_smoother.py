@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import square_root
 from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.factors.pivots import square_root
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.run_over_data import check_data
 from heliograph.filters.smoother_step import SmootherStep

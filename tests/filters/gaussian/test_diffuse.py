@@ -261,3 +261,10 @@ def test_an_unknown_level_that_cancels_in_a_prediction_is_not_left_there():
     found = hg.kalman_filter(plant, hg.LinearSensor([[0.0, 0.0, 1.0]], 0.1)).run([[np.nan], [np.nan], [0.5]])
     assert np.isinf(found.covariances[2, 0, 0])
     assert found.covariances[2, 2, 2] == pytest.approx(1 / (1 / 0.2 + 1 / 0.1), rel=1e-12)
+
+
+def test_a_noise_free_sensor_of_an_unknown_state_leaves_what_it_does_not_hear():
+    """It hears x0 alone: x1, which is known before with the variance 1, gains 1/2 a step."""
+    plant = hg.LinearPlant(np.eye(2), np.diag([0.0, 0.5]), np.zeros(2), hg.diffuse(["x0"], known=np.diag([0.0, 1.0])))
+    found = hg.kalman_filter(plant, hg.LinearSensor([[1.0, 0.0]], 0.0)).run([[0.3], [0.3]])
+    np.testing.assert_allclose(found.covariances, [np.diag([0.0, 1.5]), np.diag([0.0, 2.0])], rtol=1e-12, atol=1e-25)

@@ -153,7 +153,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
         factors, which is faster.
         """
         if not self.linear or stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor):
-            return plain(self, z, u)
+            return super().trace_log_likelihood(plain, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # imported only where it is used
 
         return trace_log_likelihood(plain, self, z, u)

@@ -9,20 +9,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import (
-    WeightedColumns,
-    decorrelate,
-    eliminate,
-    reciprocal_or_zero,
-    square_root,
-)
+from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, eliminate
 from heliograph.factors.factored_gaussian import Gaussian, Image, from_covariance, image_by_slopes
+from heliograph.factors.pivots import reciprocal_or_zero, spoil_derivatives, square_root, unit_of
+from heliograph.filters.gaussian.moments_for_derivatives import (
+    find_grid_image,
+    find_odd_and_even_parts,
+    find_quadratic_image,
+)
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.linalg import diagonal
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.trace_settings import evaluate_at_points
+from heliograph.numerics.trace_settings import evaluate_at_points, writes_for_derivatives
 from heliograph.numerics.types import Array
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
+KNOWN = 1e4  # roundings of a state: a part of less says nothing of the derivative of what was computed with it
+SMALLEST = 1e-60  # variance: of less nothing is known
 
 Function = Callable[[jax.Array], jax.Array]
 
@@ -70,6 +73,9 @@ def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     With Cov xi = D, the slopes are (D^-1 L^-1 Cov(x, f))', and Cov f - slopes D slopes' is left.
     """
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
+    if writes_for_derivatives():  # a quotient of numbers of which only rounding is left has no digits of its derivative
+        known = x.variances <= (KNOWN * unit_of(slopes)) ** 2 * (x.mean**2 + diagonal(x.covariance))
+        slopes = spoil_derivatives(slopes, known | (x.variances < SMALLEST))
     unexplained = moments.covariance - (slopes * x.variances) @ slopes.T
     return image_by_slopes(moments.mean, slopes, x, eliminate(unexplained))
 
@@ -92,6 +98,11 @@ class Cubature(AbstractTransform):
         the curvature. Both have the weights 1 / (4 n).
         """
         n = len(x.mean)
+        if writes_for_derivatives():
+            parts = find_odd_and_even_parts(function, x, n)
+            middle = jnp.sum(parts.even, axis=1) / n
+            curvature = WeightedColumns(parts.even - middle[:, None], np.full(n, 1 / (4 * n)))
+            return image_by_slopes(parts.here + middle / 2, parts.slopes, x, curvature)
         steps = square_root(n * x.variances)
         ahead, behind = evaluate_beside_mean(function, x, steps)
         # The factor 1 / 2 of the mean of two values is left out here, and taken into the weights and the mean below.
@@ -162,9 +173,13 @@ class PolynomialMoments(AbstractTransform):
         """
         deviations = square_root(x.variances)
         factor = x.root @ jnp.diag(deviations)
+        if self.degree == 2 and writes_for_derivatives():
+            return find_quadratic_image(function, x)
         if self.degree == 2:
             return _quadratic_image(function, x.mean, factor, deviations)
         points, weights = map(jnp.asarray, _hermite_grid(x.mean.shape[0], self.degree + 1))
+        if writes_for_derivatives():
+            return find_grid_image(function, x, points, weights)
         values = evaluate_at_points(function, x.mean + points @ factor.T).T
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation

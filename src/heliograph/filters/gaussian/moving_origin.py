@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import unit_of
 from heliograph.factors.high_low_mean_gaussian import SplitMeanGaussian, center_gaussian, center_known
+from heliograph.factors.pivots import unit_of
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper

@@ -13,13 +13,13 @@ from jax import lax
 
 from heliograph.factors.covariance_factors import (
     WeightedColumns,
+    columns_with_derivatives,
     eliminate,
     join_columns,
     rounding_of,
-    square_root,
-    unit_of,
 )
 from heliograph.factors.factored_gaussian import Gaussian, Innovations, condition_on_observation
+from heliograph.factors.pivots import square_root, unit_of
 from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
@@ -27,7 +27,8 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angles.angle import Angles, continue_angles, wrap_near
 from heliograph.numerics.linalg import contract, diagonal, where
-from heliograph.numerics.trace_settings import keep_for_derivatives
+from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.trace_settings import keep_for_derivatives, writes_for_derivatives
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -126,7 +127,14 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
     combination of components without noise is known to eps. What the random gain adds, E[(G - M) y y' (G - M)'], is
     formed as a matrix and eliminated, which leaves some hundred eps in a combination without a random gain.
     """
-    return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
+    return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, take_link_noise(channel))
+
+
+def take_link_noise(channel: SecondOrder) -> WeightedColumns:
+    """Return columns of Cov n; of a traced law those with its derivatives, where the program is differentiated."""
+    if not (writes_for_derivatives() and is_traced(channel.noise)):
+        return channel.noise
+    return columns_with_derivatives(channel.nominal.center[..., -1, -1] - channel.gain_spread[..., -1, -1])
 
 
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
@@ -160,7 +168,7 @@ def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) 
 
     `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of the gain G are those of its nominal law.
     """
-    return join_columns(channel.noise, factor_gain_noise(channel.gain_spread, second, mean))
+    return join_columns(take_link_noise(channel), factor_gain_noise(channel.gain_spread, second, mean))
 
 
 def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:

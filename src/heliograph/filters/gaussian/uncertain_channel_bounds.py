@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, reciprocal_or_zero
+from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns
 from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns
+from heliograph.factors.pivots import reciprocal_or_zero
 from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
 from heliograph.filters.gaussian.young_scalars import (

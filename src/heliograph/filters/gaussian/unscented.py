@@ -2,11 +2,13 @@
 
 import jax.numpy as jnp
 
-from heliograph.factors.covariance_factors import WeightedColumns, square_root
-from heliograph.factors.factored_gaussian import Gaussian, Image
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian, Image, image_by_slopes
+from heliograph.factors.pivots import square_root
 from heliograph.filters.gaussian.factories import gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Function, evaluate_beside_mean
+from heliograph.filters.gaussian.moments_for_derivatives import find_odd_and_even_parts
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.wrappers.accepted_models import accept_limits
 from heliograph.model.channel import Channel
@@ -15,6 +17,7 @@ from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Float, Scalar
 
 ROUNDING = 1e-12  # relative, of a condition on parameters that holds with equality
@@ -88,16 +91,23 @@ class Unscented(AbstractTransform):
         self.check(n)
         alpha, beta, kappa = (jnp.asarray(number) for number in (self.alpha, self.beta, self.kappa))
         c = alpha**2 * (n + kappa)
+        weights = jnp.full(n, 1 / (4 * c))
+        weights_with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
+        if writes_for_derivatives():
+            parts = find_odd_and_even_parts(function, x, c)
+            mean_even = jnp.sum(parts.even, axis=1) * (1 / n)
+            shift = mean_even * (n / (2 * c))
+            columns = jnp.concatenate([parts.even - mean_even[:, None], shift[:, None]], axis=1)
+            return image_by_slopes(parts.here + shift, parts.slopes, x, WeightedColumns(columns, weights_with_shift))
         steps, value_at_mean = square_root(c * x.variances), function(x.mean)  # h_j and f(m)
         plus, minus = (values - value_at_mean[:, None] for values in evaluate_beside_mean(function, x, steps))
         # Columns 2 b_j and 2 a_j, so that their weights are 1 / (4 c); xi_j changes by 2 h_j along 2 a_j.
         twice_even, twice_odd = plus + minus, plus - minus
         twice_mean_even = jnp.sum(twice_even, axis=1) * (1 / n)
         shift = twice_mean_even * (n / (2 * c))  # s
-        weights = jnp.full(n, 1 / (4 * c))
         curvature = WeightedColumns(
             matrix=jnp.concatenate([twice_even - twice_mean_even[:, None], shift[:, None]], axis=1),
-            weights=jnp.append(weights, alpha**2 * kappa / n + beta),
+            weights=weights_with_shift,
         )
         explained = WeightedColumns(twice_odd, weights)
         return Image(value_at_mean + shift, explained, unit=2 * steps, curvature=curvature)

@@ -160,7 +160,7 @@ class LinearFilter(AbstractSizedFilter):
         If the channel's law is known, the same value gets a derivative that goes by covariances, which is faster.
         """
         if not self.has_score_recursion:
-            return plain(self, z, u)
+            return super().trace_log_likelihood(plain, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # not before a trace needs it
 
         return trace_log_likelihood(plain, self, z, u)

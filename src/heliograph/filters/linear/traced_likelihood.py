@@ -5,8 +5,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 
+from heliograph.filters.derivatives_of_likelihood import take_derivatives_from
 from heliograph.filters.linear.linear_filter_state import MomentsBeforeData
 from heliograph.filters.linear.step_by_covariances import (
     FactoredStep,
@@ -35,37 +35,7 @@ def trace_log_likelihood(
         z: measurements, NaN for what did not arrive.
         u: inputs.
     """
-    leaves, form = jax.tree.flatten((filter, z, u))
-    traced = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]  # what is known stays known
-
-    @jax.custom_jvp
-    def evaluate(values: list[jax.Array]) -> jax.Array:
-        """Return the log-likelihood at these values of what is traced."""
-        return plain(*jax.tree.unflatten(form, _replace_entries(leaves, traced, values)))
-
-    def differentiate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-        """Return the log-likelihood and its derivative along the tangents.
-
-        A tangent that is a SymbolicZero is known to be zero, so only the derivatives by the other values are computed.
-        """
-        (values,), (slopes,) = primals, tangents
-        moving = [n for n, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
-
-        def by_covariances(moved: list[jax.Array]) -> jax.Array:
-            """Return the log-likelihood with the values `moved` in place of those with tangents."""
-            all_values = _replace_entries(values, moving, moved)
-            return _sum_by_covariances(*jax.tree.unflatten(form, _replace_entries(leaves, traced, all_values)))
-
-        return jax.jvp(by_covariances, ([values[n] for n in moving],), ([slopes[n] for n in moving],))
-
-    evaluate.defjvp(differentiate, symbolic_zeros=True)
-    return evaluate([leaves[i] for i in traced])
-
-
-def _replace_entries(entries: list[Any], places: list[int], values: list[jax.Array]) -> list[Any]:
-    """Return a list with these values in these places."""
-    changed = dict(zip(places, values, strict=True))
-    return [changed.get(i, entry) for i, entry in enumerate(entries)]
+    return take_derivatives_from(plain, _sum_by_covariances, (filter, z, u))
 
 
 def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:

@@ -8,13 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.covariance_factors import (
-    WeightedColumns,
-    factor_covariances,
-    join_columns,
-    rounding_of,
-    square_root,
-)
+from heliograph.factors.covariance_factors import WeightedColumns, factor_covariances, join_columns, rounding_of
 from heliograph.factors.factored_gaussian import (
     Gaussian,
     condition_on_observation,
@@ -22,6 +16,7 @@ from heliograph.factors.factored_gaussian import (
     merge_mixture,
     predict_affine,
 )
+from heliograph.factors.pivots import square_root
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -45,6 +40,7 @@ from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import is_traced, stack_parts
+from heliograph.numerics.trace_settings import write_for_derivatives
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
@@ -288,11 +284,13 @@ def _list_combinations(
     if len(atoms) > COMPONENT_LIMIT:
         raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(atoms):,}")
     weight, gain, offset, noise = (stack_parts(column) for column in zip(*atoms, strict=True))
+    with write_for_derivatives():  # of a traced noise
+        columns = factor_covariances(noise + added_variance * np.eye(noise.shape[-1]))
     return AtomCombinations(
         weight=weight,
         gain=gain,
         offset=offset,
-        noise=factor_covariances(noise + added_variance * np.eye(noise.shape[-1])),
+        noise=columns,
         mode=np.array(mode_of_atom),
         transition=modes_before.transition,
     )

@@ -4,8 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import reciprocal_or_zero
+from heliograph.factors.covariance_factors import WeightedColumns, eliminate
+from heliograph.factors.pivots import reciprocal_or_zero, spoil_derivatives
 from heliograph.numerics.linalg import outer
+from heliograph.numerics.trace_settings import writes_for_derivatives
+
+FEW_DIGITS = 1e-10  # share of its second moment: of a smaller variance few digits are left beside others
 
 
 def orthogonalise_first_rows(
@@ -31,3 +35,29 @@ def orthogonalise_first_rows(
         rows = rows - outer(multiples, rows[i])
         numbers = numbers - multiples * numbers[i]
     return rows, numbers, jnp.stack(variances)
+
+
+def spoil_where_known(
+    numbers: jax.Array, power: jax.Array, moments: tuple[jax.Array, jax.Array], noise: WeightedColumns
+) -> jax.Array:
+    """Return numbers, whose derivatives are NaN where a combination of states, or a noise, is known to rounding.
+
+    Rows of many modes, most of which depend on others, are made orthogonal to them: of derivatives of what is known
+    only rounding would be left. Where nothing is differentiated the numbers are returned.
+
+    Args:
+        numbers: of whose derivatives that is said.
+        power: second moments (n,) of the states before data.
+        moments: rows of (x - c, 1) in each mode (M, n + 1, columns), and the weights of their columns (M, columns).
+        noise: triangular factors of the noise of z in each mode, (M, m, m) and (M, m).
+    """
+    if not writes_for_derivatives():
+        return numbers
+    x, weights = moments
+    second = jnp.einsum("jac,jc,jbc->ab", x, weights, x)
+    mean = second[:-1, -1] / second[-1, -1]
+    left = eliminate(second[:-1, :-1] / second[-1, -1] - jnp.outer(mean, mean)).weights
+    is_possible = jnp.sum(x[:, -1] ** 2 * weights, axis=1, keepdims=True) > 0  # a mode of no probability has no noise
+    of_noise = jnp.einsum("jlc,jc->l", noise.matrix**2, noise.weights) + jnp.max(power)
+    known = jnp.any(left <= FEW_DIGITS * power) | jnp.any(is_possible & (noise.weights <= FEW_DIGITS**2 * of_noise))
+    return spoil_derivatives(numbers, known)

@@ -12,19 +12,17 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import (
     WeightedColumns,
     join_columns,
-    reciprocal_or_zero,
     rounding_of,
     side_by_side,
-    square_root,
     triangularise,
-    unit_of,
 )
 from heliograph.factors.factored_gaussian import Innovations, from_covariance
+from heliograph.factors.pivots import reciprocal_or_zero, square_root, unit_of
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
 from heliograph.filters.gaussian.signal_moments import bound_signal_power_at_start, factor_spread
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag, describe_by_pattern, pattern_of
-from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows
+from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows, spoil_where_known
 from heliograph.filters.modes.jump_linear_filter import concatenate_modes, make_mode_sum_matrix, subtract_mean_output
 from heliograph.filters.modes.linear_by_mode import (
     centred_measurement,
@@ -159,8 +157,10 @@ class SideInformationFilter(AbstractSizedFilter):
         links = jax.tree.map(
             lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
-        size = bound_signal_power_at_start(sensor, second_moments_at_start(self.plant))
+        power = second_moments_at_start(self.plant)
+        size = bound_signal_power_at_start(sensor, power)
         received = _make_measurement_model(prior, sensor, size, *links)
+        prior = prior._replace(variances=spoil_where_known(prior.variances, power, (x, weights), received.noise))
         # The projection, then the innovation as it is reported: NaN for what did not arrive.
         corrected, innovations, innovation = _project_on_data(prior, excess, received, z)
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))

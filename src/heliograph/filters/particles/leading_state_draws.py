@@ -5,8 +5,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.covariance_factors import decorrelate, square_root
+from heliograph.factors.covariance_factors import decorrelate
 from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.factors.pivots import square_root
 from heliograph.factors.repeated_measurements import rounding_of_products
 from heliograph.numerics.gaussian_density import LOG_TURN
 

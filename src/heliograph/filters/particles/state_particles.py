@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.covariance_factors import WeightedColumns, columns_of, join_columns, square_root, triangularise
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, join_columns, triangularise
+from heliograph.factors.pivots import square_root
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,

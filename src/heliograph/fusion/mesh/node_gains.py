@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import WeightedColumns, eliminate, square_root
+from heliograph.factors.covariance_factors import WeightedColumns, eliminate
 from heliograph.factors.factored_gaussian import condition_on_observation, from_covariance
+from heliograph.factors.pivots import square_root
 from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 

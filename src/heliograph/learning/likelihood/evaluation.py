@@ -12,6 +12,7 @@ from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, choose_typical_network, make_filter_of_form
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.gaussian_density import differentiate_log_density
+from heliograph.numerics.trace_settings import write_for_derivatives
 from heliograph.numerics.types import Array, Float
 
 
@@ -186,7 +187,8 @@ def _differentiate_errors(
         """Return (e, S) at x, and their derivatives along one axis of x."""
         return jax.jvp(errors_at, (x,), (axis,))
 
-    (e, s), (de, ds) = jax.vmap(differentiate_along, out_axes=(None, 1))(jnp.eye(len(x)))
+    with write_for_derivatives():
+        (e, s), (de, ds) = jax.vmap(differentiate_along, out_axes=(None, 1))(jnp.eye(len(x)))
     return e, s, de, ds
 
 

@@ -1,22 +1,24 @@
 """Covariance of (A, n) in two parts: that of a random gain A, and columns of that of the noise n; and both joined."""
 
+from typing import Any
+
 import numpy as np
 
-from heliograph.factors.covariance_factors import WeightedColumns, columns_of
+from heliograph.factors.covariance_factors import WeightedColumns, columns_with_derivatives
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.random_affine.moments.moment_tensors import Tensor
 
 
-def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
+def split_off_noise(spread: Tensor, factor: Any = columns_with_derivatives) -> tuple[Tensor, WeightedColumns]:
     """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
 
     `spread` (m, m, p + 1, p + 1) has at [i, j] the covariance of the rows i and j of (A, n), with n last. If A and n
-    are correlated, nothing is split: the covariances are returned as they are, with columns of zeros.
+    are correlated, nothing is split: they are returned as they are, with columns of zeros. `factor` is for Cov n.
     """
     xp, noise_covariance = library(spread), spread[..., -1, -1]
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
     removed = xp.where(uncorrelated, noise_covariance, 0.0)
-    noise = pad_columns(columns_of(removed))  # m columns, some of them zero if the covariance has fewer
+    noise = pad_columns(factor(removed))  # m columns, some of them zero if the covariance has fewer
     return spread - removed[..., None, None] * make_power_of_constant(spread.shape[-1]), noise
 
 

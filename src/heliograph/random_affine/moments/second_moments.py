@@ -82,7 +82,7 @@ def describe_second_moments(
         nominal: the spread under the nominal law.
         uncertain: True if several laws are possible.
     """
-    gain_spread, noise = split_off_noise(nominal.center)
+    gain_spread, noise = split_off_noise(nominal.center, columns_of)
     return SecondOrder(
         mean_gain=mean[:, :-1],
         offset=mean[:, -1],

@@ -1,0 +1,80 @@
+"""A measurement of a Gaussian in factors, of correlated noises: by uncorrelated combinations, or beside the noises.
+
+Components of uncorrelated noises are N^-1 z, N the unit lower triangle of the noise's factors. Where a noise is only
+rounding, N has derivatives as large as one over it, which N^-1 spreads over all columns, to cancel. So what is to be
+differentiated has one more column for each noise, of a weight as small as these derivatives are large.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.factors.covariance_factors import WeightedColumns, decorrelate
+from heliograph.factors.pivots import spoils_what_is_known
+from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
+from heliograph.factors.scalar_update import (
+    Measured,
+    propagate_slope_rounding,
+    stack_numbers,
+    update_by_rows,
+    update_by_scalar,
+)
+
+
+def measure_uncorrelated(
+    root: jax.Array,
+    d: jax.Array,
+    mean: jax.Array,
+    rows: jax.Array,
+    noise: WeightedColumns,
+    present: jax.Array,
+    least: jax.Array,
+) -> Measured:
+    """Measure z = E z + slopes xi + N omega of x = m + L xi, component after component of N^-1 z.
+
+    Returns the rows (n + m, n) and variances (n,) given all components, the mean with what is left of z - E z times -1
+    below, the m innovations, each given those before it, and their variances.
+
+    Args:
+        root: L (n, n).
+        d: variances (n,) of xi.
+        mean: m (n,).
+        rows: slopes (m, n), and z - E z as a last column; 0 of what is missing.
+        noise: N (m, m), unit lower triangular, and the variances r (m,) of omega.
+        present: which components arrived (m,).
+        least: variance (m,) up to which slopes are rounding.
+    """
+    n = len(d)
+    rows, variance = decorrelate(noise.matrix, rows), jnp.where(present, noise.weights, 1.0)
+    # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
+    root, news = jnp.concatenate([root, rows[:, :n]]), jnp.concatenate([mean, -rows[:, n]])
+    return update_by_rows(root, d, news, variance, least)
+
+
+def measure_beside_noises(
+    root: jax.Array,
+    d: jax.Array,
+    mean: jax.Array,
+    rows: jax.Array,
+    noise: WeightedColumns,
+    present: jax.Array,
+    least: jax.Array,
+) -> Measured:
+    """Compute `measure_uncorrelated` with omega as more columns, so that a component has no other noise."""
+    n, m = len(d), len(present)
+    N, r = jnp.where(present[:, None], noise.matrix, 0.0), jnp.where(present, noise.weights, 0.0)
+    of_state = jnp.concatenate([root, jnp.zeros((n, m), N.dtype)], axis=1)
+    root = jnp.concatenate([of_state, jnp.concatenate([rows[:, :n], N], axis=1)])
+    news, d = jnp.concatenate([mean, -rows[:, n]]), jnp.concatenate([d, r])
+    innovations, variances = list[jax.Array](), list[jax.Array]()
+    for i in range(m):
+        f = root[n + i]
+        is_rounding = spoils_what_is_known(d[:n] @ f[:n] ** 2, least[i], r[i]) if i else jnp.asarray(False)
+        # Of what is missing all slopes are 0, and the noise is 1.
+        other_noise = jnp.where(is_rounding, noise_beside_rounding(n, least[i]), jnp.where(present[i], 0.0, 1.0))
+        root, d, gain, total = update_by_scalar(root, d, f, other_noise)
+        total = jnp.where(is_rounding, r[i], total)
+        innovations.append(-news[n + i])
+        variances.append(total)
+        news = news + gain * innovations[i]
+        least = propagate_slope_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
+    return root[:, :n], d[:n], news, stack_numbers(innovations), stack_numbers(variances)

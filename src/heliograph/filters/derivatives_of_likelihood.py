@@ -1,0 +1,64 @@
+"""Derivatives of a likelihood by another program than the one that computes its value, written only where JAX asks."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.custom_derivatives import SymbolicZero
+
+from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.trace_settings import write_for_derivatives
+
+Likelihood = Callable[..., jax.Array]
+
+
+def evaluate_for_derivatives(likelihood: Likelihood) -> Likelihood:
+    """Return the same likelihood, whose trace has right derivatives also where covariances are zero."""
+
+    def evaluate(*arguments: Any) -> jax.Array:
+        """Return the likelihood of these arguments, written by more operations than its value needs."""
+        with write_for_derivatives():
+            return likelihood(*arguments)
+
+    return evaluate
+
+
+def take_derivatives_from(plain: Likelihood, differentiated: Likelihood, arguments: tuple[Any, ...]) -> jax.Array:
+    """Return plain(*arguments), a log-likelihood, with the derivatives of another function that computes it too.
+
+    Args:
+        plain: the log-likelihood as it is computed best.
+        differentiated: the same by a program that can be differentiated; it is traced only for a derivative.
+        arguments: filter, measurements and inputs, of which some numbers are traced.
+    """
+    leaves, form = jax.tree.flatten(arguments)
+    traced = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]  # what is known stays known
+
+    @jax.custom_jvp
+    def evaluate(values: list[jax.Array]) -> jax.Array:
+        """Return the log-likelihood at these values of what is traced."""
+        return plain(*jax.tree.unflatten(form, _replace_entries(leaves, traced, values)))
+
+    def differentiate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+        """Return the log-likelihood and its derivative along the tangents.
+
+        A tangent that is a SymbolicZero is known to be zero, so only the derivatives by the other values are computed.
+        """
+        (values,), (slopes,) = primals, tangents
+        moving = [n for n, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
+
+        def move(moved: list[jax.Array]) -> jax.Array:
+            """Return the log-likelihood with the values `moved` in place of those with tangents."""
+            all_values = _replace_entries(values, moving, moved)
+            return differentiated(*jax.tree.unflatten(form, _replace_entries(leaves, traced, all_values)))
+
+        return jax.jvp(move, ([values[n] for n in moving],), ([slopes[n] for n in moving],))
+
+    evaluate.defjvp(differentiate, symbolic_zeros=True)
+    return evaluate([leaves[i] for i in traced])
+
+
+def _replace_entries(entries: list[Any], places: list[int], values: list[jax.Array]) -> list[Any]:
+    """Return a list with these values in these places."""
+    changed = dict(zip(places, values, strict=True))
+    return [changed.get(i, entry) for i, entry in enumerate(entries)]

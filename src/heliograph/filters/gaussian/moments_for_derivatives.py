@@ -1,0 +1,126 @@
+"""Moments of f(x) by points, written so that they can be differentiated where the points nearly coincide.
+
+At m +- s_j L_j, s_j = sqrt(c d_j), the even part of f has the derivative c f''[L_j, L_j] in a variance d_j, which is
+there at d_j = 0 too; as a difference of values it is lost in their rounding as s_j goes to zero. So, where f is nearly
+linear over a step, its parts are integrals of its derivatives, which subtract nothing:
+
+    f(m + s L) + f(m - s L) - 2 f(m) = s^2 int (1 - |t|) f''(m + t s L)[L, L] dt,
+    f(m + s L) - f(m - s L) = s int f'(m + t s L)[L] dt,  t from -1 to 1.
+
+With the nodes 0 and +- 1 / sqrt 6 both are exact to the fourth power of s.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import WeightedColumns, eliminate
+from heliograph.factors.factored_gaussian import Gaussian, Image
+from heliograph.factors.pivots import square_root
+from heliograph.numerics.types import Array
+
+Function = Callable[[jax.Array], jax.Array]
+
+NODE = 1 / np.sqrt(6)  # of a step: where the derivatives are taken
+NEARLY_LINEAR = 1e-3  # share of f' that f'' adds over a step, its square that f''' adds: its fourth power is none
+
+
+class Parts(NamedTuple):
+    """f about m in the columns L_j of x = m + L xi, for steps s_j.
+
+    Shapes: here f(m) (p,), slopes (p, n), the odd part over 2 s_j; even (p, n), f at both points less 2 f(m); linear
+    (p, n), whether f is nearly linear over the step.
+    """
+
+    here: jax.Array
+    slopes: jax.Array
+    even: jax.Array
+    linear: jax.Array
+
+
+def find_odd_and_even_parts(function: Function, x: Gaussian, scale: Array | float) -> Parts:
+    """Return f at the mean, and its odd and even parts at m +- sqrt(scale d_j) L_j."""
+    mean, variances = x.mean, x.variances
+    steps = square_root(scale * variances)
+
+    def of_column(column: jax.Array, step: jax.Array, variance: jax.Array) -> Parts:
+        """Return the parts in one column L_j, by values at two points, or by derivatives."""
+        here, slope_here = jax.jvp(function, (mean,), (column,))
+        at = [differentiate_twice(function, mean + sign * NODE * step * column, column) for sign in (1, -1)]
+        (slope_ahead, bend_ahead), (slope_behind, bend_behind) = at
+        bend = jnp.maximum(jnp.abs(bend_ahead), jnp.abs(bend_behind))
+        slope = jnp.maximum(jnp.abs(slope_here), jnp.maximum(jnp.abs(slope_ahead), jnp.abs(slope_behind)))
+        twist = jnp.abs(bend_ahead - bend_behind) / (2 * NODE)  # s f'''
+        linear = (step * bend <= NEARLY_LINEAR * slope) & (step * twist <= NEARLY_LINEAR**2 * slope)
+        ahead, behind = function(mean + step * column), function(mean - step * column)
+        safe_step = jnp.where(step > 0, step, 1.0)
+        slopes = jnp.where(linear, slope_ahead + slope_behind - slope_here, (ahead - behind) / (2 * safe_step))
+        even_by_values = (ahead - here) + (behind - here)
+        even = jnp.where(linear, scale * variance / 2 * (bend_ahead + bend_behind), even_by_values)
+        return Parts(here, slopes, even, linear)
+
+    return jax.vmap(of_column, in_axes=(1, 0, 0), out_axes=Parts(None, 1, 1, 1))(jnp.asarray(x.root), steps, variances)
+
+
+def differentiate_twice(function: Function, at: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return f'(x)[v] and f''(x)[v, v]."""
+    return jax.jvp(lambda y: jax.jvp(function, (y,), (direction,))[1], (at,), (direction,))
+
+
+def find_quadratic_image(function: Function, x: Gaussian) -> Image:
+    """Return the image of x by a function of degree 2, as `_quadratic_image` of `moment_transforms.py` does.
+
+    Its columns are in units of xi, with their variances as weights: of xi_i xi_j the weight is d_i d_j.
+    """
+    parts, d = find_odd_and_even_parts(function, x, 1.0), x.variances
+    deviations, root = square_root(d), jnp.asarray(x.root)
+    squares = parts.even / 2
+    rows, columns = np.triu_indices(len(d), 1)
+
+    def slopes_at(point: jax.Array) -> jax.Array:
+        """Return f'(x)[L_j] of all columns (p, n)."""
+        return jax.vmap(lambda column: jax.jvp(function, (point,), (column,))[1], in_axes=1, out_axes=1)(root)
+
+    def mixed(i: jax.Array, j: jax.Array) -> jax.Array:
+        """Return the coefficient of xi_i xi_j, by values or by slopes in the column over which f is nearly linear."""
+        (at_i, at_j), middle = (mean + deviations[k] * root[:, k] for k in (i, j)), slopes_at(mean)
+        both = function(at_i + deviations[j] * root[:, j]) - function(at_i) - function(at_j) + function(mean)
+        s_i, s_j = (jnp.where(deviations[k] > 0, deviations[k], 1.0) for k in (i, j))
+        by_i, by_j = (slopes_at(at_j) - middle)[:, i] / s_j, (slopes_at(at_i) - middle)[:, j] / s_i
+        return jnp.where(parts.linear[:, j], by_j, jnp.where(parts.linear[:, i], by_i, both / (s_i * s_j)))
+
+    mean = x.mean
+    products = jax.vmap(mixed, out_axes=1)(rows, columns) if len(rows) else jnp.zeros((len(squares), 0))
+    weights = jnp.concatenate([jnp.full(len(d), 2.0), d[rows] * d[columns]])
+    curvature = WeightedColumns(jnp.concatenate([squares, products], axis=1), weights)
+    return Image(parts.here + jnp.sum(squares, axis=1), WeightedColumns(parts.slopes, d), np.ones(len(d)), curvature)
+
+
+def find_grid_image(function: Function, x: Gaussian, nodes: Array, weights: Array) -> Image:
+    """Return the image of x by the product rule of these nodes (points, n) and weights (points,) of a normal vector.
+
+    In the columns over which f is nearly linear it is f + 1/2 sum_j d_j f''[L_j, L_j] at the points of all others, with
+    f'[L_j] xi_j beside it. A column over which only some components of f are so is taken by values.
+    """
+    parts = find_odd_and_even_parts(function, x, jnp.max(nodes) ** 2)
+    d, root, near = x.variances, jnp.asarray(x.root), jnp.all(parts.linear, axis=0)
+    deviations = jnp.where(near, 0.0, square_root(d))
+
+    def at_point(node: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the even part of f in the near columns, (p,), and its slopes in all, (p, n)."""
+        point = x.mean + root @ (deviations * node)
+        slopes, bends = jax.vmap(lambda column: differentiate_twice(function, point, column), in_axes=1)(root)
+        return function(point) + jnp.where(near, d / 2, 0.0) @ bends, slopes.T
+
+    values, slopes_at_points = jax.vmap(at_point)(nodes)  # (points, p), (points, p, n)
+    center = weights @ values
+    by_values = (values.T * weights) @ nodes / jnp.where(near, 1.0, jnp.where(deviations > 0, deviations, 1.0))
+    slopes = jnp.where(near, jnp.einsum("k,kpj->pj", weights, slopes_at_points), by_values)
+    residuals = values - center - (nodes * deviations) @ slopes.T
+    bent = jnp.moveaxis(slopes_at_points - slopes, 1, 0).reshape(len(center), -1)
+    weights_of_bent = (weights[:, None] * jnp.where(near, d, 0.0)).reshape(-1)
+    covariance = WeightedColumns(residuals.T, weights).covariance + WeightedColumns(bent, weights_of_bent).covariance
+    return Image(center, WeightedColumns(slopes, d), np.ones(len(d)), eliminate(covariance))

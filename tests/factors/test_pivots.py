@@ -1,0 +1,156 @@
+"""Derivatives of a Gaussian in factors where covariances are zero or singular, against those of covariances."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heliograph.factors import (
+    WeightedColumns,
+    columns_of,
+    columns_with_derivatives,
+    condition_on_observation,
+    from_covariance,
+    join_columns,
+    merge_mixture,
+    predict_affine,
+    rounding_of,
+    triangularise,
+)
+from heliograph.numerics import write_for_derivatives
+
+F = np.array([[0.9, 0.3, 0.0], [-0.2, 0.7, 0.4], [0.1, 0.0, 0.5]])
+H, Z = np.array([[1.0, 0.5, -0.3], [0.2, 1.0, 0.4], [0.0, -1.0, 2.0]]), np.array([0.4, -1.2, 0.7])
+MEAN = np.array([0.3, -0.2, 1.1])
+SINGULAR = {
+    "zero": np.zeros((3, 3)),
+    "a known state": np.diag([1.0, 0.0, 0.5]),
+    "tied states": np.outer([1.0, 1.0, -2.0], [1.0, 1.0, -2.0]),
+    "regular": np.array([[1.0, 0.2, 0.1], [0.2, 2.0, -0.3], [0.1, -0.3, 0.5]]),
+}
+P_SLOPE, Q_SLOPE, R_SLOPE = (
+    np.array([[a, b, c], [b, d, e], [c, e, f]])
+    for a, b, c, d, e, f in [(1, 0.5, -0.2, 0.7, 0.1, 2), (0.4, -0.1, 0.2, 1, 0.3, 0.6), (0.5, 0.2, 0.1, 1, -0.4, 0.8)]
+)
+TOLERANCE = 1e-12  # a hundred operations on numbers of order 1, whose derivatives are up to ten
+
+
+@pytest.fixture(autouse=True)
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+def derivative(function, *slopes):
+    """Return the function at 0 and its derivative along numbers that all move alike, by both modes of JAX."""
+
+    def evaluate(t):
+        with write_for_derivatives():
+            return function(*(t * slope for slope in slopes))
+
+    @jax.jit
+    def differentiate(t):
+        return *jax.jvp(evaluate, (t,), (1.0,)), jax.jacrev(evaluate)(t)
+
+    value, forward, backward = differentiate(0.0)
+    for a, b in zip(jax.tree.leaves(forward), jax.tree.leaves(backward), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * max(1.0, float(np.max(np.abs(b)))))
+    return value, forward
+
+
+@pytest.mark.parametrize("factor", [columns_of, columns_with_derivatives, lambda P: from_covariance(MEAN, P)])
+@pytest.mark.parametrize("name", SINGULAR)
+def test_factors_have_the_derivatives_of_their_covariance(name, factor):
+    """Of a covariance that moves in any direction: W' of each column is as large as its weight is small."""
+    value, slope = derivative(lambda change: factor(jnp.asarray(SINGULAR[name] + change)).covariance, P_SLOPE)
+    np.testing.assert_allclose(slope, P_SLOPE, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(value, SINGULAR[name], rtol=0, atol=1e-14)
+
+
+def noise_of(covariance):
+    """Return a noise with the rounding of numbers of order 1, as models have it."""
+    return triangularise(join_columns(columns_of(covariance), rounding_of(np.ones(3))))
+
+
+@pytest.mark.parametrize("process", ["zero", "a known state"])
+@pytest.mark.parametrize("start", SINGULAR)
+def test_a_prediction_has_the_derivative_of_the_covariance(start, process):
+    def predict(dP, dQ):
+        x = from_covariance(MEAN, jnp.asarray(SINGULAR[start] + dP))
+        return predict_affine(x, F, MEAN, noise_of(jnp.asarray(SINGULAR[process] + dQ))).covariance
+
+    _, slope = derivative(predict, P_SLOPE, Q_SLOPE)
+    np.testing.assert_allclose(slope, F @ P_SLOPE @ F.T + Q_SLOPE, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["zero", "a known state", "regular"])
+@pytest.mark.parametrize("start", SINGULAR)
+def test_an_observation_has_the_derivatives_of_mean_covariance_and_density(start, noise):
+    """Of P - K S K' with K = P H' S^-1: the noise is only the rounding of numbers, or a part of it is."""
+    if np.linalg.matrix_rank(H @ SINGULAR[start] @ H.T + SINGULAR[noise]) < 3:
+        pytest.skip("the density of what is determined has no derivative")
+
+    def observe(dP, dR):
+        x = from_covariance(MEAN, jnp.asarray(SINGULAR[start] + dP))
+        columns = noise_of(jnp.asarray(SINGULAR[noise] + dR))
+        after, seen = condition_on_observation(x, H @ x.root, Z - H @ x.mean, columns)
+        return after.mean, after.covariance, seen.log_density(np.full(3, True), np.abs(Z))
+
+    def by_covariances(dP, dR):
+        P, R = SINGULAR[start] + dP, SINGULAR[noise] + dR
+        S, e = H @ P @ H.T + R, Z - H @ MEAN
+        K = jnp.linalg.solve(S, H @ P).T
+        density = -(e @ jnp.linalg.solve(S, e) + jnp.linalg.slogdet(S)[1] + 3 * np.log(2 * np.pi)) / 2
+        return MEAN + K @ e, P - K @ S @ K.T, density
+
+    value, slopes = derivative(observe, P_SLOPE, R_SLOPE)
+    expected = jax.jvp(lambda t: by_covariances(t * P_SLOPE, t * R_SLOPE), (0.0,), (1.0,))
+    for a, b in zip((*value, *slopes), (*expected[0], *expected[1]), strict=True):
+        # Their numbers are multiplied by inverses of S, twice for a derivative.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * max(1.0, float(np.max(np.abs(b)))))
+
+
+def test_an_observation_of_which_a_part_is_missing():
+    def observe(dP, dR):
+        x = from_covariance(MEAN, jnp.asarray(dP))
+        after, _ = condition_on_observation(
+            x, H @ x.root, jnp.array([0.3, np.nan, -0.2]), noise_of(jnp.eye(3) / 2 + dR)
+        )
+        return after.covariance
+
+    np.testing.assert_allclose(derivative(observe, P_SLOPE, R_SLOPE)[1], P_SLOPE, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("name", SINGULAR)
+def test_a_mixture_has_the_derivative_of_its_covariance(name):
+    weights, shift = jnp.array([0.25, 0.75]), np.array([0.5, 0.0, -0.25])
+
+    def merge(dP, dQ):
+        parts = [from_covariance(MEAN + s, jnp.asarray(SINGULAR[name] + d)) for s, d in ((0.0, dP), (shift, dQ))]
+        return merge_mixture(jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts), weights).covariance
+
+    _, slope = derivative(merge, P_SLOPE, Q_SLOPE)
+    np.testing.assert_allclose(slope, 0.25 * P_SLOPE + 0.75 * Q_SLOPE, rtol=0, atol=TOLERANCE)
+
+
+def test_many_columns_are_a_loop_of_the_same_derivatives():
+    """More than 24 rows, where what is to be differentiated is not the operation that native code knows."""
+    n = 30
+    slope = np.eye(n) + 0.3 * np.eye(n, k=1) + 0.3 * np.eye(n, k=-1)
+    given = np.diag(np.arange(n) % 2.0)
+
+    def factor(change):
+        return columns_of(jnp.asarray(given + change)).covariance
+
+    np.testing.assert_allclose(derivative(factor, slope)[1], slope, rtol=0, atol=TOLERANCE)
+
+
+def test_what_is_not_differentiated_is_factored_as_before():
+    """An infinitesimal pivot is there only where a derivative is asked for; numbers are factored by their rank."""
+    columns = columns_of(jnp.zeros((2, 2)))
+    assert not np.any(columns.weights)
+    with write_for_derivatives():
+        assert 0 < float(columns_of(jnp.zeros((2, 2))).weights[0]) < 1e-100
+    assert isinstance(columns_with_derivatives(np.eye(2)), WeightedColumns)
+    assert columns_with_derivatives(np.diag([1.0, 0.0])).matrix.shape == (2, 1)

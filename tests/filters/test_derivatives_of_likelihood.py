@@ -1,0 +1,172 @@
+"""Derivatives of nonlinear filters' likelihoods where covariances are zero, against fractions and textbook formulas."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.filters import PolynomialMoments, gaussian_filter, late_filter, mixture_filter, sequential_filter
+from tests.oracles.likelihood_slopes import MOTION, READING, ROWS, SHAPES, differentiate_exactly
+
+pytestmark = pytest.mark.slow  # each compiles a derivative
+PERFECT, NAMES = hg.perfect(2), ("p", "q", "r")
+FILTERS = {
+    "extended": hg.extended_filter,
+    "cubature": hg.cubature_filter,
+    "unscented": hg.unscented_filter,
+    "near points": lambda plant, sensor: hg.unscented_filter(plant, sensor, alpha=0.01),
+    "quadratic": lambda plant, sensor: gaussian_filter(plant, sensor, PERFECT, transform=PolynomialMoments(2)),
+    "cubic": lambda plant, sensor: gaussian_filter(plant, sensor, PERFECT, transform=PolynomialMoments(3)),
+}
+START = np.array([0.3, -0.2])
+
+
+def slopes_of(function, x):
+    with jax.enable_x64(True):
+        return np.asarray(jax.jit(jax.grad(function))(np.array(x)))
+
+
+def affine_models(scales):
+    """Return a linear plant and sensor, written as functions of which a filter does not know that they are linear."""
+    start, q, r = scales[:, None, None] * SHAPES
+    plant = hg.Plant(lambda x, u: jnp.asarray(MOTION) @ x, q, np.zeros(2), start)
+    return plant, hg.Sensor(lambda x: jnp.asarray(READING) @ x, r)
+
+
+@pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (0.0, 0.25, 0.0), (1.0, 0.25, 0.0), (0.5, 0.0, 0.25)])
+@pytest.mark.parametrize("name", FILTERS)
+def test_gradients_of_affine_functions_are_exact_where_covariances_are_zero(name, scales):
+    """To 1e-11 of the largest: derivatives of factors are as large as variances are small, and some digits are lost."""
+    slopes = slopes_of(lambda x: hg.log_likelihood(FILTERS[name](*affine_models(x)), ROWS), scales)
+    expected = differentiate_exactly(scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+def move(x, u=()):
+    return jnp.stack([0.75 * x[0] + 0.25 * jnp.sin(x[1]), 0.5 * x[1] - 0.125 * x[0] + 0.1 * x[0] ** 2])
+
+
+def read(x):
+    return jnp.stack([x[0] + 0.5 * x[1] + 0.2 * x[1] ** 2, jnp.sinh(x[1])])
+
+
+def curved_models(scales):
+    start, q, r = scales[:, None, None] * SHAPES
+    return hg.Plant(move, q, START, start), hg.Sensor(read, r)
+
+
+def textbook_likelihood(scales, order):
+    """Return the likelihood of the extended filter by covariances, of second order with 1/2 tr(f'' P) in the means."""
+    (P, Q, R), m, total = scales[:, None, None] * SHAPES, jnp.asarray(START), 0.0
+
+    def moments(function, m, P):
+        slopes, bends = jax.jacfwd(function)(m), jax.jacfwd(jax.jacfwd(function))(m)
+        return function(m) + (order - 1) * jnp.einsum("iab,ab->i", bends, P) / 2, slopes
+
+    for z in ROWS:
+        m, F = moments(move, m, P)
+        P = F @ P @ F.T + Q
+        expected, H = moments(read, m, P)
+        e, S = z - expected, H @ P @ H.T + R
+        total = total - (e @ jnp.linalg.solve(S, e) + jnp.linalg.slogdet(S)[1] + 2 * np.log(2 * np.pi)) / 2
+        K = jnp.linalg.solve(S, H @ P).T
+        m, P = m + K @ e, P - K @ S @ K.T
+    return total
+
+
+@pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (0.0, 0.25, 0.0), (1.0, 0.25, 0.0), (0.5, 0.0, 0.25)])
+def test_the_extended_filter_has_the_gradient_of_the_textbook(scales):
+    slopes = slopes_of(lambda x: hg.log_likelihood(hg.extended_filter(*curved_models(x)), ROWS), scales)
+    expected = slopes_of(lambda x: textbook_likelihood(x, order=1), scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("name", [name for name in FILTERS if name != "extended"])
+def test_points_have_the_gradient_of_second_order_where_nothing_is_uncertain(name):
+    """As P goes to 0 all points give the mean f + tr(f'' P) / 2 and the covariance f' P f', to the first power of P."""
+    scales = (0.0, 0.0, 0.5)
+    slopes = slopes_of(lambda x: hg.log_likelihood(FILTERS[name](*curved_models(x)), ROWS), scales)
+    expected = slopes_of(lambda x: textbook_likelihood(x, order=2), scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+def differences(function, x, step=1e-4):
+    """Return one-sided differences of four values, whose error is the fourth power of the step."""
+    weights, counts = [-25 / 12, 4, -3, 4 / 3, -1 / 4], range(5)
+    rows = [[function(np.array(x) + count * step * e) for count in counts] for e in np.eye(len(x))]
+    return np.array(rows) @ weights / step
+
+
+LINK = np.array([[0.5, 0.25], [0.25, 1.0]])
+
+
+def linear_models(scales):
+    start, q, r = scales[:3, None, None] * SHAPES
+    return hg.LinearPlant(MOTION, q, START, start), hg.LinearSensor(READING, r)
+
+
+def fading(n):
+    return hg.gilbert_elliott(hg.hop(0.8, n * LINK, dimension=2), hg.hop(0.3, 4 * n * LINK, dimension=2), 0.1, 0.3)
+
+
+OTHERS = {
+    "fading link": lambda x: hg.cubature_filter(*curved_models(x[:3]), hg.hop(hg.Rayleigh(0.8), x[3] * LINK)),
+    "link of known gain": lambda x: hg.extended_filter(*curved_models(x[:3]), hg.hop(0.8, x[3] * LINK)),
+    "modes of a link": lambda x: hg.filters.imm_filter(*linear_models(x), fading(x[3])),
+    "best linear filter behind modes": lambda x: hg.linear_filter(*linear_models(x), fading(x[3])),
+    "mixture": lambda x: mixture_filter(*linear_models(x), hg.hop(0.8, x[3] * LINK)),
+    "late": lambda x: late_filter(hg.extended_filter(*curved_models(x[:3])), 1),
+    "two nodes": lambda x: sequential_filter(
+        [hg.extended_filter(*curved_models(x[:3])), hg.extended_filter(*curved_models(x[:3]), hg.hop(0.8, x[3] * LINK))]
+    ),
+}
+
+
+@pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5, 0.3), (0.8, 0.25, 0.4, 0.0)])
+@pytest.mark.parametrize("name", OTHERS)
+def test_gradients_of_other_filters_are_one_sided_differences(name, scales):
+    """To 1e-5 of the largest: rounding of values over the step, and the fourth power of the step times what varies."""
+    z = np.concatenate([ROWS, ROWS[::-1]], axis=1) if name == "two nodes" else ROWS
+
+    def likelihood(x):
+        return hg.log_likelihood(OTHERS[name](x), z)
+
+    slopes, expected = slopes_of(likelihood, scales), differences(lambda x: float(likelihood(x)), scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-5 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("scales", [(0.25, 0.0), (0.0, 0.5), (0.25, 0.5)])
+def test_an_unknown_start_has_the_gradient_of_the_marginal_density(scales):
+    """Of z = G delta + y with an unknown delta: -(log |S| + log |G' S^-1 G| + y' S^-1 (y - G delta^)) / 2."""
+    F, n = MOTION, len(ROWS)
+    power = [np.linalg.matrix_power(F, k) for k in range(n + 1)]
+
+    def marginal(x):
+        Q, R = x[0] * SHAPES[1], x[1] * SHAPES[2]
+        G = np.concatenate([READING @ power[t + 1] for t in range(n)])
+        W = np.block([[READING @ power[t - j] if j <= t else np.zeros((2, 2)) for j in range(n)] for t in range(n)])
+        S = W @ jnp.kron(np.eye(n), Q) @ W.T + jnp.kron(np.eye(n), R)
+        z, inverse = ROWS.ravel(), jnp.linalg.inv(S)
+        J = G.T @ inverse @ G
+        rest = inverse - inverse @ G @ jnp.linalg.inv(J) @ G.T @ inverse
+        return -(jnp.linalg.slogdet(S)[1] + jnp.linalg.slogdet(J)[1] + z @ rest @ z) / 2
+
+    def filtered(x):
+        plant = hg.LinearPlant(F, x[0] * SHAPES[1], np.zeros(2), hg.diffuse)
+        return hg.log_likelihood(hg.kalman_filter(plant, hg.LinearSensor(READING, x[1] * SHAPES[2])), ROWS)
+
+    expected = slopes_of(marginal, scales)
+    np.testing.assert_allclose(slopes_of(filtered, scales), expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+def test_a_traced_known_part_of_an_unknown_start():
+    """One state is unknown, the other has a variance that is differentiated, at 0."""
+
+    def likelihood(p):
+        plant = hg.LinearPlant(MOTION, 0.25 * SHAPES[1], np.zeros(2), hg.diffuse(["x0"], known=p * np.diag([0.0, 1.0])))
+        return hg.log_likelihood(hg.kalman_filter(plant, hg.LinearSensor(READING, 0.5 * SHAPES[2])), ROWS)
+
+    expected = differences(lambda x: float(likelihood(float(x[0]))), [0.0], step=1e-3)[0]
+    with jax.enable_x64(True):
+        assert float(jax.grad(likelihood)(0.0)) == pytest.approx(expected, rel=1e-8)
