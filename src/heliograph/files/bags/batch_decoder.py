@@ -216,7 +216,7 @@ class BatchDecoder:
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
             connection = batch[numbers[0]].connection
             for rows, fields in self._yield_rows_by_layout(connection, table):
-                columns, marked = blank_columns(connection.msgtype, fields)
+                columns, marked = blank_columns(connection.msgtype, fields, self._list_judged_paths(topic))
                 counts[topic] += int(np.count_nonzero(marked))
                 for source, _, places in self._sources.of(topic):
                     # The node, and the places of its values: one, as `_list_paths_of_numbers` refuses others.
@@ -224,6 +224,11 @@ class BatchDecoder:
                     size = len(self._sources.names[node])
                     results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
         return results, counts
+
+    def _list_judged_paths(self, topic: str) -> set[str]:
+        """Return the paths of a topic's fields that messages may say to have no value."""
+        sources = [source for source, *_ in self._sources.of(topic) if source.valid != {}]
+        return {path for source in sources for path in _list_paths_of_numbers(source)}
 
     def _yield_rows_by_layout(
         self, connection: "Connection", table: np.ndarray
@@ -242,7 +247,7 @@ class BatchDecoder:
                 paths = {
                     path for source, *_ in self._sources.of(connection.topic) for path in _list_paths_of_numbers(source)
                 }
-                paths |= list_flags(connection.msgtype, paths)
+                paths |= list_flags(connection.msgtype, self._list_judged_paths(connection.topic))
                 known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
             yield left[fits], known[index].read_columns(table[left[fits]])

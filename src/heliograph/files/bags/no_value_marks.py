@@ -61,15 +61,17 @@ def list_flags(kind: str, paths: Collection[str]) -> set[str]:
     return {flag for mark in MARKS.get(kind, ()) if any(map(mark.covers, paths)) for flag in mark.flags}
 
 
-def blank_columns(kind: str, columns: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def blank_columns(
+    kind: str, columns: Mapping[str, np.ndarray], judged: Collection[str]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the columns of many messages with NaN for values that do not exist, and which messages have such values.
 
     Some message types have flags that say that a field has no value (MARKS). `columns` maps the path of a field or flag
-    to its numbers (messages,). The second result is a mask (messages,).
+    to its numbers (messages,). Only fields among `judged` are looked at. The second result is a mask (messages,).
     """
     blank, marked = dict(columns), np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
     for mark in MARKS.get(kind, ()):
-        for path in filter(mark.covers, columns):
+        for path in filter(mark.covers, judged):
             is_none = mark.is_none(columns[path], *(columns[flag] for flag in mark.flags))
             blank[path] = np.where(is_none, np.nan, columns[path].astype(np.float64))
             marked |= is_none
@@ -82,7 +84,7 @@ def blank_message(kind: str, message: Any, paths: Collection[str]) -> bool:
     Args:
         kind: the type of the message.
         message: the message, as rosbags decoded it.
-        paths: dotted paths of the fields that are read.
+        paths: dotted paths of the fields that are judged.
     """
     marked = False
     for mark in MARKS.get(kind, ()):

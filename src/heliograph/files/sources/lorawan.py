@@ -3,16 +3,8 @@
 from typing import NamedTuple
 
 from heliograph.files.sources.derived_values import Computed, Yaw, ZeroIfAbsent
-from heliograph.files.sources.source_description import (
-    Count,
-    Name,
-    Paths,
-    Source,
-    Texts,
-    json_field,
-    read_paths,
-    read_texts,
-)
+from heliograph.files.sources.message_reading import read_texts
+from heliograph.files.sources.source_description import Count, Name, Paths, Source, Texts, json_field, read_paths
 from heliograph.numerics.check import fail, show_value
 
 COUNT_BITS = 16  # of a frame

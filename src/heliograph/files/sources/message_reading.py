@@ -1,11 +1,11 @@
-"""What one message says of one node, or why it could not be read."""
+"""What one message says of one node, or why it could not be read; checks that sources share."""
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.check import InputError
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 
@@ -52,3 +52,11 @@ def is_allowed(value: object, allowed: Container[object]) -> bool:
     if not isinstance(value, bool):
         return value in allowed
     return value in allowed or any(word in allowed for word in (str(value), str(value).lower(), str(value).upper()))
+
+
+def read_texts(name: str, value: object) -> tuple[str, ...]:
+    """Return a text or a sequence of texts as a tuple; `name` is the option's name, for errors."""
+    items = [value] if isinstance(value, str) else value
+    if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
+        raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))
+    return tuple(items)

@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 from heliograph.files.device_availability import Available
 from heliograph.files.sources.derived_values import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.sources.message_fields import TimeUnit, convert_name, convert_time, field_at, parse_start
-from heliograph.files.sources.message_reading import is_allowed
+from heliograph.files.sources.message_reading import is_allowed, read_texts
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
@@ -149,6 +149,7 @@ Where = TypeAliasType("Where", Condition | Sequence[Condition] | None)
 Valid = TypeAliasType("Valid", str | Mapping[str, object] | None)
 Devices = TypeAliasType("Devices", tuple[Available, ...])
 Allowed = TypeAliasType("Allowed", dict[str, Container[object]])
+Flags = TypeAliasType("Flags", Allowed | None)
 Numbers = TypeAliasType("Numbers", tuple[float, ...])
 
 
@@ -171,7 +172,8 @@ class Source:
         step: seconds of a step where times are counted in steps; None where they are not.
         where: the values, or a container of them, that the field at each dotted path may have.
         available: conditions on what the device says of itself on another topic.
-        valid: the values that the field at each dotted path has where the message can be trusted.
+        valid: the values that the field at each dotted path has where the message can be trusted; None for no flags
+            but those that types of ROS have, {} for none at all.
         quoted: whether numbers may be texts.
     """
 
@@ -187,7 +189,7 @@ class Source:
     step: "Step"
     where: "Allowed"
     available: "Devices"
-    valid: "Allowed"
+    valid: "Flags"
     quoted: bool
 
     @property
@@ -196,7 +198,7 @@ class Source:
         values = [field for path in self.paths for field in ((path,) if isinstance(path, str) else path.parts)]
         options = (self.node, self.plant, self.time, self.sequence)
         fields_of_options = [option.path for option in options if isinstance(option, Field | Stamp | Count)]
-        return [*values, *fields_of_options, *self.where, *self.valid]
+        return [*values, *fields_of_options, *self.where, *(self.valid or ())]
 
     def check_valid(self, message: object, where: str) -> None:
         """Raise ValueError unless all flags of a message say that it can be trusted.
@@ -206,7 +208,7 @@ class Source:
         Raises:
             ValueError: a flag has another value, or it is missing.
         """
-        for field, allowed in self.valid.items():
+        for field, allowed in (self.valid or {}).items():
             if not is_allowed(value := field_at(message, field, where), allowed):
                 expected = "true or 1" if allowed == (True, 1) else f"one of {show_value(allowed)}"
                 said = f"{expected}, of a message that can be trusted"
@@ -265,7 +267,8 @@ def json_field(
             device says whether it is online; or a list of these. None for all messages.
         valid: dotted path of a flag by which a message says that it can be trusted, such as that its checksum is
             right: true or 1; or for each path the values that say so, as in `where`. Any other message is refused, by
-            its reason, and counts as none that was lost. None for no such flag.
+            its reason, and counts as none that was lost. None for no such flag; {} for none either of those that ROS
+            has (-1 in the covariance of an `Imu`, no fix, out of range), by which values count as not arrived.
         quoted: whether numbers in quotes are numbers too (default False: they are refused).
 
     Raises:
@@ -363,21 +366,13 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
     return allowed_by_path, available
 
 
-def _read_valid_flags(valid: object) -> Allowed:
+def _read_valid_flags(valid: object) -> Flags:
     """Return {path of a flag: its values in a message that can be trusted}; a path alone has true or 1."""
-    if isinstance(valid, str):
-        return {valid: (True, 1)}
-    if not isinstance(valid, Mapping | None):
+    if valid is None or isinstance(valid, str):
+        return None if valid is None else {valid: (True, 1)}
+    if not isinstance(valid, Mapping):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
     return _split_conditions(valid)[0]  # those on fields of the message
-
-
-def read_texts(name: str, value: object) -> tuple[str, ...]:
-    """Return a text or a sequence of texts as a tuple; `name` is the option's name, for errors."""
-    items = [value] if isinstance(value, str) else value
-    if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
-        raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))
-    return tuple(items)
 
 
 def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:
