@@ -149,6 +149,7 @@ Where = TypeAliasType("Where", Condition | Sequence[Condition] | None)
 Valid = TypeAliasType("Valid", str | Mapping[str, object] | None)
 Devices = TypeAliasType("Devices", tuple[Available, ...])
 Allowed = TypeAliasType("Allowed", dict[str, Container[object]])
+Flags = TypeAliasType("Flags", Allowed | None)
 Numbers = TypeAliasType("Numbers", tuple[float, ...])
 
 
@@ -171,7 +172,8 @@ class Source:
         step: seconds of a step where times are counted in steps; None where they are not.
         where: the values, or a container of them, that the field at each dotted path may have.
         available: conditions on what the device says of itself on another topic.
-        valid: the values that the field at each dotted path has where the message can be trusted.
+        valid: the values that the field at each dotted path has where the message can be trusted; None for no flags
+            but those that types of ROS have, {} for none at all.
         quoted: whether numbers may be texts.
         marks: whether a message of ROS may say that a value is none.
     """
@@ -188,7 +190,7 @@ class Source:
     step: "Step"
     where: "Allowed"
     available: "Devices"
-    valid: "Allowed"
+    valid: "Flags"
     quoted: bool
     marks: bool
 
@@ -198,7 +200,7 @@ class Source:
         values = [field for path in self.paths for field in ((path,) if isinstance(path, str) else path.parts)]
         options = (self.node, self.plant, self.time, self.sequence)
         fields_of_options = [option.path for option in options if isinstance(option, Field | Stamp | Count)]
-        return [*values, *fields_of_options, *self.where, *self.valid]
+        return [*values, *fields_of_options, *self.where, *(self.valid or ())]
 
     def check_valid(self, message: object, where: str) -> None:
         """Raise ValueError unless all flags of a message say that it can be trusted.
@@ -208,7 +210,7 @@ class Source:
         Raises:
             ValueError: a flag has another value, or it is missing.
         """
-        for field, allowed in self.valid.items():
+        for field, allowed in (self.valid or {}).items():
             if not is_allowed(value := field_at(message, field, where), allowed):
                 expected = "true or 1" if allowed == (True, 1) else f"one of {show_value(allowed)}"
                 said = f"{expected}, of a message that can be trusted"
@@ -268,7 +270,8 @@ def json_field(
             device says whether it is online; or a list of these. None for all messages.
         valid: dotted path of a flag by which a message says that it can be trusted, such as that its checksum is
             right: true or 1; or for each path the values that say so, as in `where`. Any other message is refused, by
-            its reason, and counts as none that was lost. None for no such flag.
+            its reason, and counts as none that was lost. None for no such flag; {} for none either of those that ROS
+            has (-1 in the covariance of an `Imu`, no fix, out of range), by which values count as not arrived.
         quoted: whether numbers in quotes are numbers too (default False: they are refused).
         marks: whether values did not arrive of which a message of ROS says itself that they are none, as an `Imu` by a
             -1 in its covariance (default True). False for a driver that sets such marks beside values.
@@ -369,11 +372,11 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
     return allowed_by_path, available
 
 
-def _read_valid_flags(valid: object) -> Allowed:
+def _read_valid_flags(valid: object) -> Flags:
     """Return {path of a flag: its values in a message that can be trusted}; a path alone has true or 1."""
-    if isinstance(valid, str):
-        return {valid: (True, 1)}
-    if not isinstance(valid, Mapping | None):
+    if valid is None or isinstance(valid, str):
+        return None if valid is None else {valid: (True, 1)}
+    if not isinstance(valid, Mapping):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
     return _split_conditions(valid)[0]  # those on fields of the message
 
