@@ -56,16 +56,9 @@ def test_what_says_that_it_is_no_value_did_not_arrive(tmp_path, kind, make, path
     values = np.array([event.values[0] for event in events.sort_events()])
     assert np.flatnonzero(np.isnan(values)).tolist() == list(BAD)
     assert any("without a value (no fix, no estimate, out of range): /topic (3)" in note for note in events.notes)
-<<<<<<< ours
-    kept = hg.files.json_field(path, "a", where=where, marks=False)  # of a driver that sets marks beside values
-    events = hg.files.read_messages(bag, NETWORK, {"/topic": kept})
-    assert np.isfinite([event.values[0] for event in events.sort_events()]).all() and "/topic" not in str(events.notes)
-||||||| base
-=======
     kept = hg.files.json_field(path, "a", where=where, valid={})  # of a driver that sets marks beside values
     events = hg.files.read_messages(bag, NETWORK, {"/topic": kept})
     assert np.isfinite([event.values[0] for event in events.sort_events()]).all() and "/topic" not in str(events.notes)
->>>>>>> theirs
     other = {FIX: "status.service", IMU: "linear_acceleration.z", RANGE: "max_range", SCAN: "ranges.2"}[kind]
     kept = hg.files.read_messages(bag, NETWORK, {"/topic": hg.files.json_field(other, "a", where=where)})
     assert np.isfinite([event.values[0] for event in kept.sort_events()]).all() and "/topic" not in str(kept.notes)

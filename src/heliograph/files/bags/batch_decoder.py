@@ -225,20 +225,11 @@ class BatchDecoder:
                     results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
         return results, counts
 
-<<<<<<< ours
-    def _list_judged_paths(self, topic: str) -> set[str]:
-        """Return the paths of a topic's fields that messages may say to have no value."""
-        sources = [source for source, *_ in self._sources.of(topic) if source.marks]
-        return {path for source in sources for path in _list_paths_of_numbers(source)}
-
-||||||| base
-=======
     def _list_judged_paths(self, topic: str) -> set[str]:
         """Return the paths of a topic's fields that messages may say to have no value."""
         sources = [source for source, *_ in self._sources.of(topic) if source.valid != {}]
         return {path for source in sources for path in _list_paths_of_numbers(source)}
 
->>>>>>> theirs
     def _yield_rows_by_layout(
         self, connection: "Connection", table: np.ndarray
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:

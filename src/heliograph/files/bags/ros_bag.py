@@ -249,15 +249,9 @@ def _append_messages(
             table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
         marked[topic] += blank_message(
-<<<<<<< ours
-            kind, content, {f for single in sources.of(topic) if single.source.marks for f in single.source.fields}
-||||||| base
-            kind, content, {field for single in sources.of(topic) for field in single.source.fields}
-=======
             kind,
             content,
             {f for single in sources.of(topic) if single.source.valid != {} for f in single.source.fields},
->>>>>>> theirs
         )
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):

@@ -175,7 +175,6 @@ class Source:
         valid: the values that the field at each dotted path has where the message can be trusted; None for no flags
             but those that types of ROS have, {} for none at all.
         quoted: whether numbers may be texts.
-        marks: whether a message of ROS may say that a value is none.
     """
 
     paths: "tuple[Path, ...]"
@@ -192,7 +191,6 @@ class Source:
     available: "Devices"
     valid: "Flags"
     quoted: bool
-    marks: bool
 
     @property
     def fields(self) -> list[str]:
@@ -232,7 +230,6 @@ def json_field(
     where: "Where" = None,
     valid: "Valid" = None,
     quoted: bool = False,
-    marks: bool = True,
 ) -> "Source":
     """Map a field of a topic's messages, or several, to a node's outputs or to inputs of the plant.
 
@@ -273,8 +270,6 @@ def json_field(
             its reason, and counts as none that was lost. None for no such flag; {} for none either of those that ROS
             has (-1 in the covariance of an `Imu`, no fix, out of range), by which values count as not arrived.
         quoted: whether numbers in quotes are numbers too (default False: they are refused).
-        marks: whether values did not arrive of which a message of ROS says itself that they are none, as an `Imu` by a
-            -1 in its covariance (default True). False for a driver that sets such marks beside values.
 
     Raises:
         ValueError: no path, as many outputs as paths expected and others given, numbers that are not finite, another
@@ -313,7 +308,6 @@ def json_field(
         available=available,
         valid=_read_valid_flags(valid),
         quoted=flag("json_field, quoted", quoted),
-        marks=flag("json_field, marks", marks),
     )
 
 
