@@ -257,7 +257,8 @@ def _make_tables(
 ) -> list[ExploredTable]:
     """Return the tables of the page: scores over all steps, of all states and of each of several; then over time.
 
-    Details of single states take time to read: of as many settings as have some ROWS rows, by those of the first.
+    Scores of single states and steps take time to read. So they are read only for the first settings, with at most
+    about ROWS rows in all if each setting has as many rows as the first.
     """
     scored = [_convert_to_state_score(score) for score in scores]
     if read_state_scores is None:
@@ -265,7 +266,7 @@ def _make_tables(
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = read_state_scores(settings[:1], steps)
-    # So many settings with as many rows as the first have some ROWS rows together.
+    # `detailed` has the rows of the first setting here: ROWS / len(detailed) settings have ROWS rows.
     detailed += read_state_scores(settings[1 : ROWS // max(len(detailed), 1)], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
@@ -292,7 +293,11 @@ def _convert_to_state_score(score: Score) -> StateScore:
 
 
 def _make_scores_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:
-    """Return the table of each filter's scores over all steps, and how it is drawn at first."""
+    """Return the table of each filter's scores over all steps, and how it is drawn at first.
+
+    x: its horizontal axis. panel: a column with one plot for each value. whole: columns whose values are all shown.
+    unordered: a column whose values have no order.
+    """
     columns, parameters = _make_columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _choose_axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")

@@ -41,7 +41,7 @@ class ReadingOptions:
 
     @property
     def are_for_messages(self) -> bool:
-        """Return whether an option is given that rows of time have not."""
+        """Return whether an option is given that only messages (window, ahead, plant) have, and no table of rows."""
         return self.window is not None or self.ahead is not None or self.plant is not None
 
     @property

@@ -141,9 +141,10 @@ def _check_names(names: Sequence[str], known: Mapping[str, EntryPoint], kind: st
 
 
 def change_settings(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
-    """Return a study's settings with other values; an error names the option by which a wrong value was given.
+    """Return a study's published settings with some of the values replaced.
 
-    An `OptionValue` came by an option of its own. Other values came by the general option.
+    An `OptionValue` was given by an option of its own, such as --runs 10, and errors name that option. All other values
+    were given by the general option for settings.
 
     Raises:
         ValueError: there is no such setting, or its value is wrong.

@@ -171,9 +171,10 @@ def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> 
 
 
 def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
-    """Return the C statements of a start from a given mean and covariance; they return 7 if these are invalid.
+    """Return the C statements of a function that starts a filter from a given mean and covariance.
 
-    The flag `none` is then 1. The new state `after` is copied to the caller's state only if it is valid.
+    It returns 0, or the error code 7 if mean or covariance are invalid: the generated start then sets the flag `none`
+    to 1. The new state `after` is copied to the caller's `*state` only if it is valid.
     """
     members = ", ".join(f"after.{member.name}" for member in program.members)
     return [

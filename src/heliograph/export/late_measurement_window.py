@@ -44,17 +44,21 @@ class LateMeasurementWindow(NamedTuple):
 
     @property
     def places(self) -> int:
-        """Return places for rows: one more where a row may be made, before the oldest is dropped."""
+        """Return for how many rows (steps) there must be memory.
+
+        In continuous time a late measurement adds a row between others before the oldest row is dropped: one more.
+        """
         return self.rows + (self.time is not None)
 
 
 def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
-    """Return how many steps late a measurement may be, checked: a filter in continuous time can make rows in between.
+    """Return how many steps late a measurement may be, checked.
 
-    Warns where a plant's prediction over an interval is not that over its parts.
+    In continuous time a late measurement splits the interval between two steps. So nothing of the model may count
+    steps, and the prediction over an interval should be that over its two parts: warn if it is not.
 
     Raises:
-        ValueError: no positive whole number; continuous time where a part goes by steps.
+        ValueError: no positive whole number; a filter in continuous time with a part of its model that counts steps.
     """
     count = check_count("window", steps)
     if TIME_STEP not in filter.inputs:

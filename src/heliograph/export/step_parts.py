@@ -38,13 +38,12 @@ class PartOfStep(NamedTuple):
 
 
 def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
-    """Return the step, or apart its prediction and its correction, for numbers of type `real`.
+    """Return the functions to export: one step or, if `apart`, prediction and correction, for numbers of type `real`.
 
-    A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
-    deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
+    Each has example arguments, of which only shapes count, and the names of its results `beside` state and estimate.
     """
     leaves, tree = jax.tree.flatten(filter.init())
-    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)  # of these, only shapes count
+    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
     flags = ("implausible", "spoilt")
     if not apart:
         return [
@@ -52,16 +51,20 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
                 "step", ("z", "u"), _make_step_function(filter, tree, real), examples=(leaves, z, u, k), beside=flags
             )
         ]
-    # Whether a correction weighs components is seen of one.
+    # Make one correction, to see whether the filter weighs components.
     _state, innovation = filter.correct(filter.predict(filter.init(), u, 0), z, 0)
     has_weights = innovation.weight is not None
-    news = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
+    results_of_correction = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
     return [
         PartOfStep(
             "predict", ("u",), _make_prediction_function(filter, tree, real), examples=(leaves, u, k), beside=flags
         ),
         PartOfStep(
-            "correct", ("z",), _make_correction_function(filter, tree, real), examples=(leaves, z, k), beside=news
+            "correct",
+            ("z",),
+            _make_correction_function(filter, tree, real),
+            examples=(leaves, z, k),
+            beside=results_of_correction,
         ),
     ]
 
@@ -106,7 +109,10 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 
 
 def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
-    """Return the function of the correction alone, which tells innovation, distance and weights as well."""
+    """Return the function of the correction by a measurement, with its innovation as further results.
+
+    `tree`: structure of the filter's state, which the function takes and returns as a list of arrays.
+    """
 
     @jax.jit
     def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
@@ -122,9 +128,9 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
             filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, filter.angles_used()
         )
         implausible = is_implausible(filter, innovation, z, real)
-        beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
+        outcome = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
-        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
+        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *outcome, *weight]
 
     return correct
 

@@ -136,10 +136,10 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
 
 
 def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
-    """Return the first result that always equals result `number` (after every part and at the start), or `number`.
+    """Return the number of the first array of the state that always equals array `number`, or `number` itself.
 
-    results[n].same is the number of the first result of a part that always equals result n. `named` holds the numbers
-    at the start.
+    Two arrays are always equal if they are so at the start (`named`) and after each of the `parts`: results[n].same is
+    the same number for all results of a part that equal each other.
     """
     same = [n for n in range(number) if all(code.results[n].same == code.results[number].same for code in parts)]
     start = named[number].start

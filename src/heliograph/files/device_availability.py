@@ -102,7 +102,7 @@ class DeviceStatuses:
 
     @property
     def topics(self) -> list[str]:
-        """Return the topics on which words are said, wildcards included."""
+        """Return the topics on which devices send their status, online or offline; they may have wildcards."""
         return list(self._by_pattern)
 
     @property

@@ -140,7 +140,7 @@ class NodeEvents:
         return lines
 
     def list_lost_digits(self, name: str) -> list[str]:
-        """Return a line where most stamps are those of other events, as of stamps that lost their digits; else none."""
+        """Return a line if most events share their stamp with others, as if stamps had lost digits; else nothing."""
         count, distinct = len(self.time), len(np.unique(np.array(self.time)))
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 

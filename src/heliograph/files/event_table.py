@@ -103,7 +103,7 @@ class EventTable:
     def _columns_of_plant(self, plant: str) -> dict[str, NodeEvents]:
         """Return the columns of a plant by node, and of its inputs without dt; empty ones where it is new."""
         if plant not in self._plants:
-            sizes = {INPUTS: len(self.network.inputs) - (not self.steps)}
+            sizes = {INPUTS: len(self.network.inputs) - (0 if self.steps else 1)}  # without dt
             sizes |= {name: self.network.nodes[name].received for name in self.network.names}
             self._plants[plant] = {name: NodeEvents(size, self.numbers) for name, size in sizes.items()}
         return self._plants[plant]
@@ -167,8 +167,8 @@ class EventTable:
     def finish(self, source: str, strict: bool = False) -> None:
         """End the reading of a source: leave out stamps that were not set; say what was left out.
 
-        A stamp that is more than a year before its arrival, or far from all others, was not set; where most of a node's
-        are, they are of another clock. Steps are no stamps.
+        A stamp more than a year before its arrival, or far from all others, counts as not set, unless most of a node's
+        stamps are like that: then its clock is another one. Step numbers are no stamps, and not looked at.
 
         Args:
             source: name of what was read, for errors.
@@ -178,7 +178,7 @@ class EventTable:
             ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
         by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
-        # Steps are no stamps; neither are numbers of a network that counts steps.
+        # Look at dates always, and at numbers only if these are no step numbers.
         for name, columns in by_node if self.dated or not self.steps else ():
             unset = columns.drop_unset_stamps_in_place(f"{source}, {name}")
             self.notes += [unset.note] if unset.note else []
@@ -212,7 +212,7 @@ class EventTable:
 
     @property
     def _times_are_steps(self) -> bool:
-        """Return whether times are steps of messages, which say nothing of the moment of arrival."""
+        """Return whether times are step numbers without a length in seconds, so that they give no time of arrival."""
         return self.steps and self.step is None and not self.numbers
 
     @property
@@ -301,9 +301,9 @@ class EventTable:
     def recording(self, window: float = np.inf, ahead: float = AHEAD) -> Recording:
         """Return the events that a timeline uses as rows in order of their times; a repeated event counts once.
 
-        Where time counts steps, and where nodes share a channel, all events of a time are one row, else each is. An
-        input holds from its event to the next, so a row has the inputs that were there after the row before; where time
-        counts steps it leads to its own step. Before the first event an input is 0.
+        If time counts steps, or if nodes share a channel, all events of a time are one row, else each is one. An input
+        holds from its event to the next, and is 0 before the first. A row has the inputs of the interval up to it:
+        those known after the row before it or, if time counts steps, those of its own step.
 
         Args:
             window: how late an event may be, in seconds or steps (default any).

@@ -221,8 +221,8 @@ class RowReader:
 
         Args:
             cells: the rows.
-            before: the last row before these, from which they go on: it has the time and the inputs that missing ones
-                are made of. None of the first ones.
+            before: the last row of the block before, None for the first block. Missing times and inputs of these rows
+                are filled from it.
 
         Raises:
             ValueError: times that go backwards, a time step that is none.

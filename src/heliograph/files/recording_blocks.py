@@ -83,16 +83,19 @@ class RecordingBlocks:
             raise self.reasons[0] if self.reasons else fail(str(self._path), "at least one row", "none")
 
     def _yield_recordings(self, parts: Iterable[TableRows]) -> Iterator[Recording]:
-        """Yield parts of a table as recordings, each of which goes on from the last row of the one before it."""
+        """Yield parts of a table as recordings, each of which goes on from the last row of the one before it.
+
+        Rows that the reader refused, and warnings on a part (`doubts`), are collected over all parts.
+        """
         order = BlockOrderCheck(self._path, self._reader.network)
-        for came in self._yield_cells(parts):
-            cells = self._reader.put_in_order(came)
+        for unordered in self._yield_cells(parts):
+            cells = self._reader.put_in_order(unordered)
             self._note_refused(self._reader.refused)
             self._reader.refused = []
             if not len(cells.numbers):
                 continue
             last_before = order.last
-            order.check_block(came, cells)
+            order.check_block(unordered, cells)
             with warnings.catch_warnings(record=True) as doubts:
                 warnings.simplefilter("always", UserWarning)
                 recording = self._reader.make_recording(cells, last_before)

@@ -114,12 +114,12 @@ class Solution:
 
     @property
     def x(self) -> Float[np.ndarray, " p"]:
-        """The maximum on the line (p,); infinite where a number is at the end of its domain."""
+        """The maximum in unbounded coordinates (p,): +-infinity where a number is at an end of its domain."""
         return self.top.limit
 
     @property
     def total(self) -> float:
-        """Log-likelihood there, in nats."""
+        """Log-likelihood at the maximum, in nats."""
         return self.top.total
 
     @property
@@ -155,9 +155,9 @@ class Solution:
 
     @cached_property
     def rank(self) -> InformationRank:
-        """Directions of active coordinates on which the data say nothing at the maximum (flat): as many as `ridges`."""
-        late_information = self.surface.evaluations(self.top.x[None]).late[0]
-        return find_rank_of_late_rows(late_information[np.ix_(self.active, self.active)], self.ridges)
+        """Flat directions of active coordinates, along which l is constant: as many as `ridges`; and all others."""
+        information = self.surface.evaluations(self.top.x[None]).late[0]  # of the second half of the rows
+        return find_rank_of_late_rows(information[np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
@@ -172,7 +172,7 @@ class Solution:
 
     @property
     def basis(self) -> Float[np.ndarray, "active r"]:
-        """Identified directions, in columns."""
+        """Directions that the data identify, in columns of active coordinates (`rank.rest` has units `rank.unit`)."""
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
     def _project_on_identified(self, matrix: np.ndarray) -> np.ndarray:
@@ -181,7 +181,7 @@ class Solution:
 
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates (active,) are real numbers that only a few stretches of the data tell."""
+        """Which active coordinates (active,) are real numbers on which only a few stretches of the data inform."""
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
@@ -191,8 +191,8 @@ class Solution:
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
         """Return the covariance of the active coordinates along the identified directions, and its degrees of freedom.
 
-        It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores, estimated by `method`.
-        For numbers that only a few stretches of the data tell, J is taken from the model.
+        It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores (gradients of l by row),
+        estimated by `method`. Numbers on which only a few stretches of the data (`few`) inform have J from the model.
         """
         scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
         if self.few.any():
@@ -249,7 +249,7 @@ class Solution:
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
         """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`."""
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
-        # The estimates, and their derivatives by the active coordinates, on the line.
+        # Estimates at the maximum, and their derivatives by the active coordinates x (logarithms, logits or numbers).
         values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
         rows = []
         for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
@@ -321,9 +321,9 @@ class Solution:
         )
 
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
-        """Return whether the data identify a function of the numbers: whether it does not change along ridges.
+        """Return whether the data identify a function f of the numbers: f does not change where l does not (ridges).
 
-        `slopes`: its derivatives by the active coordinates, of which a share ALONG may lie on a ridge (`rank.flat`).
+        `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most ALONG |df/dx|.
         """
         scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
         size = np.linalg.norm(scaled_slopes)
@@ -339,9 +339,10 @@ class Solution:
         return np.asarray(np.quantile(moves, [(1 - level) / 2, (1 + level) / 2]))
 
     def _make_boundary_row(self, entry: TableEntry, value: float, level: float) -> Row:
-        """Return the row of a number at an end of its domain: the interval is from there to where the profile fell.
+        """Return the row of a number at an end of its domain: its interval is from there to one point inside.
 
-        There the square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
+        At an end 2 * (fall of l) is chi-squared with probability 1/2 and else 0: P(fall > d) = P(chi2 > 2 d) / 2. So an
+        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does. FURTHER: where the search begins.
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1
@@ -360,9 +361,9 @@ class Solution:
         )
 
     def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
-        """Return where the profile likelihood of a coordinate has fallen by `drop` nats, by entry of `first`.
+        """Return where the profile likelihood of a coordinate is `drop` nats below its maximum, for each side searched.
 
-        `first`: signed distances from the maximum at which the searches begin; END, REAL_END: their limits.
+        `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`.
         """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
         return self.surface.find_profile_crossings(
@@ -385,9 +386,9 @@ def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
 
 
 def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
-    """Return the rank of the information (p, p) in a recording's second half, with exactly `ridges` flat directions.
+    """Return the rank of the information `late` (p, p) of the second half of the rows, with `ridges` flat directions.
 
-    What is known before the first step pins down a ridge weakly. That does not grow with the data, so it is not used.
+    The initial state's law informs weakly on ridges, where no data do. The second half has hardly any of that.
     """
     rank = find_information_rank(late)
     if rank.flat.shape[1] == ridges:

@@ -55,7 +55,7 @@ class Fit:
 
     @property
     def best(self) -> Solution:
-        """Maximum that counts: of the conditional form where there is one."""
+        """Maximum that predictions use: of the conditional likelihood if it was maximised, else of the linear one."""
         return self.solutions[-1]
 
     @property
@@ -92,7 +92,7 @@ class Fit:
 
     @property
     def free_numbers(self) -> int:
-        """Number of free numbers: directions that no data identify are none."""
+        """Number of free numbers, less the directions in which the likelihood does not change (ridges)."""
         return self.description.parameters.size - self.best.ridges
 
     @property
@@ -368,8 +368,8 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
         step = int(np.argmax(~np.isfinite(by_row)))
         expected = "numbers under which the recording is possible"
         raise fail("start of the fit", expected, f"a log-likelihood of {total} from step {step} on")
-    # Others are drawn uniformly around it: logarithms and logits within SPREAD, real numbers within half their size or
-    # AWAY standard errors, whichever is more; of one that is 0 and of which the data tell nothing there, within SPREAD.
+    # Draw the others uniformly around it: logarithms and logits within SPREAD; real numbers within half their size or
+    # AWAY standard errors, whichever is more, or within SPREAD if both are 0 (no information gives no standard error).
     free, deviation = surface.domains.free, surface.standard_errors(start)
     far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
     drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD)

@@ -55,7 +55,10 @@ class Parameter:
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
     def entries_at(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
-        """Return the entries (entries,) of the table at a point x (size,) of the line."""
+        """Return what the table of estimates shows of this number (entries,), at its unbounded coordinates x (size,).
+
+        A coordinate is the logarithm or logit of a number whose domain has ends, else the number itself.
+        """
         with jax.enable_x64(True):
             return np.asarray(self._trace_entries(np.asarray(x)))
 

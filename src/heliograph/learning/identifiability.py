@@ -68,11 +68,12 @@ class Identifiability:
         return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
 
     def or_sharper(self, other: "Identifiability") -> "Identifiability":
-        """Return the one of this and another with fewer ridges, or as many and the larger `weakest`.
+        """Return whichever of this and `other` has fewer ridges (directions in which the likelihood is constant).
 
-        What data tell at one point they tell almost everywhere, so that more ridges are rounding.
+        The rank of the information is the same at almost all points, so that a point with more ridges has them by
+        rounding or by chance. With equally many, the larger least eigenvalue (`weakest`) decides.
         """
-        return min(self, other, key=lambda known: (known.ridges, -known.weakest))
+        return min(self, other, key=lambda result: (result.ridges, -result.weakest))
 
     def at(self, solution: "Solution") -> "Identifiability":
         """Return the identifiability with estimates and intervals of what is identified."""
@@ -157,15 +158,16 @@ def _judge_identifiability(
 
 
 def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
-    """Return the sentences on numbers that are not identified, and on what is in their place.
+    """Return sentences on the numbers that are not identified, and on the products or sums of them that are.
 
-    `solution`: the maximum, whose estimates and intervals they have; None where there is none yet.
+    `solution`: the maximum, whose estimates and intervals the sentences quote; None where there is none yet.
     """
     names = identifiability.parameters.coordinates
     lines = [
         _describe_confounded_group(identifiability.parameters, group, solution) for group in identifiability.groups
     ]
-    # Where a group has more identified combinations than products, moments of the links say more.
+    # A group of len(places) numbers becomes known once `fix` of them are; the data identify the other dimensions. If
+    # there are fewer identified products than these, mean gains and covariances of the links say the rest.
     has_others = any(group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups)
     if solution is not None and has_others:
         lines += describe_identified_links(solution)

@@ -51,9 +51,10 @@ def count_cosines(steps: int) -> int:
 def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
     """Return which of k numbers have their information in only a few of the nu stretches of the data, (k,).
 
-    Stretches are spans of rows, as many as cosines are used. With V_b the information in stretch b,
-    (sum_b V_b)^2 / sum_b V_b^2 is nu if all stretches tell the same, and 1 if one tells all. Below FEW nu they are few.
-    Scores of such a number vary only within a few stretches, where cosines hardly change, so that cosines miss them.
+    Stretches divide the rows evenly, as many as cosines are used to estimate the covariance of summed scores. With V_b
+    the information in stretch b, (sum_b V_b)^2 / sum_b V_b^2 is nu if all V_b are equal, and 1 if all but one are 0.
+    Below FEW nu the stretches are few. Scores of such a number differ from 0 only there, where cosines hardly change,
+    so that the cosines' estimate misses their variance.
     `information`: for each recording, the information of each row on each number (steps, k).
     """
     by_recording = []

@@ -138,9 +138,10 @@ class FreeNumberCollector:
         self.marks: list[_MarkedNumber] = []
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """Return the start, marked so that checks at its place report the domain.
+        """Return the start of a number marked `hg.free`, wrapped so that the check of its argument reports its domain.
 
-        `self.marks`: the numbers met so far. A name met before is the same number again, and must have the same start.
+        A checked argument (a variance, a probability) knows which values are allowed: that becomes the number's domain.
+        `self.marks`: the numbers met so far. The same name is the same number again, and must have the same start.
         """
         for mark in self.marks:
             if name is not None and mark.given == name:

@@ -65,12 +65,13 @@ def find_confounded(
 ) -> list[ConfoundedNumbers]:
     """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
 
-    Only points with the fewest flat directions count. The flat directions of coordinates x become those of the numbers
-    v themselves, and of log |v|: sums of v, or products, are identified where they do not change along these.
+    Only points with the fewest flat directions (without information) count. Flat directions of the coordinates x become
+    those of the numbers v by dv/dx, and of log |v| by d log |v| / dx. A sum of v is identified if it does not change
+    along the former, and a product if its logarithm does not change along the latter.
 
     Args:
         parameters: the free numbers.
-        points: points of the line (p,).
+        points: points in unbounded coordinates x (p,): logarithms or logits of numbers whose domain has ends.
         ranks: the rank of the information at each of them.
     """
     fewest = min(rank.flat.shape[1] for rank in ranks)
@@ -122,11 +123,14 @@ def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...
 def _make_confounded_numbers(
     group: tuple[int, ...], of_logs: list[np.ndarray], of_numbers: list[np.ndarray]
 ) -> ConfoundedNumbers:
-    """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums.
+    """Return a group of numbers v_i that the data do not separate, with the combinations that they do identify.
+
+    These are products prod_i v_i^e_i with whole exponents e, if the same ones are identified at all points; else sums
+    sum_i w_i v_i. `fix` in the result: how many of the numbers must be known so that the others become so.
 
     Args:
         group: the coordinates.
-        of_logs: flat directions of the logarithms of numbers at each point, in columns.
+        of_logs: flat directions (without information) of the logarithms of numbers at each point, in columns.
         of_numbers: flat directions of the numbers at each point, in columns.
     """
     places = list(group)

@@ -47,44 +47,44 @@ class ClockLeap(NamedTuple):
             leap = leap.earlier
 
     def is_over(self, now: float) -> bool:
-        """Return whether the plant has gone on after it for as long as it leapt."""
+        """Return whether the plant has gone on after the leap, from `since` to `now`, for as long as it leapt."""
         return now - self.since >= self.since - self.now
 
     def as_believed(self) -> "ClockLeap":
-        """Return this leap as a believed one; if an earlier leap is believed, both are joined into one leap.
+        """Return this leap (a gap in time that only one clock shows) as believed: rows may become final after it.
 
-        A believed leap lets rows become final, although no other clock confirms it. The leap with which a plant begins
-        (`now` is -inf) is never joined, since it has no time before it. `back`: time of a message that contradicted the
-        leap, None if there is none. `since`: the first moment after the newest of the joined leaps.
+        If an earlier leap is believed already, the two become one, which begins where the earlier one began and whose
+        far side (`since`) is that of this one. The leap with which a plant begins has no time before it (`now` is -inf)
+        and is not joined. A message that contradicted the leap before (`back`) is forgotten.
         """
         if self.earlier is None or self.earlier.now == -inf:
             return self._replace(believed=True, back=None)
         return self.earlier._replace(since=self.since, back=None)
 
     def with_back(self, of: "ClockLeap", back: float | None) -> "ClockLeap":
-        """Return this chain of leaps with `back` set in the leap `of`.
+        """Return this leap and the earlier ones, with `back` set in the leap `of`, which is one of them.
 
-        `back` is the time of a message that goes on from before the leap, which is a first sign against the leap; None
-        if there is none. `earlier` is the previous leap of the chain.
+        A leap is a gap in time that only one clock shows. `back` is the time of a message that is dated before the gap
+        though it came after it: the first sign that the clock was wrong; None if there is no such message.
         """
         if self is of:
             return self._replace(back=back)
         return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
 
     def is_taken_back_by(self, clock: str, time: float, now: float) -> bool:
-        """Return whether `clock` refutes the leap by saying `time`, which lies between the leap's two sides.
+        """Return whether a message of `clock` dated `time`, inside the leap's gap, shows that the leap never happened.
 
-        `now` is the newest arrival after the leap. A leap that is not `believed` is always refuted. `since` is the
-        first moment after the leap. `back` is the time of an earlier message by the leap's own clock that went on from
-        before the leap, None if there is none.
+        It does if the leap is not `believed`. Otherwise it does not if it may just be late: if the plant went on after
+        the leap, from `since` to `now`, for at least as long as the message is late. Otherwise one message of another
+        clock is enough. The leap's own clock must say so twice, the second time shortly after the first (`back`).
         """
         if not self.believed:
             return True
         if now - self.since >= self.since - time:
-            return False  # the message is late by no more than the plant has gone on since the leap
+            return False  # it may be late
         if clock != self.clock:
             return True
-        # The leap's own clock needs two such messages, the second of which goes on from the first (`back`).
+        # The second message of the leap's own clock is later than the first, but far from the leap's other side.
         return self.back is not None and self.back < time < self.back + self.time - time
 
 

@@ -121,8 +121,8 @@ class Fleet:
     def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
         """Predict each plant to the step paired with it, without measurements; this row becomes the plant's `silence`.
 
-        The row does not belong to the history: `take_event` drops it at the next event that is used. A later silence
-        is predicted from an earlier one, so that no step is computed twice.
+        The row does not belong to the plant's history and is dropped at the next event. A later prediction continues
+        from an earlier one, so that no step is computed twice.
         """
         chains = []
         for plant, step in plants:
@@ -130,7 +130,7 @@ class Fleet:
             if step <= before.key[0]:  # the plant was already predicted so far
                 continue
             slot = plant.silence.slot if plant.silence is not None else self.pool.take_slot()
-            plant.silence = HeldRow((step, 0, 0), slot, self.width)
+            plant.silence = HeldRow((step, 0, 0), slot, self.width)  # nothing came: all its numbers are NaN
             self.pool.table[slot, self.pool.numbers] = plant.silence.numbers
             chains.append([before, plant.silence])
         self._step_chains(chains)
@@ -167,9 +167,9 @@ class Fleet:
         return CheckedEvent(index, sequence, time, numbers, arrival)
 
     def append_losses(self, node: str, values: list[float]) -> list[float]:
-        """Return a message's values, followed by NaN for each number of lost messages where these do not come with it.
+        """Return a message's values, followed by NaN for each number of lost messages if it does not state these.
 
-        `PlantState.add_event` writes the number that the running count of messages says in its place.
+        Only filters of senders that decide when to send need them. The count of messages later replaces the NaN.
 
         Raises:
             ValueError: values of a sender of single components, whose losses a count of messages does not say.
@@ -226,7 +226,7 @@ class Fleet:
         return screened
 
     def _screen_by_limits(self, limits: ReadingLimits, node: str, unscreened: ScreenedEvent) -> ScreenedEvent:
-        """Return an event without the values that a node's limits refuse; its `repeats` are continued by the event."""
+        """Return an event without the values that a node's limits refuse. `repeats`: its runs of equal readings."""
         event, values = unscreened.event, np.array(unscreened.event.values)
         screened = limits.screen(values[None], unscreened.repeats)
         if not screened.refused.any():
@@ -277,18 +277,18 @@ class Fleet:
         return verdict
 
     def advance_time(self, plant: PlantState, now: float) -> None:
-        """Advance a plant's time to `now`, which is known to be right; undo a leap in time that contradicts it."""
+        """Advance a plant's time to `now`, known to be right; undo a leap (jump of one clock) that went far beyond."""
         leap, longest_gap = plant.leap, self.options.leap
         if leap is not None:
             found = find_contradicted_leap(leap, plant.now, now, longest_gap)
-            if found is not None and found[0].now > -inf:  # not the leap with which the plant began
+            if found is not None and found[0].now > -inf:  # not the leap with which the plant began (nothing before)
                 plant.undo_leap(found[0], longest_gap, self._names)
             elif now >= leap.time - longest_gap:  # the right time has come as far, and confirms the leap
                 plant.leap = None
         plant.now = max(plant.now, now)
 
     def undo_events(self, plant: PlantState, clock: tuple[float, ClockLeap | None]) -> None:
-        """Restore a plant to its state before the events taken since it was last finalised; `clock`: its own then."""
+        """Undo a plant's events since its rows were last made final. `clock`: its time and newest leap in time then."""
         self.pool.free_slots(plant.undo_changes())
         plant.clock = clock
 
@@ -317,7 +317,7 @@ class Fleet:
         self._step_chains(chains)
 
     def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
-        """Step from the first row of each chain to the second, and so on; what came is in the table already."""
+        """Compute the state of each row of a chain from the row before it; a row's measurements are in the table."""
         by_steps, endless = self.program.dt is None, self.end_step == np.inf
         # Long gaps cut a chain into legs. Step the first legs of all chains at once, pass their gaps, and so on.
         legs_of_chains = [cut_chain_into_legs(chain, by_steps, endless) for chain in chains]
@@ -331,7 +331,7 @@ class Fleet:
             legs_of_chains = [legs[1:] for legs in legs_of_chains]
 
     def step_row(self, before: HeldRow, row: HeldRow) -> None:
-        """Step from the row `before` into `row`, which is none of a plant's, and write it into the table."""
+        """Compute the state of `row`, which no plant holds, from that of the row `before`; write it into the table."""
         self.pool.table[row.slot, self.pool.numbers] = row.numbers
         self._step_chains([[before, row]])
 
@@ -357,10 +357,10 @@ class Fleet:
     def find_sender_status(self, plant: PlantState, now: float = -inf) -> dict[str, SenderStatus]:
         """Return {node whose silence says something: the status of its sender by now}.
 
-        `now`: a moment that a clock says; if it is before the newest arrival, or the newest silent row, that counts.
+        `now`: time by a clock; if the newest arrival, or the newest step without a message, is later, that counts.
         """
         now = max(now, plant.now, -inf if plant.silence is None else plant.silence.key[0])
-        # Steps before the watermark are final: no value may come for them any more.
+        # What is before the watermark is final: no value may come for it any more. `final`: the newest such moment.
         by_steps, watermark = self.program.dt is None, plant.confirmed - self.options.window
         final = ceil(max(watermark, -1.0)) - 1 if by_steps else max(watermark, plant.begun)
         now = floor(min(now, self.end_step)) if by_steps else now

@@ -11,20 +11,22 @@ from heliograph.model.over_time import first
 
 
 def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarray) -> Origin:
-    """Return where forecasts from the row in a slot start, or from those in several; the pool stays as it is.
+    """Return where forecasts from a row start, or from several rows: their states, steps, inputs and estimates.
+
+    A row is the state after one measurement of a plant. A slot is its place in the fleet's table, which stays as it is.
 
     Args:
-        fleet: the plants, whose pool has the rows.
+        fleet: the plants, in whose table the rows are.
         slot: of the row, or of each row.
         time: of the row, or of each row (rows,), in steps or in the unit of dt.
     """
     pool, program = fleet.pool, fleet.program
     row = pool.table[slot].copy()
-    held, several = row[..., pool.held], row.ndim > 1
-    # Among the inputs stands the time step, which is not known ahead.
-    inputs = held if program.dt is None else np.insert(held, program.dt, np.nan, axis=-1)
+    latest_inputs, several = row[..., pool.held], row.ndim > 1
+    # In continuous time the time step is one of the inputs, number `program.dt`; it is not known ahead, so NaN.
+    inputs = latest_inputs if program.dt is None else np.insert(latest_inputs, program.dt, np.nan, axis=-1)
     spacing = float("nan") if program.dt is not None else 1.0
-    step = row[..., pool.at.start].astype(int) + 1
+    step = row[..., pool.at.start].astype(int) + 1  # one after the row's step number
     return Origin(
         model=program.network,
         state=program.step_rows.state.tree(row[..., pool.state]),

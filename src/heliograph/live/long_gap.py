@@ -60,7 +60,11 @@ def convert_to_covariances(
 def convert_to_factors(
     rows: Float[np.ndarray, "row state"], places: Sequence[FactorPlaces]
 ) -> Float[np.ndarray, "row state"]:
-    """Return rows with the factors L and D in the places of covariances: undo `convert_to_covariances`."""
+    """Return rows with the factors L and D of each covariance L D L' where the covariance stood.
+
+    The covariance stands in the places of its factors: entries below its diagonal in those of L (`lower`), and its
+    diagonal in those of D (`variances`).
+    """
     rows = rows.copy()
     for lower, variances in places:
         n = variances.shape[-1]
@@ -76,21 +80,20 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
                  count: int, places: Sequence[FactorPlaces] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
     """Return the state after `count` silent steps from one after step number `at`, in bounded work.
 
-    A silent step s' = g(s) is affine in means and covariances where the plant is linear: P' = F P F' + Q. Numbers that
-    do not move over a probe of real steps stay; for the others g(s + d) = g(s) + A d, with A by differences along each
-    of them, and d' = A d + c with c = g(s) - s is raised to the power by squaring, d_2n = A^n d_n + d_n. The map is
-    used only if it predicts the probe; factors L, D of a covariance are no affine map's, and are taken as L D L'.
-    Otherwise real steps go on, PROBES times PROBED of them; what then moves on by
-    as much as before, as the variance of a random walk does, is taken to go on so, and all else to stay. A state of
-    which a number is not finite after that begins anew with `start`, the initial law.
+    A silent step g (one without a measurement) of a linear plant is affine in mean and covariance: x' = F x,
+    P' = F P F' + Q. So a few real steps (a probe) show how the rest go. Numbers that do not move over a probe stay. Of
+    the others g(s + d) = g(s) + A d, A by differences. The map d' = A d + c, c = g(s) - s, is repeated by doubling,
+    d_2n = A^n d_n + d_n, and used only if it predicts the probe. Without such a map up to PROBES * PROBED real steps
+    are made; then a number that moves equally in each probe, as a variance of a random walk, is extrapolated, and all
+    others stay. A result that is not finite is replaced by `start`, the initial law.
 
     Args:
-        step: the silent step.
+        step: the silent step g.
         start: state by the initial law.
         state: state before the gap.
         at: number of the step that led to it.
         count: number of steps, at least 0.
-        places: of the factors of covariances in a state.
+        places: where a state holds factors L, D of a covariance. These are not affine, but P = L D L' is.
     """
     after = _pass_silent_steps(step, state, at, count, places)
     return after if np.isfinite(after[np.isfinite(state)]).all() else start
@@ -225,9 +228,9 @@ def _measure_affine_map(
     """Return A and c = g(s) - s of the step g(s + d) = g(s) + A d, by differences along each of the m `columns`.
 
     Args:
-        step: the silent step g.
+        step: the step g of the filter without a measurement.
         state: the state s.
-        movement: by how much each number moves over a probe, which scales its difference.
+        movement: by how much each number moved over some real steps: the scale of the difference along it.
         columns: numbers of the state that move; A and c are of these alone.
         at: number of the step before.
     """
@@ -238,8 +241,8 @@ def _measure_affine_map(
     tried[np.arange(1, len(columns) + 1), columns] += size
     after = step(tried, at + 1)[:, columns]
     matrix = ((after[1:] - after[0]) / size[:, None]).T
-    # Entries in units of the movements are rounded to LEAST: a zero computed as 1e-15 would let what grows for ever
-    # drive what rests.
+    # Round A to LEAST, in units of the movements: an entry 0 computed as 1e-15 would make a number at rest grow with
+    # one that grows for ever.
     units = size[:, None] / size
     return np.round(matrix / units / LEAST) * LEAST * units, after[0] - state[columns]
 

@@ -93,23 +93,29 @@ class PlantState:
 
     @property
     def confirmed(self) -> float:
-        """Return the newest arrival that another clock confirms, or that is believed; rows become final by it."""
+        """Return the time by which rows become final: the newest arrival, or that before a leap in doubt.
+
+        A leap is a gap in time that one clock alone has shown. It is in doubt until another clock confirms it or it is
+        believed (`ClockLeap`).
+        """
         return self.now if self.leap is None or self.leap.believed else self.leap.now
 
     @property
     def clock(self) -> tuple[float, ClockLeap | None]:
-        """Return the newest arrival, and the leap in time that led to it where no other clock confirms it."""
+        """Return the time of the newest arrival, and the leap (gap in time) that led to it, or None."""
         return self.now, self.leap
 
     @clock.setter
     def clock(self, clock: tuple[float, ClockLeap | None]) -> None:
-        """Set the newest arrival and the leap to what they were."""
+        """Set the time of the newest arrival, and the leap that led to it, None if there is none."""
         self.now, self.leap = clock
 
     def undo_contradicted_leap(
         self, clock: str, time: float, longest_gap: float, agreed: bool, names: Sequence[str]
     ) -> None:
-        """Undo a leap in time that a clock contradicts, or note its first message against its own leap.
+        """Undo a leap (a gap in time that one clock alone showed) if this event shows that it never happened.
+
+        One message of the leap's own clock is not enough if the leap is believed: it is noted, and a second one counts.
 
         Args:
             clock: name of the clock's node, or `ARRIVAL`.
@@ -129,9 +135,10 @@ class PlantState:
             self.leap = self.leap.with_back(leap, time)
 
     def pass_time(self, clock: str, time: float, now: float, longest_gap: float, agreed: bool) -> None:
-        """Advance the time to `now` by an event that was used.
+        """Advance the plant's time to `now`, the arrival of an event that was used.
 
-        More than `longest_gap` at once is a leap, unless another clock agrees.
+        If time goes on by more than `longest_gap` at once and no other clock says the same, this is a leap: rows do not
+        become final by it until it is confirmed or believed. An event on the far side of an open leap may confirm it.
 
         Args:
             clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
@@ -144,28 +151,28 @@ class PlantState:
         if agreed:
             leap = None
         elif leap is not None:
-            # From before the leap, an event says nothing of the present; one of the leap's own message neither.
+            # An event dated before the leap says nothing of the present, nor does the leap's own message again.
             if time < leap.time - longest_gap or (time == leap.time and clock == leap.clock):
                 return
             leap = self._confirm_leap(clock, leap, time, longest_gap)
-        # A new leap, unless one is open still that nothing has confirmed: this event then is of its far side.
+        # A new leap; but while an earlier one is in doubt, this event belongs to that one's far side.
         if now > newest + longest_gap and not agreed and (leap is None or leap.believed):
             moments = {node: (link.at, link.latest) for node, link in self.links.items()}
             leap = ClockLeap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)
         self.now, self.leap = max(newest, now), leap
 
     def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
-        """Return the leap after an event on its far side at `time` by `clock`, or None if it is confirmed.
+        """Return the leap after an event of `clock` behind its gap; None, or earlier leaps, if it is confirmed.
 
-        Another clock confirms it at once. Its own clock confirms it when the plant has gone on for as long as it leapt
-        (`is_over`). INPUTS have no clock of their own, and ARRIVAL is the clock of arrivals.
+        Another clock confirms the leap at once. The clock that made it confirms it when the plant has gone on for as
+        long as the gap (`is_over`). Before that, a second message of it makes the leap believed if no node that was
+        heard shortly before the gap could confirm it. Inputs have no clock; ARRIVAL is the clock of arrivals.
         """
         if clock != leap.clock:
             return None
         if leap.is_over(self.now):
             return leap.earlier
         others = (link.latest for node, link in self.links.items() if node not in (clock, INPUTS))
-        # A second message by the same clock is believed, unless a node that was heard shortly before can confirm it.
         if clock != ARRIVAL and any(latest >= max(leap.now - longest_gap, 0.0) for latest in others):
             return leap
         return leap.as_believed()
@@ -202,13 +209,16 @@ class PlantState:
         return True
 
     def _count_withdrawn(self, rows: Sequence[HeldRow], leap: ClockLeap, names: Sequence[str]) -> None:
-        """Count the events of a leap's rows as withdrawn, by node; `names` are of the nodes, then of the inputs."""
+        """Count the events in the rows of an undone leap as withdrawn, not used, in the counts of their nodes.
+
+        `names` are those of the nodes in their order, then that of the inputs.
+        """
         counts: dict[str, int] = {}
         for row in rows:
             for node, _running_count, _time in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
-            # `leap.moments` holds the times in the node's counts before the leap.
+            # The times in a node's counts become those from before the leap, `leap.moments`.
             self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
     def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
@@ -216,9 +226,9 @@ class PlantState:
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
     def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
-        """Return the events of leaps that were undone since the last call, and the slots of their rows.
+        """Return the withdrawn events since the last call, and the slots (table rows) that their rows took.
 
-        Such events are withdrawn: a later message showed that their clock was wrong.
+        An event is withdrawn if a later message showed that its clock was wrong: its leap (gap in time) was undone.
         """
         leaps, self.aside = self.aside, []
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
@@ -272,13 +282,14 @@ class PlantState:
             later_row.numbers[column] = number
 
     def undo_changes(self) -> list[int]:
-        """Undo the changes since the last finalisation; return the slots that are free again.
+        """Undo all changes since the last finalisation, as if the batch had not come; return the slots that are free.
 
-        `aside` holds for each undone leap the rows that were removed with it. `kept` is the row from before a leap.
-        `dirty` is the index of the first row to step again. The base, the first held row, is final.
+        Changes are events that were added to rows (`changes`), and rows that were removed with an undone leap, a gap in
+        time by one clock (`aside`). A slot is a row of the table of estimates. The base, the first held row, is final
+        and never changes. Rows from `dirty` on have to be stepped again.
         """
         slots, keys = list[int](), [row.key for row, _ in self.changes]
-        # The newest comes first: undo the changes after each undone leap, and then restore the leap's rows.
+        # Backwards: undo the changes that came after a leap was undone, and then bring the leap's rows back.
         for leap in reversed(self.aside):
             slots += self._undo_since(leap.changes)
             self.rows.replace_rows(leap.held)
@@ -323,10 +334,11 @@ class PlantState:
         return chain
 
     def finalise_rows(self, watermark: float, longest_gap: float) -> tuple[list[HeldRow], list[int]]:
-        """Make rows before the watermark final; return them and the slots that are no longer needed.
+        """Make rows before the watermark final; return them and the slots (table rows) that are no longer needed.
 
-        `longest_gap` is the longest gap that is no leap; the newest row before a leap is kept. The base is the newest
-        final row, from which later rows are stepped. `forced` counts rows that became final early, for lack of room.
+        Later rows are stepped from the newest final row, the base. If a leap (a gap in time of more than `longest_gap`
+        by one clock) may still be undone, the newest row before it is kept too. Rows that become final early, for lack
+        of room, are counted in `forced`.
         """
         self.changes = []
         base, forced = self.rows.find_base(watermark)
@@ -337,11 +349,13 @@ class PlantState:
         return final, self._free_kept_row(left, longest_gap)
 
     def _free_kept_row(self, left: list[HeldRow], longest_gap: float) -> list[int]:
-        """Keep the newest row before a leap, as long as the leap may be taken back; return the slots of all others.
+        """Choose the row to keep in case a leap is undone; return the slots of all other rows that are not held.
 
-        `left`: rows that are not held any more.
+        A leap is a gap in time of more than `longest_gap` that one clock alone showed. As long as it may be undone, the
+        newest row before its gap is kept in `kept`: the plant then goes on from there. `left`: rows that are not held
+        any more, in order of time.
         """
-        # The oldest leap that is not confirmed, other than the one with which the plant began.
+        # The oldest leap that may be undone. That with which the plant began has no row before it.
         leaps = [] if self.leap is None else [leap for leap in self.leap.list_with_earlier() if leap.now > -inf]
         leap = leaps[-1] if leaps else None
         if self.kept is not None and (leap is None or leap.now != self.kept.now):  # it was of another leap
@@ -357,10 +371,9 @@ class PlantState:
 
     @property
     def slots(self) -> list[int]:
-        """Return all slots of the plant.
+        """Return all slots of the plant: the numbers of its rows in the table of estimates.
 
-        A slot is the number of a row in the table. `kept` is the row from before a leap, None if there is none. `gone`
-        are rows that were removed when a leap was undone.
+        They are those of rows held, of the row kept from before a leap, and of rows removed with an undone leap.
         """
         kept = [] if self.kept is None else [self.kept.row]
         gone = [row for leap in self.aside for row in leap.gone]

@@ -66,8 +66,8 @@ class SlotTable:
     def write_prior(self, slot: int, time: float) -> None:
         """Fill a slot with the prior, at `time`, before any measurement.
 
-        `at` is the column of the step number. `numbers` are the columns of what came, NaN for nothing; the last of
-        them, and of the row, is its time.
+        A row has columns of the state (here the initial law), the outputs (0), the step number `at` (-1, before the
+        first step) and the `numbers` received (NaN for none), of which the last is the row's time.
         """
         row = self.table[slot]
         row[:] = 0.0
@@ -140,20 +140,23 @@ class SlotTable:
         return _insert_time_step(u_without_dt[None], dt, time_between)[0], step_number
 
     def pass_long_gap(self, slot: int, to: int) -> None:
-        """Predict the row in a slot, in place, to step number `to` without measurements, in bounded work."""
+        """Predict the row in a slot, in place, to step number `to` without measurements, in bounded work.
+
+        Its latest inputs go on. `self.at`, `self.held`, `self.state`: a row's columns of step number, inputs and state.
+        """
         row = self.table[slot]
-        at, held = int(row[self.at.start]), row[self.held]
+        at, inputs = int(row[self.at.start]), row[self.held]
         nothing = np.full(self.program.received, np.nan)
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
-            """Return the states (row, state) after step number k, without measurements and with the inputs `held`."""
-            same_for_all = np.concatenate([nothing, held, [k]])
+            """Return the states (row, state) after step number k, without measurements and with the same `inputs`."""
+            same_for_all = np.concatenate([nothing, inputs, [k]])
             rows = np.broadcast_to(same_for_all, (len(states), len(same_for_all)))
             return self._step_parts(states, rows)[:, : self.step_rows.state.size].copy()
 
         state = self.step_rows.state
         column_numbers = np.arange(float(state.size))
-        places = find_factor_places(state.tree(column_numbers))
+        places = find_factor_places(state.tree(column_numbers))  # of factors of covariances, which are not affine
         state_before = row[self.state].copy()
         state_after = pass_long_gap(step, self.step_rows.start, state_before, at, count=to - at, places=places)
         self.table[slot, self.state], self.table[slot, self.at.start] = state_after, to
@@ -188,6 +191,10 @@ class ChainLeg(NamedTuple):
 def cut_chain_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[ChainLeg]:
     """Return the steps along a chain of rows, cut into legs where a gap is too long to step through one by one.
 
+    A step is (slot of the row before, slot of the row, step number). In a gap of over LONG steps the first step
+    makes the new row; its state is then predicted over the gap at once, to step number `jump`, TAIL steps before its
+    time. These last steps, one by one, begin the next leg.
+
     Args:
         chain: rows, of which each is stepped into from the one before it.
         by_steps: whether time counts steps.
@@ -198,7 +205,6 @@ def cut_chain_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> 
         begin, last, before = int(row.key[0]) + 1, next_row.key[0], row.slot
         numbers: Sequence[float] = range(begin, int(last) + 1) if by_steps else (last,)
         if len(numbers) > LONG and endless:
-            # One step into the new row, which is then taken in place to TAIL steps before its own; these one by one.
             legs[-1] = ChainLeg([*legs[-1].steps, (before, next_row.slot, begin)], jump=int(last) - TAIL)
             legs.append(ChainLeg([]))
             before, numbers = next_row.slot, range(int(last) - TAIL + 1, int(last) + 1)

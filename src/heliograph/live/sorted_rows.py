@@ -52,7 +52,11 @@ class SortedRows:
     """
 
     def __init__(self, base: HeldRow, joint: bool, columns: list[slice], capacity: int):
-        """Hold the base as the only row; the class says what the arguments are."""
+        """Hold the base (the row whose state all later rows follow from) as the only row.
+
+        `joint`: whether all events of one time form one row. `columns`: columns of each node's numbers in a row, by its
+        index, those of the inputs last. `capacity`: greatest number of rows after the base.
+        """
         self.held, self.keys = [base], [base.key]
         self.joint, self.columns_by_node, self.capacity = joint, columns, capacity
 

@@ -192,21 +192,21 @@ class Stream:
 
     @property
     def held(self) -> np.ndarray:
-        """Return by component how many runs of equal readings were longer than its noise allows; none was refused."""
+        """Return by component how many runs of equal readings were longer than noise allows (not refused: a doubt)."""
         found = self._repeats.found or [0] * self.filter.received
         return np.array(found, dtype=np.int64)
 
     def _count_readings(self, screened: ScreenedReadings | None, z: np.ndarray) -> list[str]:
-        """Count what was screened; where none is stuck by rule, return a line on the first run of each that is.
+        """Count refused readings and runs of equal ones; return a line for each output found stuck for the first time.
 
-        A filter either refuses stuck readings (`screened`), or a watch only tells of them. `refused`: counts by reason;
-        `_repeats`: runs of equal readings.
+        Lines come only from a watch (`_watch`), which is there if no limits refuse stuck readings. `screened`: which
+        readings limits refused, and why; None without limits. `_repeats`: runs of equal readings.
         """
         if screened is not None:
             for reason, more in count_by_reason(screened.refused).items():
                 self.refused[reason] += more
             self._repeats = screened.repeats
-        # `found`: by component how many runs were too long so far; () before the first reading.
+        # `found`: by component, how many runs so far were longer than noise allows; () before the first reading.
         found_before, watch = self._repeats.found, self._watch
         if watch is None:
             return []
@@ -288,18 +288,18 @@ class Stream:
         return rule.find_status(last_arrival, begun=-1, final=now, now=now)
 
     def save(self) -> bytes:
-        """Return state and step number for `restore`: after it, the same pushes give the same bits."""
+        """Return state, counts and newest inputs as bytes for `restore`: then the same pushes give the same bits."""
         leaves = {f"state.{i}": leaf for i, leaf in enumerate(self._stepper.state)}
         head = {
             "paths": list(self._compiled.layout),
             "steps": self.steps,
             "refused": {reason: count.tolist() for reason, count in self.refused.items()},
             "repeats": self._repeats,
-            "last": self._last,
-            "beyond": self._beyond,
+            "last": self._last,  # step of the newest measurement
+            "beyond": self._beyond,  # unexpected measurements in a row
             # JSON has no NaN: an input that is not known is None.
             "inputs": [None if value != value else value for value in self._inputs.tolist()],
-            "of": self._compiled.identity,
+            "of": self._compiled.identity,  # of the filter: `restore` refuses another one
         }
         return pack_snapshot(head, leaves)
 
@@ -339,7 +339,7 @@ class Stream:
     def _restore_counts(self, head: dict[str, Any]) -> None:
         """Set the step number, the newest inputs and all counts to those in the head of a snapshot.
 
-        Earlier versions did not write all of them. What is missing begins anew.
+        Earlier versions did not write all of them; the rest begins anew. `_beyond`: unexpected measurements in a row.
         """
         self.steps = int(head["steps"])
         # Versions up to 0.4.0 counted refusals by limits and by codes together.

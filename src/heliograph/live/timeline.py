@@ -144,17 +144,17 @@ class Timeline:
 
     @property
     def gated(self) -> dict[tuple[str, str], int]:
-        """Return by node and filter that weighs how many values of final rows it left out, by a weight of 0."""
+        """Return {(node, filter): number of values in final rows with weight 0}, for filters that weigh values."""
         return dict(self._gates.counts)
 
     @property
     def timeouts(self) -> dict[str, int]:
-        """Return of each node how many silences were longer than its timeout, and ended; `senders` names others."""
+        """Return by node how many silences longer than its timeout have ended; `senders` shows one that goes on."""
         return self._counts_of("timeouts")
 
     @property
     def held(self) -> dict[str, int]:
-        """Return of each node without `stuck` how many runs of equal readings were longer than its noise allows."""
+        """Return by node how many runs of equal readings were longer than noise allows; 0 if limits refuse these."""
         return self._counts_of("held")
 
     def _counts_of(self, what: str) -> dict[str, int]:
@@ -230,7 +230,7 @@ class Timeline:
         return make_forecast_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
-        """Return the slot (table row) of the state at `now` and its time; it is predicted if nothing came then."""
+        """Return the table slot of the state at `now` and its time: of a row, or predicted into the `_spare` slot."""
         newest, by_steps = self._plant.rows.held[-1], self._program.dt is None
         newest_time, newest_node, _ = newest.key  # the node is BEFORE in the row before all events
         now = np.floor(min(self.now, self._fleet.end_step)) if by_steps else self.now
@@ -250,7 +250,7 @@ class Timeline:
         return self._fleet.find_sender_status(self._plant)
 
     def _outputs_after(self, slots: int | list[int]) -> np.ndarray:
-        """Return the outputs after the row in a slot, or after several."""
+        """Return the outputs of the row in a slot of the fleet's table, or of several: estimates after its events."""
         pool = self._fleet.pool
         return pool.table[slots, pool.outputs].copy()
 
@@ -262,11 +262,11 @@ class Timeline:
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
         if time <= rows.keys[0][0] if by_steps else time < rows.keys[0][0]:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:.12g}")
-        # Slots of the row before that moment, of the moment itself, and of all later rows. Where no step has a row at
-        # the moment, the spare slot takes a prediction to it.
+        # Slots of the row before that moment, of the moment itself, and of all later rows. If there is no row at that
+        # moment, a prediction to it in the spare slot takes its place.
         after = rows.first_after(time)
         has_row = by_steps and rows.keys[after - 1][0] >= time
-        slots = [row.slot for row in rows.held[after - 1 - has_row :]]
+        slots = [row.slot for row in rows.held[after - (2 if has_row else 1) :]]
         if not has_row:
             self._fleet.predict_into(rows.held[after - 1], time, self._spare)
             slots.insert(1, self._spare)
@@ -275,8 +275,8 @@ class Timeline:
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
 
-        They are the filtered estimates after the row, in order of time. Without calls, the last 2 `capacity` of them
-        are kept.
+        They are the filtered estimates after the row, in order of time. Without calls, only the last 2 * `capacity` of
+        them stay available.
         """
         time, outputs = self._finals.take_all()
         return Record(time, self.network.states, truth=None, measurements={}, estimates=self._arrange_outputs(outputs))
@@ -373,7 +373,7 @@ class Timeline:
     def _convert_event(
         self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None
     ) -> CheckedEvent:
-        """Return a pushed event as checked numbers; by default it arrives when measured, or now if that is later."""
+        """Return a pushed event as checked numbers; without `arrival` it arrived when measured, or now if later."""
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))

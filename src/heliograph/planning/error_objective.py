@@ -135,8 +135,9 @@ class Criterion(NamedTuple):
     def make_tangent(self, p: Matrices) -> "Criterion":
         """Return the linear criterion <V, P> that is a lower bound of this one and meets it at p.
 
-        A linear criterion is its own tangent. For a largest eigenvalue, V is the derivative of the smoothed one, scaled
-        so that W^-1/2 V W^-1/2 has trace 1: it is then an average of eigenvalues, which never exceeds the largest.
+        A linear criterion (`sharpness` None) is its own tangent. Else the criterion is the largest eigenvalue of
+        S = W^1/2 P W^1/2, and U = W^-1/2 V W^-1/2 is the derivative of its smoothed form tr(S^q)^(1/q) by S, scaled to
+        trace 1. As U >= 0, <V, P> = tr(U S) is an average over the spectrum of S: it never exceeds the largest.
         """
         if self.sharpness is None:
             return self

@@ -185,10 +185,12 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
 
 
 def _find_relay_power_limits(problem: DesignProblem) -> float | None:
-    """Return the power that all relays together may send in each slot, or None without a limit.
+    """Return the total power that relays which filter may send in each slot, or None without a limit.
+
+    The design of such relays minimises the trace of the steady error covariance, and knows no other limit.
 
     Raises:
-        ValueError: another error than the steady trace, a target error, only some relays free, limits of single relays.
+        ValueError: another error to minimise, a target error, only some relays free, limits of single relays.
     """
     if problem.free is not None or problem.target_error is not None:
         raise fail("design of relays that filter", "all relays free, and a budget or none", "free or target_error")
@@ -202,12 +204,13 @@ def _find_relay_power_limits(problem: DesignProblem) -> float | None:
 
 
 def _make_relay_network(relays: RelayNetwork, gains: Gains) -> Network:
-    """Return a network of the relays with these gains and the best receiver behind them, for at least COVERED steps."""
+    """Return a network of relays with gains by slot, and the best receiver for them, for at least COVERED steps."""
     slots, n = len(relays.slots), len(relays.states)
     # The slots of a period are repeated until COVERED steps are reached.
     times = ceil(COVERED / slots)
     over_time = {name: np.tile(gain, (times, 1, 1)) for name, gain in gains.items()}
-    # A design must have gains of the receiver; zeros will do, since the best receiver replaces its schedule.
+    # `given_design` asks for gains of the receiver too. They are zeros, and their schedule is dropped: the receiver of
+    # the network is the best filter behind these relays (`receiver_behind_relays`).
     receiver_gains = {RECEIVER: np.zeros((times * slots, n, relays.received[-1]))}
     schedules = relay_schedules(relays, given_design(relays, over_time | receiver_gains))
     schedules.pop(RECEIVER)

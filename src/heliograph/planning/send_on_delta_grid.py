@@ -46,18 +46,19 @@ class _CellGrid(NamedTuple):
 
 
 def _choose_cells(system: ScalarSystem, delta: float, share: float) -> _CellGrid:
-    """Return the grid of cells for a state and a value sent last.
+    """Return the grid of cells of equal length h on which the joint law of state and value sent last is computed.
 
-    Cells are at most `share` of the deviation of either noise, in units of the state.
+    h is at most `share` of the standard deviation of either noise. The sender sends when the measurement is more than
+    delta from the value sent last, so that delta is made the edge of a cell: (k + 1/2) h for a whole number k.
 
     Raises:
         ValueError: more cells than can be computed.
     """
     a, q, r = system.a, system.q, system.r
-    # delta is the edge of a cell, so h = delta / (cells + 1/2).
+    # The number k of cells; MOST_CELLS keeps it finite, since so many are refused below.
     cells_of_delta = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), MOST_CELLS) - 0.5))
     h = delta / (cells_of_delta + 0.5)
-    # As many as reach over HELD deviations of what is measured.
+    # The grid reaches HELD standard deviations of the measurement, sqrt(q / (1 - a^2) + r), to either side of 0.
     measured = np.sqrt(q / (1 - a * a) + r)
     cells_each_side = int(np.ceil(min(HELD * measured / h, MOST_CELLS)))
     if cells_each_side > POINTS:

@@ -68,7 +68,8 @@ class SensorWorth:
 
     @property
     def best_addition(self) -> ErrorWithout | None:
-        """The case of the addition with the least `mean_increase`; None of fewer than two."""
+        """The case with the least error (`mean_increase`) among the nodes that were added; None of fewer than two."""
+        # The cases of added nodes are the last ones.
         cases = self.cases[len(self.cases) - len(self.added) :]
         return min(cases, key=lambda case: case.mean_increase) if len(cases) > 1 else None
 
@@ -242,14 +243,14 @@ def _compute_squares_at_end(
 ) -> Float[np.ndarray, "runs n"]:
     """Return the squared error of each state after the last step of each run (runs, n), or if `exact` its variance.
 
-    One run stands for all where variances are exact, and the same rows arrive in all of them and tell the same.
+    If variances are the same in all runs, only the first run is computed and returned.
     """
     squares, used = [], filter.angles_used()
-    # What arrives decides the variances, and what a message tells of its link: where both are the same in all runs,
-    # so are they.
-    told = find_told_filter(filter)
-    is_number = np.isin(np.arange(z.shape[-1]), () if told is None else told.numbers)
-    deciding = np.where(is_number, z, np.isnan(z))
+    # Variances depend on which outputs arrive, and on the values of gains or noise variances that are reported with
+    # each message (`numbers`), not on measured values. If both are the same in all runs, so are the variances.
+    reported = find_told_filter(filter)
+    is_reported = np.isin(np.arange(z.shape[-1]), () if reported is None else reported.numbers)
+    deciding = np.where(is_reported, z, np.isnan(z))
     alike = exact and np.array_equal(deciding, np.broadcast_to(deciding[:1], z.shape), equal_nan=True)
     for row, x in zip(z, truth, strict=True):
         filtered = filter.run(row, u)

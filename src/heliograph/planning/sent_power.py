@@ -195,20 +195,22 @@ def _find_feedback_filters(network: Network) -> dict[str, AbstractFilter]:
 def _compute_innovation_moments(
     filter: AbstractFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None
 ) -> Moments:
-    """Return E (y - r, 1)(y - r, 1)' of each step, with r the reference, the filter's prediction of y; one batch.
+    """Return E (d, 1)(d, 1)' of each step (1, steps, m + 1, m + 1), with d = y - r what a sensor with feedback sends.
 
-    E (y - r)(y - r)' = C P C' + R, which no data change: the filter is run over zeros.
+    y is the measurement and r its prediction by the filter at the receiver, fed back to the sensor. So d is an
+    innovation: E d = 0 and E d d' = C P C' + R. P does not depend on data, so the filter is run over zeros.
     """
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
-    world, state, moments = filter.premise, filter.init(), []
-    assert world is not None and world.sensor is not None  # of a filter that is fed back
+    model, state, moments = filter.premise, filter.init(), []  # the filter's model of plant and sensor
+    assert model is not None and model.sensor is not None  # since it predicts a measurement
     for k, u in enumerate(inputs):
         state = filter.predict(state, u, k)
-        sensor = at(world.sensor, k)
+        sensor = at(model.sensor, k)
         c = np.asarray(sensor.matrix)
         moment = np.eye(len(c) + 1)
+        # [[C P C' + R, 0], [0, 1]]
         moment[:-1, :-1] = c @ np.asarray(filter.estimate(state).covariance) @ c.T + np.asarray(sensor.noise.covariance)
         moments.append(moment)
         state, _ = filter.correct(state, np.zeros(filter.received), k)

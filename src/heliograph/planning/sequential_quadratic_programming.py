@@ -177,9 +177,11 @@ class ScaledProgramme:
         return restored
 
     def polish_by_newton(self, z: Vector) -> Vector:
-        """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them.
+        """Return the point after Newton's steps on the Lagrangian of the limits that are active (met with equality).
 
-        `z`: where a descent ended, within the limits.
+        `z`: where a descent ended, within the limits; in units `problem.unit` of each number. Steps end when one is
+        only rounding, leaves the limits, or raises the objective plus a penalty on the active limits. After each,
+        `restore` moves the point back into limits that rounding broke.
         """
         for _ in range(ROUNDS):
             newton = self._solve_newton_step(z)
@@ -190,8 +192,8 @@ class ScaledProgramme:
                 break
             unit = self.problem.unit
             end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
-            before, after = (self._compute_penalised_value(point, multipliers, active) for point in (z, end))
-            if not (self.is_feasible(end) and after <= before * (1 + ROUNDING)):
+            value, value_at_end = (self._compute_penalised_value(point, multipliers, active) for point in (z, end))
+            if not (self.is_feasible(end) and value_at_end <= value * (1 + ROUNDING)):
                 break
             z = end
         return z

@@ -47,7 +47,8 @@ class SummedLinks(NamedTuple):
 
         B (`self.rows`) is what each link carries of the state. D (`self.noise`) is the covariance of the links' noise,
         and N (`self.floor`) the variance of the receiver's. T = diag(`self.unit`) is the power of each link at
-        amplitude 1.
+        amplitude 1. With a' T a = P, the information is B' a a' B / (a' (D + N T / P) a), which by Cauchy and Schwarz
+        is at most the bound.
         """
         noise = self.noise + np.diag(self.floor * self.unit / total)
         bound: np.ndarray = self.rows.T @ np.linalg.solve(noise, self.rows)

@@ -92,7 +92,7 @@ class SumOfLinksTask(NamedTuple):
 
     @property
     def largest_total(self) -> float:
-        """Largest power that all free links may send together."""
+        """Largest power sum_i caps_i^2 t_i of all free links: t_i (`unit`) at amplitude 1, caps_i^2 t_i at most."""
         links = self.links
         return min(self.limits.total, float((self.caps**2 * links.unit)[self.free].sum()))
 

@@ -113,8 +113,8 @@ class BatchIntake:
     def _refuse_implausible(self) -> set[str]:
         """Step the plants that took events, restore those with implausible events, and return the restored names.
 
-        Each implausible event is noted in `_refused` with its reason. Its plant is again as before the batch, so that
-        the plant's other events must be taken anew.
+        Each implausible event is noted in `_refused` with its reason, by (number of its message, whether it is inputs).
+        Its plant is restored to its state before the batch, so that the caller must apply its other events again.
         """
         plants_by_name = {candidate.plant.name: candidate.plant for candidate in self._taken}
         self.fleet.step(plants_by_name.values())
@@ -142,17 +142,17 @@ class BatchIntake:
             return MessageOutcome(self._count_unread(UnreadMessage(message, str(error))), why=str(error))
 
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
-        """Return {(number of a message, True): reason} for inputs that lead to no valid prediction, as in `_refused`.
+        """Return {(number of a message, True): reason} for inputs that lead to no valid prediction.
 
-        The prediction starts from the plant's state before the batch. A message has inputs beside its values, or it has
-        only inputs (its node is INPUTS).
+        These are keys of `_refused`; True says that the inputs are meant, not the values. The prediction starts from
+        the plant's state before the batch. A message has inputs beside its values, or only inputs (its node is INPUTS).
         """
         numbers, plants, inputs = list[int](), list[PlantState | None](), []
         for i, message in enumerate(messages):
             if isinstance(message, str | UnreadMessage):
                 continue
             values = message.values if message.node == INPUTS else message.inputs
-            if values and len(values) == self.fleet.program.given:
+            if values and len(values) == self.fleet.program.given:  # as many as the network has inputs
                 numbers.append(i)
                 plants.append(self.plants.get(message.plant))
                 inputs.append(values)
@@ -266,10 +266,11 @@ class BatchIntake:
         return at if origin is None or step is None else floor(at / step + 0.5)
 
     def _find_plant(self, message: AnyMessage, wall: datetime) -> PlantState | None:
-        """Return the plant of a message; None if it has to begin, or to begin anew since its first clock was wrong.
+        """Return the plant of a message; None if it has to begin, or to begin anew because its first time was wrong.
 
-        That is so where the message goes on from before the leap with which the plant began, and where that is in the
-        future of the clock on the wall, with which the message agrees.
+        The first message of a plant sets its time, by one clock only (its first leap). That was wrong if this message
+        is dated long before it and the rule of `is_taken_back_by` holds; or if the time here (`wall`) agrees with this
+        message while the plant's time is far ahead of it.
         """
         plant, longest_gap = self.plants.get(message.plant), self.fleet.options.leap
         has_other_kind_of_time = plant is not None and isinstance(message.time, datetime) != (plant.origin is not None)
@@ -280,12 +281,12 @@ class BatchIntake:
         clock, clock_time = message.node, at
         if message.arrival is not None:
             clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)
-        # The leap with which the plant began: the message takes that back if it goes on from before.
+        # Does the message contradict the leap with which the plant began (`now` is -inf: nothing came before it)?
         first, newest = find_contradicted_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
         began_with_it = first is not None and first.now == -inf and not plant.holds_rows_before(first, at, longest_gap)
         if first is not None and began_with_it and first.is_taken_back_by(clock, clock_time, newest):
             return None
-        # The clock on the wall agrees with the message, and not with the plant.
+        # Does the time here agree with the message, and not with the plant?
         if plant.origin is not None:
             now = self._time_as_number(wall, plant.origin, plant.name)
             is_plant_ahead, is_message_right = plant.confirmed > now + longest_gap, abs(at - now) <= longest_gap
@@ -294,19 +295,22 @@ class BatchIntake:
         return plant
 
     def _begin_plant(self, name: str, at: float, origin: datetime | None, leap: ClockLeap) -> PlantState:
-        """Return a new plant, whose first moment may still turn out wrong.
+        """Return a new plant that begins at the time `at`; a later message may still show that this time was wrong.
 
-        Of one that begins anew the old is ended, and its events are counted as from the future.
+        If a plant of this name exists, its clock was wrong: it ends, its events become refusals (`replaced`), and are
+        counted as from the future. `leap`: the jump in time, by one clock, with which the plant begins.
         """
         plant, old = self.fleet.begin_plant(name, at, origin), self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
+            # The store has the old plant: the new one takes over its version, also if it is restored in this batch.
             plant.version = self._anew[name] = old.version
             events = [WithdrawnEvent(*event) for row in old.rows.held for event in row.events]
             self.replaced.append((old, events))
             for node_index, sequence, time in events:
                 node = INPUTS if node_index < 0 else self.fleet.network.names[node_index]
                 plant.link_counts(node).count("future", sequence, time)
+            # Forget the old plant's state before the batch, and those of its events that were taken in this batch.
             self._before.pop(name, None)
             self._taken = [taken for taken in self._taken if taken.plant is not old]
             self.fleet.end_plant(old)

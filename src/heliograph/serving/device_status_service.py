@@ -38,13 +38,13 @@ class DeviceStatusService:
         self._service.published(outputs)
 
     def finish(self, ended: bool) -> list[Output]:
-        """Commit everything; return the last outputs."""
+        """Commit everything, also statuses of devices; return the last outputs. `ended`: no more messages can come."""
         self._keep_words()
         return self._service.finish(ended)
 
     def _keep_words(self) -> None:
-        """Store the words of devices (their last messages on whether they are online) since the last call."""
-        # If the store cannot be reached, it raises, and the words stay in `_unkept`.
+        """Store the statuses (online or offline) that devices have sent since the last call, the last of each topic."""
+        # If the store cannot be reached, it raises, and the statuses stay in `_unkept` for the next call.
         self._unkept |= self._words.pop_changed_words()
         if self._unkept:
             self._store.keep_words(self._unkept)

@@ -30,13 +30,17 @@ class EstimateWriter:
     """
 
     def __init__(self, program: NetworkProgram):
-        """Make the template of a line with the estimates of all filters of a network's program."""
+        """Make the template of a line with the estimates of all filters of a network's program.
+
+        A template is such a line with numbers of output columns in place of values. `_whole`: columns that are written
+        as whole numbers. A row fits the template if no variance is negative, no filter has a reason not to use what
+        arrived, and all estimates are finite.
+        """
         n = self._n = len(program.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
         for columns in program.filter_columns:
             self._nodes.setdefault(columns.node, []).append(columns)
-        # Columns of the outputs that decide whether the template fits: variances, reasons not to use what arrived, and
-        # all that has to be finite.
+        # Columns of the outputs that decide whether the template fits.
         claimed = [columns.covariance for columns in program.filter_columns if columns.claim != "none"]
         self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]  # the diagonal, row after row
         self._reasons = [
@@ -125,11 +129,12 @@ class EstimateWriter:
         return results | self._tabulate_innovation(columns, outputs)
 
     def _tabulate_innovation(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
-        """Return what a filter made of what arrived: nis, how many numbers it received; {} if it judges nothing.
+        """Return nis, the normalised innovation squared, and the count of numbers received; {} if there is no test.
 
-        Of one that weighs also each output's value, variance and weight, and of a measurement not used the reason.
+        If the filter weighs outputs singly, "outputs" has each one's value, variance and weight. If it did not use the
+        measurement, "implausible" is the reason. `columns`: where these are among the `outputs` of a row.
         """
-        # Normalised innovation squared: of a fusion that of what its nodes received, of a filter as it judged it.
+        # A fusion has the nis of all that its nodes received (`tested`), a filter that of its own `judgement`.
         if columns.tested is not None:
             nis, received = (outputs[column] for column in columns.tested)
             return {"nis": nis, "received": int(received) if isfinite(nis) else 0}

@@ -53,12 +53,13 @@ class NeighbourMessenger:
         ]
 
     def _find_due_rows(self, plant: PlantState) -> list[HeldRow]:
-        """Return the rows whose message is due now and was not before the recorded changes.
+        """Return the rows (steps) whose message to the neighbours became due by the changes of this batch.
 
-        It is due once the row has the node's measurement, or a row after it, which shows that this step is over.
+        A message is due once its row has the node's measurement, or once there is a later row: the step is then over.
         """
         assert self._node is not None
-        # By row with changes: whether it was measured before them.
+        # `plant.changes`: (row, what it was before the batch), where None stands for a new row. By changed row: whether
+        # it had the node's measurement before.
         measured_before: dict[int, bool] = {}
         for row, old in plant.changes:
             measured_before.setdefault(id(row), old is not None and self._has_measurement(old[1]))
@@ -74,10 +75,10 @@ class NeighbourMessenger:
         return due
 
     def _has_measurement(self, events: Iterable[tuple[int, int, float]]) -> bool:
-        """Return whether events include the node's measurement, or for a node without a sensor any message.
+        """Return whether events include the node's measurement, or for a node without a sensor any neighbour's message.
 
-        An event is (number of the sender, count, time). The node itself has number 0, and its neighbours have the
-        numbers after it.
+        Without a sensor, neighbours' messages are the first sign that a step has begun. An event is (number of the
+        sender, count, time): number 0 is the node itself, greater ones its neighbours, negative ones inputs.
         """
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)

@@ -80,12 +80,13 @@ class ForecastPublisher:
     def make_forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
         """Return the forecasts from each row, by horizon: its time, how far ahead it is, and what each filter says.
 
-        The rows of all plants are predicted side by side. A row whose horizons reach behind the last step has none. How
-        far ahead is in seconds where the messages have dates, else in the unit of their time.
+        A row holds a plant's state after its newest measurement. The rows of all plants are predicted in one call. A
+        row has no forecasts if its longest horizon is after the last step for which the network is defined. How far
+        ahead is in seconds where the messages have dates, else in the unit of their time.
         """
         results: list[list[Ahead]] = [[] for _ in rows]
         latest_time = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
-        times = [float(row.key[0]) for row in rows]
+        times = [float(row.key[0]) for row in rows]  # a row's key begins with its time
         covered = [i for i, time in enumerate(times) if time <= latest_time]  # numbers of the rows that have forecasts
         if not covered:
             return results

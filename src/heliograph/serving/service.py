@@ -75,11 +75,11 @@ class Service:
         forecast: Spans | None = None,
         thresholds: Thresholds = (),
     ):
-        """Begin with no plant in memory, whose state `store` keeps; `say` gets warnings; the class says all else."""
+        """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings."""
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
-        # Counts over all batches, and of the last one.
+        # Messages that were malformed, and that were duplicates or late, in all batches; statistics of the last batch.
         self.malformed, self.known, self.last = 0, 0, BatchStatistics()
         # What takes messages, and what makes outputs: estimates, messages to neighbours, what silence means, forecasts.
         self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
@@ -114,7 +114,7 @@ class Service:
         return outputs
 
     def resume(self) -> None:
-        """Load stored plants, up to ROWS rows, if silence of a sender has a meaning: it goes on while nothing runs."""
+        """Load stored plants, up to ROWS rows, if a sender's silence while the service did not run says something."""
         if (self.fleet.deciding and self.fleet.options.step is not None) or self.fleet.shortest_timeout < inf:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
@@ -129,14 +129,15 @@ class Service:
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
     def _take_silence(self, now: datetime) -> list[Output]:
-        """Advance plants by the clock, as no message came: commit what is final by it, and publish what silence means.
+        """Advance plants to `now` without a message: commit rows that become final, publish estimates of the present.
 
-        The estimates of silent steps are published without a commit, since they follow from it and the clock.
+        Where a sender decides when to send, its silence means that it had no reason to. Estimates of silent steps need
+        no commit: they can be computed again from the committed state and the clock.
         """
-        if self._exchange.sends:  # each of its steps is a message to the neighbours
+        if self._exchange.sends:  # a node sends to its neighbours at each step, and needs a message to make the step
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
-        # Rows that are final by the clock, and events whose clocks it shows to be wrong.
+        # Rows that become final by `now`, and withdrawn events: those that `now` shows to be dated by a wrong clock.
         due = self._silence.find_plants_due(self.plants.values(), now)  # plants, each with the step that it is by now
         for plant, step in due:
             self.fleet.advance_time(plant, step)
@@ -156,7 +157,7 @@ class Service:
             return []
 
     def _make_step_messages(self, now: datetime) -> list[Message]:
-        """Return a message for each plant in which a new step has begun; its null inputs mean that inputs stay."""
+        """Return a message for each plant in which a new step has begun, to make its row: null (unchanged) inputs."""
         unchanged: list[float | None] = [None] * self.fleet.program.given
         return [
             Message.model_construct(
@@ -235,9 +236,10 @@ class Service:
         touched = {outcome.plant.name: outcome.plant for outcome in outcomes if outcome.plant is not None}
         self._warn_of_doubts(list(touched.values()))
         entries, malformed, known = self._make_entries_on_unused(messages, payloads, outcomes)
-        # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
+        # A row is final when no later message can change it: its estimates are committed. Others are only published.
         sent = self._exchange.make_messages(touched.values())
         finalised = self.fleet.finalise_plants(touched.values())
+        # Events that were used before a clock turned out wrong, by plant: they are refused after all.
         withdrawn = [*self._intake.replaced, *((each.plant, each.withdrawn) for each in finalised)]
         entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
         entries += self._write_finals(finalised)
@@ -265,16 +267,16 @@ class Service:
     def _make_entries_on_unused(
         self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[MessageOutcome]
     ) -> tuple[list[Entry], int, int]:
-        """Return entries on messages that were not used, or not wholly; how many were malformed, and how many known.
+        """Return refusals of messages that were not used, or not wholly; how many were malformed, and how many known.
 
-        Known are duplicates, and late ones, which a store may have used before it was closed. `payloads` and `outcomes`
-        have one for each message.
+        Known are duplicates and late messages: they may have been used before a restart. `outcomes`: what became of
+        each message. `payloads`: what each was read from.
         """
         entries, malformed, known = list[Entry](), 0, 0
         for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):
             if outcome.verdict == "used" and not outcome.notes:  # as most are
                 continue
-            # Of a plant that is damaged in the store; a text is a message that could not be read, of no known plant.
+            # Its plant is damaged in the store. A message that could not be read is a text, and its plant unknown.
             damage = self._damage.get(find_plant_name(message) or "")
             if damage and not isinstance(message, str):
                 entries.append(make_refusal_of_message(message, "damaged", damage))
@@ -291,9 +293,9 @@ class Service:
         return entries, malformed, known
 
     def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
-        """Return an entry for a message that was refused, and one for each part of a message that was left out.
+        """Return a refusal for a message that was not used, and one for each part of a message that was left out.
 
-        `outcome` has a verdict other than "used" (None: unread), or notes on parts. Warn of the first implausible one.
+        `outcome.notes`: why inputs or values were left out as implausible. The first such message causes a warning.
         """
         entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
         if outcome.verdict is not None and outcome.verdict != "used":
@@ -361,20 +363,20 @@ class Service:
         return [Entry(plant.name, "final", body) for (plant, _), body in zip(rows, bodies, strict=True)]
 
     def _write_withdrawn(self, plant: PlantState, events: Iterable[WithdrawnEvent]) -> Iterator[Entry]:
-        """Yield a refusal for each event that a plant used before the event's clock turned out wrong (LEAPT)."""
+        """Yield a refusal ("future", LEAPT) of each event that was used before its clock turned out to be wrong."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             identity = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
             yield make_refusal_entry(plant.name, identity, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
-        """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""
+        """Return outputs with the estimates after these rows, forecasts from them, and the status of their senders."""
         outputs, held = [], [row for _, row in rows]
         self._silence.note_published(rows)
         forecasts = [None] * len(rows) if self._ahead is None else self._ahead.make_forecasts(held)
         bodies = self._write_estimates(b"provisional", rows)
         for (plant, _), body, horizons in zip(rows, bodies, forecasts, strict=True):
-            # Members are added before the closing brace of the line.
+            # `body` is a JSON object as bytes: members are added before its closing brace, body[:-1].
             if horizons is not None:
                 ahead = [{"time": self._time_in_messages(plant, time), "ahead": distance, "estimates": estimates}
                          for time, distance, estimates in horizons]  # fmt: skip

@@ -168,13 +168,17 @@ def _drop_ended(parts: dict[int, _ServedPart]) -> None:
 
 
 async def run_service(settings: ServiceSettings) -> None:
-    """Serve until the messages end, or until SIGTERM or SIGINT."""
+    """Serve until the messages end, or until SIGTERM or SIGINT.
+
+    `settings.parts`: into how many parts the plants are divided, of which this process serves some; None if it serves
+    all plants alone. `wrap` connects a service to the page that shows it.
+    """
     _log_to_stderr()
     async with _serve_watch_page(settings) as wrap:
         program = await _compile_steps(settings.network)
         if program is None:
             return
-        if program.uneven:
+        if program.uneven:  # filters for which one prediction over a time is not two over its halves
             what = f"predictions depend on when others are asked for: {program.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:

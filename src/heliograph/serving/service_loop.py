@@ -131,7 +131,10 @@ async def _serve_batches(
 async def _publish_in_time(
     service: BatchService, transport: Transport, outputs: Sequence[Output], ending: StoppableWork
 ) -> None:
-    """Publish outputs; what a reader does not take in the time after a stop is published after a restart."""
+    """Publish outputs and note this in the service, unless a stop comes and publishing is not done in the time left.
+
+    Then the outputs count as unpublished, and are published after a restart.
+    """
     publishing = asyncio.ensure_future(transport.publish(outputs))
     if not await ending.wait_in_time(publishing):
         publishing.cancel()

@@ -114,14 +114,17 @@ def choose_store_location(network: str, given: str | None, parts: int | None, no
 
 
 def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
-    """Return the settings of one node of a fusion between neighbours, at the topic of its name below the broker's.
+    """Return the settings of a process that serves one node of a fusion between neighbours.
+
+    It reads and writes the topic that ends in the node's name, below the topic of the whole network. Sources of other
+    nodes are left out; the length of a step in seconds (`step`) is the same for all nodes.
 
     Args:
         settings: those of the whole network.
         node: name of the node.
 
     Raises:
-        ValueError: no such node, no broker between the nodes, parts that processes share.
+        ValueError: no such node, no broker between the nodes, or plants divided into parts among processes (--parts).
     """
     if settings.broker is None or settings.parts is not None:
         raise fail("--node", "a broker between the nodes (--broker URL), and no --parts",

@@ -62,14 +62,14 @@ class SilenceWatch:
     def find_plants_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
         """Return pairs of a plant in which a new step has begun without a message, and the step's number.
 
-        There are none unless steps have a length and senders decide when to send: only then silence has a meaning.
+        There are none unless steps have a length and some senders decide when to send: only then silence informs.
         """
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
         for plant, origin in self._iterate_dated_plants(plants):
             present_step = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
-            # A step of this clock also confirms or contradicts a leap in time that no other clock has confirmed.
+            # A leap is a jump in time that only one sender's clock shows. The time here can confirm or contradict it.
             leap = plant.leap
             has_open_leap = leap is not None and leap.now > -inf and not leap.believed
             has_new_step = present_step > plant.rows.held[-1].key[0]

@@ -263,7 +263,11 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
 
 
 def _list_channel_factors(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
-    """Return the factors of M = (G, n), element ia, and of its second moments E[M_ia M_jb], element ijab."""
+    """Return the factors by which a channel z = G y + n changes with the units, of M = (G, n) and of E[M_ia M_jb].
+
+    They are q_i / r_a, entry ia, and q_i q_j / (r_a r_b), entry ijab, with q the factor of each number received, and r
+    that of each output y of the sensor, and 1 for the offset n.
+    """
     q, r = units.received, np.append(units.outputs, 1.0)
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
 

@@ -229,7 +229,8 @@ def _change_units_of_channel(channel: Channel, units: Units) -> Channel:
 def _measure_difference(a: SecondOrder, b: SecondOrder) -> float:
     """Return the largest difference of two descriptions' second moments E[M_ia M_jb], relative to their scales.
 
-    The scale of an entry of M = (G, n) is the root of its mean square. That of a product is the product of two scales.
+    The scale of an entry of M = (G, n) is the root of its mean square, and that of a product is the product of both.
+    As indices a and b may be exchanged, the moment ijab is compared with scale_ia scale_jb + scale_ib scale_ja.
     """
     moments_of_a, moments_of_b = _find_largest_moments(a), _find_largest_moments(b)
     spread, _, power, _ = moments_of_a
@@ -243,7 +244,11 @@ def _measure_difference(a: SecondOrder, b: SecondOrder) -> float:
 
 
 def _find_largest_moments(described: SecondOrder) -> list[np.ndarray]:
-    """Return the largest that spread, shift, power and nominal second moments may be, (m, m, p + 1, p + 1) each."""
+    """Return the largest values of four second moments of M = (gain, offset), entry ijab, (m, m, p + 1, p + 1) each.
+
+    They are bounds of the covariance of M (`spread`), of the square of its mean's error (`shift`), of E[M_ia M_jb]
+    (`power`), and the covariance of the nominal law. Each may be uncertain: anything within `radius` of `center`.
+    """
     quadratics = described.spread, described.shift, described.power, described.nominal
     return [np.asarray(quadratic.center + quadratic.radius) for quadratic in quadratics]
 

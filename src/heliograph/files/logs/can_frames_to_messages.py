@@ -68,12 +68,12 @@ def read_can_database(path: Path) -> Database:
 
 
 def find_words(signal: "Signal") -> dict[float, str]:
-    """Return the values of a physical quantity that stand for words, such as "SNA", with these.
+    """Return {value: word} for values of a physical quantity that are no measurement, such as "SNA" (not available).
 
-    These are values that the database names and that are beyond the signal's least or greatest value, or at the end of
-    what its bits hold: from 0xFB.. of 0xFF.. on, of a signed one the least and the greatest. What has neither a unit
-    nor a scale nor an offset counts or enumerates, and its values are numbers, whatever their names; so is a named
-    value within the range, as 0 "standstill".
+    A value stands for a word if the database names it and it is out of the signal's range, or is at the end of what
+    its bits hold: from 0xFB.. of 0xFF.. on, or for a signed signal the least and the greatest. A named value within
+    the range, such as 0 "standstill", is a measurement. So are all values of a signal without unit, scale and offset,
+    which counts or enumerates.
     """
     is_quantity = signal.unit or signal.scale != 1 or signal.offset != 0
     if not is_quantity or not signal.choices or signal.is_float:

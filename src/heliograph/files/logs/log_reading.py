@@ -105,7 +105,9 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
 
 
 def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -> list[str]:
-    """Return the units of the signals of sources.
+    """Return the units of the signals that sources read, as lines "topic.signal in unit".
+
+    Topics of a log are its messages. A topic of the sources with a wildcard (+ or #) need not be there.
 
     Raises:
         ValueError: a message or a signal that is not in the log, a signal of another unit in another log.

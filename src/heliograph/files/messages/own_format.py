@@ -147,7 +147,9 @@ class HeliographMessageReader:
 
         `components`: names of each node's values. `numbers`: whether times are numbers rather than dates, None before
         the first. `zero`: the time from which large integer times are counted. `rounded`: the first time whose distance
-        from `zero` is no exact double. `least` and `most`: the range of the times.
+        from `zero` is no exact double. `least` and `most`: the range of the times. `_numbered`: nodes whose values
+        may come without a count of lost messages. `_zoned`: whether dates have a zone, None before the first.
+        `_columns`: names of columns that were checked already.
         """
         self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}

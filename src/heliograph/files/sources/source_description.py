@@ -376,9 +376,9 @@ def _read_valid_flags(valid: object) -> Flags:
 
 
 def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:
-    """Return one number for each path, from as many or from one.
+    """Return one number (a scale or an offset) for each path in a message, from as many numbers or from a single one.
 
-    One is for values alone: what is told of these, such as covariances, gets the `neutral` number.
+    A single number applies to measured values; paths of covariances get the `neutral` number instead.
     """
     count = len(paths)
     try:

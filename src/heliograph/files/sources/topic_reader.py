@@ -149,7 +149,7 @@ class TopicReader:
         return self._sources_of_topic[topic]
 
     def take_device_word(self, topic: str, payload: object, where: str) -> bool:
-        """Note what a device says of itself, online or offline; return whether the message is such a word.
+        """Note the status that a device sends, online or offline; return whether the message is such a status.
 
         Args:
             topic: the topic of the message.
@@ -157,7 +157,7 @@ class TopicReader:
             where: place of the message, for errors.
 
         Raises:
-            ValueError: a word that is neither online nor offline; one line.
+            ValueError: a status that is neither online nor offline; one line.
         """
         return self.device_statuses.take_status_message(topic, payload, where)
 
@@ -256,8 +256,8 @@ class TopicReader:
     ) -> Reading | None:
         """Return plant, node, count and time of a message that could not be read, as a reading whose values are NaN.
 
-        None where its names cannot be read either, and where it has no count: then it tells nothing of lost messages.
-        One that was refused by its flag or count is reported without a count too. `error`: why it could not be read.
+        It serves to count lost messages. So None without a readable plant, node and running count; but a message that
+        was refused by its flag or count (`error` is a RefusedError) is returned even without a count.
         """
         sequence, is_count_absent = None, False
         try:

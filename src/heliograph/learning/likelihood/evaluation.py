@@ -35,7 +35,7 @@ class Evaluation(NamedTuple):
 
     @property
     def late(self) -> Float[np.ndarray, "points p p"]:
-        """Information of the second half, to which the initial state adds nothing."""
+        """Information of the second half of the rows alone, where the law of the initial state hardly matters."""
         return np.asarray(self.halves[:, 1])
 
     @property
@@ -194,7 +194,11 @@ def _differentiate_errors(
 
 @lru_cache
 def _find_linear_filter(objective: Objective) -> Any:
-    """Return the objective's filter, at or near its start, if it is linear with a score recursion; else None."""
+    """Return the filter of the objective if it computes the likelihood's gradient (score) itself; else None.
+
+    The linear form filters by means and covariances of gains. Its network is the description's start, or one near it
+    if a gain that is random near the start is not at the start itself.
+    """
     description, is_linear = objective.description, objective.form == "linear"
     network = choose_typical_network(description) if is_linear else description.start
     filter = make_filter_of_form(network, objective.form)

@@ -79,8 +79,8 @@ class MaximumSearch:
     def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> HighestPoint:
         """Return the highest point that climbs reach, proved to be a maximum.
 
-        Climbs begin at all starts, then at as many points around the best, then near each end of the domains. In a long
-        recording its first rows say where most of them begin; the maximum is one of all rows.
+        Climbs begin at all starts, then at as many points around the best, and near the low end of each interval. In a
+        long recording most climbs go most of the way by its first rows; the maximum is one of all rows.
 
         Args:
             starts: where to begin (starts, p); from a single one there is a single climb.
@@ -89,23 +89,23 @@ class MaximumSearch:
         no_ends = np.zeros(starts.shape[1])
         climbed = self._climb_by_first_rows(starts, no_ends, 0)
         top = self._prove_maximum(climbed)
-        self.best, ends = top._replace(converged=False, reason=""), climbed.total
+        self.best, totals = top._replace(converged=False, reason=""), climbed.total  # totals: l at each climb's end
         if len(starts) > 1:
             around = self._draw_starts_around(top, len(starts) - 1, seed)
-            # What climbs to the top joins it.
+            # The top itself is the last start, so that climbs to it join it; it is no new result, hence [:-1].
             climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, len(around))
-            ends = np.concatenate([ends, climbed.total[:-1]])
+            totals = np.concatenate([totals, climbed.total[:-1]])
             if climbed.total.max() > top.total + SAME:
                 top = self._prove_maximum(climbed)
-        self.best, self.ends = top, -np.sort(-np.nan_to_num(ends, nan=-np.inf))
+        self.best, self.ends = top, -np.sort(-np.nan_to_num(totals, nan=-np.inf))  # the highest first
         return top
 
     def _prove_maximum(self, climbed: ClimbEnds) -> HighestPoint:
-        """Return the best of some climbs once it is a maximum; numbers may be put at the ends of their domains.
+        """Return the best of some climbs, after climbing again until it is a maximum, or why after ROUNDS it is none.
 
-        It climbs again while the point is no maximum, at most ROUNDS times, and then says why it is none. A point is a
-        maximum if two conditions hold. Inside the domains, g' H^-1 g is negligible and H is not indefinite, with g the
-        gradient of the log-likelihood l and H the Hessian of -l. And l does not rise inwards from any end.
+        A point is a maximum if two conditions hold. For numbers inside their domains, g' H^-1 g is negligible and H is
+        not indefinite, with g the gradient of the log-likelihood l and H the Hessian of -l. For numbers that were put
+        at an end of their domain, l does not rise on the way back inside.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best_climb(climbed, no_ends)
@@ -120,17 +120,17 @@ class MaximumSearch:
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
     def _draw_starts_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
-        """Return `count` points drawn around a maximum, and one more near each end of a domain.
+        """Return `count` points drawn around a maximum, and one more for each number on an interval, near its low end.
 
-        Logarithms and logits are within SPREAD of it, real numbers within AWAY standard errors. A point near an end
-        lies LOWERED steps of a logarithm or logit towards it. INWARDS: distances from an end that are tried. SEEN: the
-        fall of the likelihood, in nats, from which on a number matters.
+        Logarithms and logits are drawn within SPREAD of the maximum, real numbers within AWAY standard errors. The
+        extra point of a number has its logarithm or logit lowered by LOWERED.
         """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
         with_ends = np.flatnonzero(self.surface.domains.single)
         drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(with_ends), len(top.x)))
-        # Draw a number at an end around the innermost point where the likelihood has not fallen by SEEN.
+        # A number at an end of its domain is drawn around another centre: of the distances INWARDS from the end, the
+        # last at which l has not fallen by SEEN nats.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
             _, rise = self._evaluate_inwards_of_end(top, int(index))
@@ -140,14 +140,14 @@ class MaximumSearch:
         return (self.surface.of_first_rows() or self.surface).move_to_finite_likelihood(points, top.x)
 
     def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> ClimbEnds:
-        """Return the ends of climbs as `_climb` does; in a long recording its first rows lead them most of the way.
+        """Return where climbs end, one by start; in a long recording its first rows lead them most of the way.
 
-        Starts that the first rows lead to one point climb by all rows together from there.
+        Starts whose climbs by the first rows end at the same point share one climb by all rows from there.
 
         Args:
             starts: where to begin (starts, p).
             ends: -1 or 1 where a coordinate is held at an end of its domain, else 0 (p,).
-            own: number of the start that climbs by all rows from where it is, since the first ones may know nothing of
+            own: number of the start that climbs by all rows from where it is, since the first rows may not have seen
                 what comes later.
         """
         short = self.surface.of_first_rows() if len(starts) > 1 else None
@@ -155,15 +155,18 @@ class MaximumSearch:
             return self._climb(starts, ends)
         others, x = np.arange(len(starts)) != own, starts.copy()
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
-        led = maximise_from_starts(short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True)
-        x[others] = led.x
+        short_ends = maximise_from_starts(
+            short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True
+        )
+        x[others] = short_ends.x
         # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `lanes` are the
         # starts that climb, and `lane_of_start` which of these stands for each.
-        error = short.standard_errors(led.x[led.order[0]])
+        error = short.standard_errors(short_ends.x[short_ends.order[0]])
         reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
         lanes, lane_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
         climbed = self._climb(self.surface.move_to_finite_likelihood(x[lanes], starts[own]), ends)
+        # Copy each climb's results to all starts that it stands for; `steps` is one number for all.
         by_start = {name: leaf if name == "steps" else leaf[lane_of_start] for name, leaf in climbed._asdict().items()}
         return ClimbEnds(**by_start)
 
@@ -205,19 +208,19 @@ class MaximumSearch:
         return _take_best_climb(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
-        """Return points from which to climb again if `top` is no maximum, or None, and why it is none, or "".
+        """Return (points, reason): where to climb again if `top` is no maximum, or why it is none if no points help.
 
-        A maximum has neither points nor a reason. From each end of a domain the likelihood is looked at on the way back
-        inside. At a saddle, climbs begin on both sides of it. SAME: nats that count as no rise. SADDLE: a curvature
-        below it (negative) makes a saddle. NEAR: a gain of a step by the Hessian below it counts as none.
+        A maximum gives (None, ""). SAME: nats that count as no rise. SADDLE: a curvature below it (negative) is that of
+        a saddle. NEAR: a gain of l promised by Newton's step that counts as none.
         """
+        # For each number at an end of its domain: climb again if l rises on the way back inside.
         for index in np.flatnonzero(top.ends):
             points, rise = self._evaluate_inwards_of_end(top, int(index))
             if rise.max() > SAME:
                 return points[[int(rise.argmax())]], ""
         curvature = self.surface.measure_curvature(top.x, top.active)
         if curvature.least < SADDLE:
-            return top.x + np.array([[1.0], [-1.0]]) * curvature.direction, ""
+            return top.x + np.array([[1.0], [-1.0]]) * curvature.direction, ""  # on both sides of the saddle
         if not curvature.gain < NEAR:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
@@ -225,9 +228,8 @@ class MaximumSearch:
     def _explain_unbounded(self, top: HighestPoint) -> str:
         """Return a sentence if the likelihood has no maximum because the network reproduces the data exactly, else "".
 
-        A climb may still end there, where only rounding is left. The log-likelihood of each number is about -log of the
-        size of its innovation. EXACTLY: log(size of the data / size of innovations) above which innovations are
-        rounding.
+        l then grows for ever as variances fall, but a climb ends where innovations are rounding. l per number of data
+        is about -log |innovation|, so l + log |data| is about log(|data| / |innovation|): above EXACTLY it is rounding.
         """
         data = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         log_likelihood_of_number = top.total / np.count_nonzero(~np.isnan(data))

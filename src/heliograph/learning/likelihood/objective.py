@@ -172,7 +172,8 @@ def _reuse_equal_objective(objective: Objective) -> Objective:
 def choose_typical_network(description: Description) -> Network:
     """Return the network at its start, or near it if a gain is random there but not at the start itself.
 
-    A gain is so if its spread is free and starts at 0, as that of two free gains which start equal.
+    A gain is random only near the start if its variance is free and starts at 0: for instance a gain that is one of
+    two free values which start equal.
     """
     start = description.start
     if _has_random_gain(start) or not _has_random_gain(description.near_start):
@@ -181,7 +182,10 @@ def choose_typical_network(description: Description) -> Network:
 
 
 def _has_random_gain(network: Network) -> bool:
-    """Return whether what all nodes receive together depends on the signal through a random gain."""
+    """Return whether the channel from sensor to all nodes together has a gain with a variance, at its first step.
+
+    Channels with a memory, and gains that the receiver knows, do not count: no average over gains is needed there.
+    """
     link = first(join_all_nodes(network)[-1])
     return not (link.remembers or link.past or link.has_known_gain) and has_random_gain(link, second_order(link))
 

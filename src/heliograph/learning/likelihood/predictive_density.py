@@ -176,9 +176,10 @@ class ChannelDensities(tuple[StackPartDensity, ...]):
 
     @staticmethod
     def of(channel: AbstractRandomAffine, nodes: int) -> "ChannelDensities":
-        """Return a channel as combinations of gains for each of its parts, each gain's law taken as `nodes` values.
+        """Return the densities of a channel whose laws of gains are replaced by `nodes` support points each.
 
-        A stack has several parts; any other channel is one part.
+        Independent channels in parallel (a stack) stay apart; each has all combinations of its gains' support points,
+        with their probabilities.
         """
         parts = channel.in_parallel
         return ChannelDensities(_stack_combinations(discretise_laws(affine, nodes).list_atoms()) for affine in parts)

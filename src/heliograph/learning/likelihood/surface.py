@@ -50,7 +50,8 @@ class LikelihoodSurface:
     def domains(self) -> OpenEnds:
         """Return which coordinates end at minus infinity (`low`) and at infinity (`high`): logarithms and logits.
 
-        `single`: which of these belong to a number of an interval.
+        A coordinate is a free number, or its logarithm or logit if its domain has ends. `single`: which coordinates are
+        of a number on an interval, and not an entry of a covariance or a law that has several coordinates.
         """
         every = self.objective.description.parameters.every
         low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))

@@ -57,7 +57,7 @@ class OpenEnds(NamedTuple):
 
     @property
     def free(self) -> Bool[np.ndarray, " p"]:
-        """Coordinates that are real numbers, without an end and without a scale of their own."""
+        """Coordinates that are real numbers (no logarithm or logit): they end nowhere, and their scale is unknown."""
         return np.asarray(~(self.low | self.high))
 
 
@@ -291,27 +291,27 @@ def _accept_or_reject_steps(
 
 
 def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
-    """Return the state in which each lane a is ended that climbs to the same top as a higher lane b: b is enough.
+    """Return the state in which each lane (climb) a is ended that goes to the same top as a higher lane b.
 
-    Both are within JOINED standard errors of a top and of each other, by the information I of either, and neighbours in
-    every logarithm and logit. There is no saddle on the way d from a to b: the log-likelihood rises by what the
-    gradients g at both ends say, (g_a + g_b)' d / 2, as a quadratic does, and bends down by (g_a - g_b)' d, which is at
-    least BENT of d' I d. `moving`: coordinates that move (lanes, p).
+    Both are within JOINED standard errors of a top and of each other, by the information I of either, and less than
+    NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b - x_a, the log-likelihood l is concave:
+    l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and (g_a - g_b)' d >= BENT d' I d. `moving`:
+    coordinates that move (lanes, p).
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)
     # d' I d: the greater of those by the information of a and of b; `squared` is [c, a, b], by that of lane c.
     squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
     distance = np.maximum(squared[lanes, lanes, :], squared[lanes, :, lanes].T)
-    # Gain and bend on the way from a to b, [a, b].
+    # [a, b]: l_b - l_a; what it is of a quadratic; and the fall of the slope, (g_a - g_b)' d.
     gain = state.total[None] - state.total[:, None]
-    foretold = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
-    bend = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
-    # Both are within JOINED standard errors of a top (2 * remaining is the square of how far), and it is the same one.
-    near_top = (2 * state.remaining < JOINED**2) & (state.joined == lanes)
+    gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
+    slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
+    near_top = (2 * state.remaining < JOINED**2) & (state.joined == lanes)  # 2 * remaining: distance squared
     neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
     neighbours &= np.all(moving[:, None] == moving[None], axis=2)
-    no_saddle = (np.abs(gain - foretold) <= ALIKE * gain + NOISE * np.abs(state.total)) & (bend >= BENT * distance)
+    is_quadratic = np.abs(gain - gain_of_quadratic) <= ALIKE * gain + NOISE * np.abs(state.total)
+    no_saddle = is_quadratic & (slope_fall >= BENT * distance)
     same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
     # [a, b] is true where b goes on: the higher one, of two that are as high the first.
     is_higher = same_top & ((gain > 0) | ((gain == 0) & (lanes[None] < lanes[:, None])))

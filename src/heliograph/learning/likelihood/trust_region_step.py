@@ -136,8 +136,9 @@ def expected_gain(
 def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each coordinate's standard error if all others were known (lanes, p), and the flat directions.
 
-    A flat direction has no information. Directions are columns (lanes, p, p) in units of the errors; all other columns
-    are zeros. Errors are 0 for coordinates that are not `moving`.
+    Each lane is a point with its `information` I (lanes, p, p); the errors are 1 / sqrt(I_ii), or 0 of coordinates that
+    are not `moving`. A flat direction is an eigenvector of I_ij / sqrt(I_ii I_jj) without information, eigenvalue <=
+    FLAT. It is a column of the result (lanes, p, p), in units of the errors; the columns of other eigenvectors are 0.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     # Information below LEAST counts as none, since its square would underflow.

@@ -40,11 +40,15 @@ class HiddenModeLosses(AbstractLossLaw):
     def fit(fates: object, intervals: bool = True) -> "HiddenModeLosses":
         """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
 
+        Args:
+            fates: a stretch of packets, 0 (arrived), 1 (lost) or NaN (unknown), or several.
+            intervals: whether to compute the intervals; their ends are NaN otherwise.
+
         Raises:
             ValueError: what is no fates.
         """
         stretches = check_fates(fates)
-        # Of stretches that were chosen for ends that arrived: log P(fates) - log P(ends arrive).
+        # A stretch cut where packets arrived (its ends are CHOSEN) counts as log P(fates) - log P(both ends arrive).
         chosen = [keep_ends_only(fate) for fate in stretches if fate[-1] == CHOSEN]
         whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
 

@@ -257,15 +257,17 @@ class RunningRateLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        parts = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
-        trials, parts = [find_trials(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
+        # Packets of unknown fate are left out. Ends at which a stretch was cut because they arrived are no trials, and
+        # become 0 (arrived), so that the law of the packets after them knows it.
+        known = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
+        trials, stretches = [find_trials(stretch) for stretch in known], [fill_ends(stretch) for stretch in known]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
             # The derivative of a share p by its logit is p (1 - p).
             share = expit(x)
             total, gradient = 0.0, np.zeros(len(x))
-            for stretch, trial_mask in zip(parts, trials, strict=True):
+            for stretch, trial_mask in zip(stretches, trials, strict=True):
                 value, slope = _sum_log_probabilities(stretch, _predict_losses(stretch, *share), trial_mask)
                 total, gradient = total + value, gradient + slope
             return total, gradient * share * (1 - share)
@@ -304,9 +306,10 @@ def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> t
 def _sum_log_probabilities(
     lost: Packets, predictions: tuple[Packets, Packets], trials: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Return the log-likelihood of the fates `lost` at `trials`, and its gradient by base, weight and step (3,).
+    """Return l = sum log P(fate) over the `trials`, and its gradient by the law's three numbers (3,).
 
-    `predictions`: P(lost) of each packet, and its derivatives (3, packets).
+    They are base, weight and step. `lost`: 1 of a lost packet, 0 of one that arrived. `predictions`: p = P(lost) of
+    each packet, and its derivatives by the three (3, packets). dl/dp = (lost - p) / (p (1 - p)).
     """
     p, slope = predictions
     p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are finite

@@ -48,8 +48,8 @@ class AbstractLossLaw(Module):
     def log_likelihoods(self, fates: object) -> Packets:
         """Return log P(fate | those before) of each packet of all stretches; NaN where the fate is unknown.
 
-        A stretch may have been cut to end with an arrival: its last packet has log P(arrived | those before) - log
-        P(arrived | the first).
+        A stretch may have been cut where packets arrived. Its likelihood is then P(fates) / P(last arrives | first
+        arrived), since its end says nothing; the last packet's entry is reduced by the logarithm of that probability.
 
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
@@ -59,9 +59,9 @@ class AbstractLossLaw(Module):
     def _score_stretch(self, fate: Packets) -> Packets:
         """Return log P(fate | earlier fates) of each packet of a stretch (packets,), or NaN if the fate is unknown.
 
-        A stretch may have been chosen because its ends arrived; its last fate is then CHOSEN. Its last entry becomes
-        log P(arrived | earlier fates) - log P(arrived | first fate), so that the sum is the log-likelihood given both
-        ends.
+        A stretch that was cut where packets arrived has CHOSEN as its first and last fate. Its last entry becomes
+        log P(last arrived | all earlier fates) - log P(last arrived | first arrived), so that the sum of entries is the
+        log-likelihood given that both ends arrived.
         """
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
@@ -128,9 +128,14 @@ class MarkovLosses(AbstractLossLaw):
     def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
         """Return the law from counts over packets whose last `order` fates are known.
 
-        A stretch may have been cut so that it begins and ends with an arrival. For order 1 the likelihood is then taken
-        given that the end arrives: the shares maximise it, and intervals come from its profile. For higher orders only
-        packets between the ends are counted.
+        A stretch may have been cut where packets arrived: its ends say nothing of losses. For order 1 the probabilities
+        then maximise P(fates) / P(the end arrives | the first arrived), and intervals come from the profile of that.
+        For higher orders only the packets between the ends are counted.
+
+        Args:
+            fates: a stretch of packets, 0 (arrived), 1 (lost) or NaN (unknown), or several.
+            order: how many of the last fates the probability of a loss depends on.
+            intervals: whether to compute the intervals of a likelihood given the ends.
 
         Raises:
             ValueError: an argument that is no fates, or an order that is not from 1 to 12.
@@ -141,8 +146,8 @@ class MarkovLosses(AbstractLossLaw):
         stretches = check_fates(fates)
         for stretch in stretches:
             past, length = _number_last_fates(fill_ends(stretch), order)
-            # For order 1 the likelihood is taken given the end, so that the step to the end counts too. `np.add.at`
-            # counts a past each time that it comes.
+            # For order 1 P(fates) has the step to the end as a factor, so it is counted too; P(the end arrives) is
+            # divided out below. `np.add.at` counts a past each time that it comes.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
         spans = _measure_spans(stretches)
@@ -196,9 +201,10 @@ class MarkovLosses(AbstractLossLaw):
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds.
+        """Return the link with these losses: a Markov chain whose modes are the fates of the last `order` packets.
 
-        A lost packet is an `erasure` that nothing passes. `counts`: (arrived, lost) after each past.
+        A mode whose last packet was lost lets nothing pass (an `erasure` that arrives with probability 0). P(lost |
+        past) is the share of losses in `counts`, (arrived, lost) after each past, or 1/2 of a past never seen.
         """
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
@@ -207,7 +213,7 @@ class MarkovLosses(AbstractLossLaw):
         # P(lost | past) for each past, a number whose bits are the last fates, the latest one lowest.
         total = self.counts.sum(axis=1)
         p = np.where(total > 0, self.counts[:, 1], 0.5) / np.where(total > 0, total, 1.0)
-        # The next past has the new fate as its lowest bit, and drops the oldest.
+        # The next past is the old one shifted left by a bit: the new fate becomes its lowest bit, the oldest drops out.
         pasts = np.arange(len(p))
         transition = np.zeros((len(p), len(p)))
         transition[pasts, (pasts << 1) & (len(p) - 1)] += 1 - p
@@ -221,10 +227,11 @@ def _measure_spans(parts: Fates) -> np.ndarray:
 
 
 def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
-    """Return the Markov law of order 1 that is most likely if each stretch was chosen for ending with an arrival.
+    """Return the Markov law of order 1 that is most likely given that each stretch was cut where packets arrived.
 
-    Its `counts` have the shares of the maximum, not those that were counted: after either fate as many packets as would
-    tell its share p as well if all were trials, n = 1 / (p (1 - p) Var(logit p)), at most those that were counted.
+    The law's `counts` are equivalent ones. After either fate they are n p and n (1 - p), with p the most likely
+    probability and n = 1 / (p (1 - p) Var(logit p)), the number of plain trials that have this variance (at most the
+    number of packets counted).
 
     Args:
         counts: (arrived, lost) after an arrival and after a loss (2, 2).
@@ -264,22 +271,22 @@ class _LikelihoodBetweenEnds(NamedTuple):
         """Return l = sum n log p - sum_spans log P_m, and its gradient (2,), at the logits x (2,) of (a, b).
 
         a = P(lost | arrived before) and b = P(arrived | lost before). n are the `counts` of arrivals and losses after
-        either fate, and p their probabilities. m are the `spans`, the steps from first to last packet of stretches cut
-        at arrivals. P_m = (b + a (1 - a - b)^m) / (a + b), the probability to arrive after m steps, is divided out,
-        because stretches end there since it arrived.
+        either fate, and p their probabilities 1 - a, a, b, 1 - b. A stretch cut at two arrivals m steps apart (`spans`)
+        is likely given its ends: P(fates) / P_m, with P_m = (b + a (1 - a - b)^m) / (a + b) the probability that the
+        chain is in arrival m steps after an arrival.
         """
         a, b = shares = 1 / (1 + np.exp(-x))
-        # P_m = again / total. The derivative of power = (1 - a - b)^m by a, and by b, is `slope`.
-        kept = 1 - a - b
-        power, slope = kept**self.spans, -self.spans * kept ** (self.spans - 1.0)
-        again, total = b + a * power, a + b
-        by_a = (power + a * slope) / again - 1 / total  # d log P_m / da
-        by_b = (1 + a * slope) / again - 1 / total  # d log P_m / db
+        # P_m = numerator / total. The derivative of power = (1 - a - b)^m by a, and by b, is `slope`.
+        eigenvalue = 1 - a - b
+        power, slope = eigenvalue**self.spans, -self.spans * eigenvalue ** (self.spans - 1.0)
+        numerator, total = b + a * power, a + b
+        by_a = (power + a * slope) / numerator - 1 / total  # d log P_m / da
+        by_b = (1 + a * slope) / numerator - 1 / total  # d log P_m / db
         (stayed, failed), (recovered, lost) = self.counts
         value = stayed * np.log1p(-a) + failed * np.log(a) + recovered * np.log(b) + lost * np.log1p(-b)
         score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
         # The derivative by a logit has the factor dp / d logit p = p (1 - p).
-        return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
+        return float(value - np.sum(np.log(numerator / total))), score * shares * (1 - shares)
 
 
 def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:

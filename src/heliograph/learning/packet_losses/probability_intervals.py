@@ -47,7 +47,7 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 
     The profile of a share is the log-likelihood with this share held, maximised over the others. Its interval ends
     where the profile has fallen by FALL (1.92, for 95 %). The ends are NaN unless `intervals` is True. A share at 0 or
-    at 1 has one open side, and FALL_AT_END counts on the other.
+    at 1 is itself one end of its interval; the other end is where the profile has fallen by FALL_AT_END.
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]

@@ -39,12 +39,15 @@ class JudgementReader:
     """
 
     def __init__(self, fleet: Fleet):
-        """Find among the outputs of the fleet's filters the columns of their judgements on each node's events."""
+        """Find, for each node, the columns of a row's outputs that say whether its events were plausible.
+
+        These are judgements by the node's own filters. Events of nodes without a filter are judged by central ones.
+        """
         self.fleet, all_columns = fleet, fleet.program.filter_columns
-        # Columns of the judgements among a row's outputs, (filter, part): of all filters, and of the central ones.
+        # Columns (filter, field of `Judgement`) of all filters, and of the central ones.
         self._all_columns = _find_judgement_columns(all_columns)
         central = _find_judgement_columns([each for each in all_columns if each.node == Network.FUSED])
-        # By index of a node those on it; the nodes without a filter of their own, whose events central filters judge.
+        # By index of a node: the columns of judgements on its events, and whether central filters make them.
         self._judgement_columns, self._judged_centrally = dict[int, np.ndarray](), set[int]()
         for index, name in enumerate(fleet.network.names):
             of_node = [each for each in all_columns if each.node == name and _takes_measurements(fleet, each)]
@@ -152,7 +155,7 @@ class JudgementReader:
         return ""
 
     def _find_row_before(self, candidate: CandidateEvent) -> HeldRow:
-        """Return the row before the candidate's; there is one, since the first that is held takes no event."""
+        """Return the row before the candidate's: there is one, since the first row of a plant never takes an event."""
         rows = candidate.plant.rows
         return rows.held[rows.find_index(candidate.row.key) - 1]
 
@@ -212,7 +215,7 @@ def _find_largest_number(event: CheckedEvent) -> float:
 
 
 def _find_judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
-    """Return the columns of the judgements of these filters, of shape (filter, part)."""
+    """Return the columns of these filters' judgements on what they received (filter, field of `Judgement`)."""
     results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
 
@@ -242,7 +245,7 @@ class AngleWatch:
 
     def find_new(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
         """Return (name of the plant, line) for each angle whose doubt shows in a newest row for the first time."""
-        # Of which all has been said is watched no longer.
+        # `angles.states` and `angles.received` lose each angle that was reported: a filter without any needs no watch.
         self._states = [watched for watched in self._states if watched.angles.states]
         self._received = [watched for watched in self._received if watched.angles.received]
         if not self._states and not self._received:
@@ -322,6 +325,6 @@ def find_filter_of_columns(fleet: Fleet, columns: FilterColumns) -> AbstractFilt
 
 
 def _takes_measurements(fleet: Fleet, output: FilterColumns) -> bool:
-    """Return whether these columns are of a filter of the node that takes measurements itself."""
-    filter = fleet.network.nodes[output.node].filters.get(output.filter)  # a fusion between neighbours is none
+    """Return whether a column belongs to a filter of measurements, and not to a fusion of neighbours' estimates."""
+    filter = fleet.network.nodes[output.node].filters.get(output.filter)  # None of a fusion
     return filter is not None and bool(filter.received)

@@ -92,9 +92,10 @@ class LinkCounts:
         return sum(self.repeats.found)
 
     def count_timeout(self, time: float, begun: float, timeout: float) -> None:
-        """Count the silence that a message of `time` ends if it is longer than the timeout of its node.
+        """Count the silence that ends with a message of `time`, if it was longer than the timeout of its node.
 
-        `begun`: since when the node is silent that has not sent yet. It comes before `count` of the message.
+        `begun`: when the silence began if the node has sent nothing before. Call this before `count`, which moves
+        `latest`, the time of the newest measurement used, to this message.
         """
         self.timeouts += time - (self.latest if self.used else begun) > timeout
 
@@ -170,10 +171,10 @@ class LinkCounts:
         return self.newest - behind if behind <= min(GAP, self.newest) else sequence
 
     def count_withdrawn(self, count: int, before: Moments | None) -> None:
-        """Recount `count` used messages, whose clock was wrong, as messages from the future.
+        """Move `count` messages from the used ones to those from the future, as their clock turned out wrong.
 
-        `at` is the time of the measurement with the greatest running count, and `latest` that of the newest one used.
-        `before` holds both as they were before these messages, None if they were the node's first.
+        Also restore `at`, the time of the measurement with the greatest running count, and `latest`, the time of the
+        newest one used. `before`: both before these messages; None if they were the node's first.
         """
         self.at, self.latest = before or (0.0, -1.0)
         self.used, self.future = max(self.used - count, 0), self.future + count

@@ -115,9 +115,10 @@ class SilenceRule(NamedTuple):
     def find_status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
         """Return the sender's status, from the times of its newest value (`last`), of the newest final row, and of now.
 
-        Before its first value (`last` is None) the sender is silent since `begun`. If it has a trigger, all times are
-        steps. `silent` is its silence up to `final`. `provisional` is its silence since then, which a late value may
-        still end.
+        Before its first value (`last` is None) the sender is silent since `begun`. `silent` is its silence up to
+        `final`, which no late value can change. `provisional` is its silence from `final` to `now`, in which a late
+        value may still arrive. With a trigger (it decides when to send) all times are steps, and `missed` counts the
+        heartbeats (values due after a longest time) that did not come; `chance` is P(all of them were lost).
         """
         silence_begin = begun if last is None else last
         silent, provisional = max(final - silence_begin, 0), max(now - max(final, silence_begin), 0)

@@ -65,7 +65,11 @@ class RepeatWatch:
 
     @staticmethod
     def for_node(node: object) -> "RepeatWatch | None":
-        """Return the watch for a node's readings; None if it refuses stuck values, or if its sender decides."""
+        """Return the watch for runs of equal readings of a node; None where it has nothing to say.
+
+        That is if the node already refuses stuck values by its limits, or if a trigger or an encoder decides what is
+        sent, so that equal readings are normal.
+        """
         if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
             return None
         refuses = node.limits is not None and node.limits.stuck is not None

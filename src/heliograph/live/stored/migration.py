@@ -109,7 +109,7 @@ class _ColumnCounter:
 def _number_state_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str, list[Any]]], int]:
     """Return {name of filter: {path of a part: [shape, first column, end]}}, and how many columns the states have.
 
-    `covariances`: as before version 0.3.0, when states held covariances.
+    `covariances`: as before version 0.3.0, when states held covariances. A part is one array of a filter's state.
     """
     network, flat, counter = fleet.network, fleet.pool.step_rows.state, _ColumnCounter(covariances)
     # A row's state has the filters of nodes by kind, the central ones by name, then what fusions remember.
@@ -241,10 +241,10 @@ class PlantMigration:
         return int(old["state"] + old["outputs"] + 2 * old["given"] + sum(old["nodes"].values()) + 2)
 
     def _select_rows(self, parts: PlantParts, index_here: Mapping[int, int]) -> list["_MovedRow"]:
-        """Return the rows that stay, in the order of their keys here; rows of nodes that are gone are left out.
+        """Return the rows of a stored plant to keep, in the order of their keys in this network.
 
-        The base always stays, and so does a row from before a leap, which stands before it. `index_here` maps a node's
-        index in the other network to its index in this one; -1 stands for the inputs.
+        Rows of nodes that this network lacks are left out. The first row (the base of all later ones) stays, and so
+        does one before it, held until a jump of a clock is confirmed. `index_here`: {index in the old network: here}.
         """
         joint, always_kept = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
         rows = []
@@ -294,9 +294,9 @@ class PlantMigration:
         return translated
 
     def _translate_states(self, table: np.ndarray) -> np.ndarray:
-        """Return the states (row, column here) of rows of the other network's table (row, column there).
+        """Return the states (rows, columns of this network) of rows of the old network's table (rows, old columns).
 
-        A filter with a counterpart there has the state that this had; any other begins with the initial law.
+        A filter that the old network had too keeps its state; any other begins with the initial law.
         """
         states = np.tile(self.fleet.pool.step_rows.start, (len(table), 1))
         filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]

@@ -45,9 +45,11 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
 
 
 def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the parts of a readable state under the paths `new`; shapes may have leading axes for several states.
+    """Return the parts of an older state by their paths in the present layout, `new`.
 
-    A covariance is factorised if `new` has its factors instead: LOWER (L below the diagonal) and VARIANCES (D).
+    `parts`: arrays by old path, with leading axes if there are several states; `can_read_layout` must hold. A
+    covariance P = L D L' is factorised if `new` has its factors: L below the diagonal (path with the ending LOWER) and
+    D (VARIANCES).
     """
     results, old_paths = dict(parts), _trace_paths(parts, new)
     for stem in _find_factored(parts, old_paths.values()):
@@ -96,15 +98,15 @@ class _LostFlag(NamedTuple):
 def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     """Return the columns of a row's states with the true columns of each boolean part (flag).
 
-    Versions before 0.3.0 wrote the flag's value, 0 or 1, in place of its first column. The parts of a filter stand in
-    their order, and the same part of filters that share a program side by side: so flags stand in the columns that no
-    other part has, in the order of the parts before them.
+    Versions before 0.3.0 wrote a flag's value, 0 or 1, in place of its first column. Each column belongs to one part
+    only, so that flags have the columns that are left over. The parts of a filter stand in their order: the flag after
+    the earliest part has the first free columns, and so on.
     """
     placed = {name: {path: _StatePart(*part) for path, part in parts.items()} for name, parts in filters.items()}
     taken: set[int] = set()
     found = [_take_columns(list(parts.values()), 0, taken) for parts in placed.values()]
     lost = [each for each in found if each is not None]
-    # The flag behind the earliest part stands in the first free column.
+    # `lost`: the first flag of each filter that is not placed yet. Placing one shows the next of its filter.
     while lost:
         first = min(lost, key=lambda each: each.end_before)
         lost.remove(first)
@@ -122,10 +124,9 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
 def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFlag | None:
     """Add the columns of a filter's parts to `taken`, up to the first flag; return that flag, or None without one.
 
-    A flag is a boolean part. Old versions wrote its value, 0 or 1, instead of the number of its first column, so that
-    its columns are lost. Example: the first columns of four parts are written as 0, 4, 1, 7, and the third is a flag
-    with the value 1. The columns of the first two are added. So are those of the last part, since it begins after the
-    end of the second.
+    A flag is a boolean part, of which old versions wrote the value, 0 or 1, instead of its first column. Example: four
+    parts have the first columns 0, 4, 1, 7 as written. The third begins before the end of the second, so it is a flag.
+    The columns of the other three are added: those of the fourth too, as 7 is after the second part's end.
 
     Args:
         parts: the parts of one filter, in their order.
@@ -147,9 +148,10 @@ def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFl
 
 
 def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
-    """Return whether a part is a flag whose columns are lost: its value, 0 or 1, stands for its first column.
+    """Return whether a part is a flag (boolean) whose first column old versions did not write.
 
-    Only such a part begins before the `end` of the previous part or, if it is the filter's first (`end` is 0), at a
+    They wrote its value, 0 or 1, in place of the column (`part.first`). Parts stand one after another, so that such a
+    number is less than the `end` of the part before. For the filter's first part (`end` is 0) it is the number of a
     column that another filter has `taken`.
     """
     if not part.columns:
@@ -179,9 +181,12 @@ def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _trace_paths(old: Iterable[str], new: Iterable[str]) -> dict[str, str]:
-    """Return {path of a part now: its path in an older state}: the same path, or that outside its nested Gaussian."""
-    there = set(old)
-    return {path: path if path in there else _flatten_path(path) for path in new}
+    """Return {path of a part now: its path in an older state}.
+
+    It is the same path, or the path without NESTED: older states held the parts of a Gaussian without nesting.
+    """
+    old_paths = set(old)
+    return {path: path if path in old_paths else _flatten_path(path) for path in new}
 
 
 def _flatten_path(path: str) -> str:

@@ -48,10 +48,12 @@ class PlantParts(NamedTuple):
     def from_bytes(data: bytes, width: int) -> "PlantParts":
         """Read the parts from bytes, of rows with `width` numbers; raise ValueError if these have another width.
 
-        HEAD: the lengths; TYPES: type of the numbers of each array; TABLE: index of the table among these, of
-        which only the numbers that are not zero are stored if the head says how many (KEPT).
+        The bytes begin with four lengths (HEAD): of the head in bytes, and the numbers of rows, events and values. The
+        head follows as JSON, and then five arrays with numbers of the TYPES. Of the array TABLE only the numbers that
+        are not zero are stored if the head says how many (KEPT).
         """
         length, rows, events, numbers = HEAD.unpack_from(data)
+        # Node and step of each row; row, node and count of each event; the table; the events' times; their values.
         head, at, arrays = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length, list[np.ndarray]()
         shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
         for number, (kind, shape) in enumerate(zip(TYPES, shapes, strict=True)):
@@ -67,7 +69,11 @@ class PlantParts(NamedTuple):
 
 
 def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
-    """Return a plant as bytes, which `unpack_plant` reads; it must have no changes that could still be undone."""
+    """Return a plant as bytes, which `unpack_plant` reads; it must have no changes that could still be undone.
+
+    The head has its times, counts and newest leap (jump of a clock). The arrays have its rows, one for each time or
+    event whose state is held, and the events in them.
+    """
     head = {
         "now": plant.now,
         "forced": plant.forced,
@@ -77,7 +83,7 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
         "leap": None if plant.leap is None else _pack_leap(plant.leap),
         BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
     }
-    # The row kept from before a leap stands first, where there is one.
+    # First the row from before a leap, where one is held in case that the leap is undone (`kept`); then all others.
     rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
     # Whole numbers, one after another: (node, sequence) of each row, and (number of the row, node, sequence) of each
     # event. Their times are no whole numbers, and stand apart; the time of a row is in the table.
@@ -127,10 +133,14 @@ def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarra
 
 
 def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
-    """Return the plant `name` from what `pack_plant` returned, with its rows in new slots of the fleet's table."""
+    """Return the plant `name` from what `pack_plant` returned, with its rows in new slots of the fleet's table.
+
+    A row is the state at one time. The base is the first row that can still be followed by late events.
+    """
     parts = PlantParts.from_bytes(data, fleet.pool.table.shape[1])
     head, rows = parts.head, _make_rows_with_events(parts, fleet)
-    # Where the head says when the last moment before a leap was, the first row is the one kept from before it.
+    # If the plant was stored after a leap (a jump of a clock) that may still be undone, its first row is the one before
+    # the leap, and the head has the newest arrival before it.
     moment_before = head.get(BEFORE_LEAP)
     kept = None if moment_before is None else RowBeforeLeap(rows.pop(0), moment_before)
     base = rows[0]
@@ -170,9 +180,10 @@ def _pack_leap(leap: ClockLeap) -> dict[str, Any]:
 
 
 def _unpack_leap(packed: Any) -> ClockLeap:
-    """Return the leap in time that `_pack_leap` packed as a dictionary of its fields.
+    """Return the leap (jump in time by one clock) that `_pack_leap` packed as a dictionary of its fields.
 
-    Versions up to 0.3.0 wrote a list: its time, the arrival before it, and five numbers of each node.
+    Versions up to 0.3.0 wrote a list: its time, the newest arrival before it (`now`), and five numbers of each node, of
+    which the third and fifth are times: of the greatest count (`at`), and of the newest measurement (`latest`).
     """
     if isinstance(packed, list):
         time, now, links = packed

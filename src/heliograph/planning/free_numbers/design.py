@@ -113,19 +113,22 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
 def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
     """Return the error for limits that no start meets: it names the least error within them, or the least power.
 
-    `begin`: the starts that were tried. A programme's `size` is its value at its start, here the least that was found.
+    `begin`: the starts that were tried. A programme's `size` is the minimised number at its start, here at the best
+    point that a search found.
     """
     starts, sharpest = len(begin), problem.sharpnesses[-1]
-    # The target error may be what cannot be met: the least error within the limits of power.
+    # If the limits of power can be met, the target error cannot: find the least error within them.
     if limits.target is not None:
         no_target = limits._replace(target=None)
         best = search_from_starts(problem, no_target, begin)
         if best is not None:
+            # Without a target a programme minimises the error, so its value at a start is an error.
             error = ScaledProgramme(problem, no_target, sharpest, best).size
             return fail(
                 "target error", f"at least {error:.6g}, the least found from {starts} starts", f"{limits.target:.6g}"
             )
-    # Else it is the power: the least total without limits of it (a target of infinity makes the power the value).
+    # Else the limits of power cannot be met: find the least total power. With a target a programme minimises the power,
+    # and an infinite target is met by all points.
     no_limit = PowerAndErrorLimits(rows=limits.rows[:0], most=limits.most[:0], target=np.inf, steps=limits.steps)
     best = search_from_starts(problem, no_limit, begin)
     power = np.inf if best is None else ScaledProgramme(problem, no_limit, sharpest, best).size

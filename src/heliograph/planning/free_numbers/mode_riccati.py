@@ -82,9 +82,9 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
 def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
     """Return X (steps, modes, n, n) and the best gains K (steps, modes, n, m) for steps that repeat for ever.
 
-    X_k,i = E[e e' 1{mode i}] is the error covariance after step k, split by mode.
+    X_k,i = E[e e' 1{mode i}] is the covariance of the error e after step k in mode i, times the mode's probability.
     """
-    # The recursion, until its gains stabilise the error; it begins without any error but the plant's noise.
+    # Iterate the Riccati recursion until its gains stabilise the error; X begins as pi Q, the plant's noise alone.
     last = m.law[-1, :, None, None] * m.process[-1]
     for _ in range(PLAIN):
         parts, gains = _run_riccati(m, last)
@@ -94,9 +94,10 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
             break
     # Policy iteration: X of these gains by a linear equation around the period, then the best gains for X.
     for _ in range(POLICIES):
-        before, parts = parts, _close_loop(m, gains).steady()
-        if np.abs(parts - before).max() <= CONVERGED * np.abs(parts).max():
+        previous, parts = parts, _close_loop(m, gains).steady()
+        if np.abs(parts - previous).max() <= CONVERGED * np.abs(parts).max():
             break
+        # The gains of step k follow from X after the step before it (the period's last for k = 0).
         gains = np.array([_update_riccati(m, k, parts[k - 1])[0] for k in range(len(parts))])
     return parts, gains
 
@@ -131,24 +132,28 @@ def _update_riccati(m: ModeSystem, k: int, X: Float[np.ndarray, "_ n n"]) -> tup
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
     """Return the recursion of X under given gains K, X_j = sum_i T_ij F_j X_i F_j' + S_j, with T the chain of modes.
 
-    F = (I - K H) A and S = pi [(I - K H) Q (I - K H)' + K N K'], with pi (`m.law`) the probability of each mode, and Q
-    and N the covariances of process and measurement noise.
+    X_j = E[e e' 1{mode j}] is the covariance of the error e times the probability of mode j. F = (I - K H) A and
+    S = pi [(I - K H) Q (I - K H)' + K N K'], with pi (`m.law`) the probability of each mode, H (`m.output`), and Q and
+    N the covariances of process and measurement noise. All are by step; K, H, N, F and S also by mode.
     """
-    K, law = gains, m.law[:, :, None, None]  # K (steps, modes, n, m), law: pi
-    I_KH = np.eye(K.shape[2]) - K @ m.output
+    K, law = gains, m.law[:, :, None, None]  # K (steps, modes, n, m); law: pi (steps, modes, 1, 1)
+    I_KH = np.eye(K.shape[2]) - K @ m.output  # I - K H
+    # `[:, None]`: A and Q of a step are the same in all modes.
     noise_in_error = I_KH @ m.process[:, None] @ I_KH.swapaxes(-1, -2) + K @ m.noise @ K.swapaxes(-1, -2)
     return JumpSystem(m.chain, I_KH @ m.transition[:, None], law * noise_in_error)
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j <L_k,j, R_k,j>, whose gradient by m at fixed X, K and L is that of the error.
+    """Return sum_k,j trace(L_k,j R_k,j), whose gradient by the system m at fixed X, K and L is that of the error.
 
-    X_k,j is the covariance after step k in mode j, times the mode's probability. R_k,j is the right side of its
-    recursion under the gains K. L is the adjoint: the derivative of the error by each X.
+    X_k,j is the error covariance after step k in mode j, times the mode's probability. R_k,j is the right side of its
+    recursion X_k,j = R_k,j(X_k-1) under the gains K. L is the adjoint: the derivative of the error by each X.
     """
     X, gains, adjoint = (jnp.asarray(values) for values in solution)
     X_before = jnp.roll(X, 1, axis=0)  # in a period, the last step leads to the first
-    if m.start is not None:  # the first step's chain forgets the earlier mode, so that any mode may hold the start
+    if m.start is not None:
+        # Over a horizon the first step's mode does not depend on an earlier one: all rows of its chain are equal. So
+        # the covariance before it may be put into any mode, here mode 0.
         X_before = jnp.zeros_like(X).at[0, 0].set(m.start).at[1:].set(X[:-1])
     right_side = _close_loop(m, gains).step(X_before)
     return jnp.sum(adjoint * right_side)

@@ -134,7 +134,10 @@ def _read_range_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarra
 
 
 def read_free_numbers(build: Build, free: object) -> tuple[Build, FreeNumbers]:
-    """Return the function and its free numbers: {name: (start, low, high)}, or where None the marks `hg.free` in it.
+    """Return a function that builds a network from its free numbers by name, and these numbers.
+
+    `free`: {name: (start, low, high)}, the arguments of `build`. If it is None, `build` marks its free numbers by
+    `hg.free`; the result is then a function that puts values in the place of the marks.
 
     Raises:
         ValueError: arguments of the function that are not the free numbers, marks that are no intervals.
@@ -200,7 +203,11 @@ class TracedNetwork:
         return hash(self._list_array_shapes())
 
     def _list_array_shapes(self) -> tuple[object, ...]:
-        """Return what the shapes of a program's arrays depend on."""
+        """Return what decides the shapes of the compiled program's arrays: it is compiled anew if this changes.
+
+        It is the shape of each free number, the number of steps, whether these repeat for ever (no horizon), and
+        whether a scalar of Young's inequality for each step is among the numbers (`young`).
+        """
         shapes = tuple((name, number.start.shape) for name, number in self.numbers.by_name.items())
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
@@ -257,7 +264,7 @@ class EvaluatedPoint(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Return the error that the search makes small, at these numbers."""
+        """Return the number that the search minimises: the error, or if it is an eigenvalue its smoothed form."""
         return self.criterion.smooth(self.covariances)[0]
 
     @property
@@ -286,7 +293,10 @@ class FreeNumberProblem:
         self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 
     def network(self, x: Vector) -> Network:
-        """Return the network at the numbers x, of which the scalar of Young's inequality (YOUNG) is none of its own."""
+        """Return the network at the free numbers x.
+
+        The scalar named YOUNG (of Young's inequality, in a bound of the error) is no argument of the network.
+        """
         values = {
             name: float(value) if np.ndim(value) == 0 else value
             for name, value in self.numbers.split_by_name(x).items()

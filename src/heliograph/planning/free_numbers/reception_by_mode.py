@@ -246,15 +246,16 @@ def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
 
 
 def _find_observed_modes(name: str, channel: AbstractRandomAffine) -> _ObservedModes:
-    """Return the modes of a channel that its receiver observes, with what arrives in each, and whether they forget.
+    """Return the modes of a channel that its receiver observes, their Markov chain, and what arrives in each.
 
-    Without memory they are the outcomes of its losses; with memory the modes of its chains, which it delivers.
+    Of a channel without memory a mode is a set of outputs that arrive, drawn anew at each step (`forgets`). Of one with
+    memory a mode is that of its Markov chains, which it delivers to the receiver.
     """
     if not memories(channel):
         cases = channel.list_outcomes()
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])
         return _ObservedModes(
-            onward=jnp.tile(law, (len(cases), 1)),  # whatever the mode was
+            onward=jnp.tile(law, (len(cases), 1)),  # each row is the same law: independent of the mode before
             initial=law,
             maps=[case.map for case in cases],
             arrived=[case.arrived for case in cases],
@@ -349,10 +350,12 @@ def _compute_steps_reception(
 def _compute_mode_reception(
     channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, sensor: LinearSensor, young: Array | None
 ) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
-    """Return H = M C and N of one mode, M the mean gain, C the sensor's matrix and R the covariance of its noise.
+    """Return H (m, n) and N (time, m, m) of one mode, in which z = H x + noise with covariance N is received.
 
-    N = Spread(y) + M R M', and with Young's scalar b as in the module docstring Spread + Shift / b + (1 + b) M R M';
-    y: E (y, 1)(y, 1)' of each step (time, m1, m1). What is lost has H = 0 and N = 1.
+    H = M C with M the channel's mean gain and C the sensor's matrix. N = Spread + M R M', where R is the covariance of
+    the sensor's noise and Spread = E[dG Y dG'] the noise that the random part dG of (gain, offset) makes, given
+    Y = E (y, 1)(y, 1)' (`y`) at each step. If M is uncertain (`young`: a scalar b > 0 for each step), N =
+    Spread + Shift / b + (1 + b) M R M', with Shift the bound of what the error of M makes. Lost outputs: H = 0, N = 1.
     """
     moments, present = second_order(channel), jnp.asarray(arrived)
     gain = jnp.where(present[:, None], jnp.asarray(moments.mean_gain), 0.0)

@@ -76,9 +76,10 @@ class PathProblem(NamedTuple):
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
     def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
-        """Return the problem with linear error that touches this one's from below at powers p, its value and gradient.
+        """Return a problem whose error is at most this one's, and equal at `powers`; then its value and gradient there.
 
-        The error is linear in P. The gradient is by the powers p (time, free).
+        Its error is linear in the covariance P: the tangent of this problem's criterion at the P of these powers. The
+        gradient is by the powers (time, free).
         """
         problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
@@ -147,11 +148,11 @@ class PowerTask(NamedTuple):
     def relax_to_whole_paths(self) -> PathProblem:
         """Return the convex problem in the power of whole paths, whose least error is a lower bound of this one's.
 
-        A path may send what its hops may together, and split it at its best; its information is replaced by the concave
-        envelope, which is nowhere below.
+        The power of a path is the sum over its hops, split best, within the sum of their limits. The information of a
+        path is replaced by its concave envelope over that power, which is nowhere lower.
         """
         problem, limits = self.problem, self.problem.limits
-        steps, count = problem.paths.second.shape
+        steps, count = problem.paths.second.shape  # (time, paths)
         # Limits of a path: the sums of its hops'.
         peak, mean = np.zeros((steps, count)), np.zeros(count)
         np.add.at(peak.T, problem.path, limits.peak.T)
@@ -227,20 +228,22 @@ def make_power_task(
 
 
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
-    """Return the total power of starts if none is given: what peaks and means allow, or a lot of power without them.
+    """Return the total power of starts if no total is given: the sum over transmitters of what each may send.
 
-    It is ten times the largest alpha for each transmitter. At power alpha half of what arrives is noise.
+    That is what its limits of peak and mean allow. Without limits it is ten times the largest alpha, where alpha is the
+    power at which half of what arrives is noise, so that more power hardly helps.
     """
     largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
-    plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
-    return float(np.where(np.isfinite(largest_means), largest_means, plenty).sum())
+    without_limit = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
+    return float(np.where(np.isfinite(largest_means), largest_means, without_limit).sum())
 
 
 def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
-    """Return masks (steps, free) of the hops that send at a start: all, and then choices of the paths that send.
+    """Return a mask (steps, free) for each start of a search: which free hops send power at which step.
 
-    They are every choice if there are at most `starts`, else as many as are drawn. A convex problem has one minimum,
-    and one start. `path`: number of the path of each free hop.
+    In the first all hops send. In each other one some whole paths send at each step: every choice of paths and steps if
+    there are at most `starts`, else random choices. A convex problem has one minimum, and needs the first start only.
+    `path`: number of the path of each free hop.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):

@@ -270,9 +270,11 @@ def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
 def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop).
 
-    j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h. F is the product of p / (p + alpha) along the path,
-    and K that of kappa. s = E y^2 of what is sent, and t is s minus the sensor's noise variance.
+    j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h. F is the product of p / (p + alpha) over the hops of
+    a path, with alpha = (noise variance) / E g^2 and g a hop's gain; K is the product of kappa = E g^2 / (E g)^2.
+    s = E y^2 (`paths.second`) is the power of the measurement, and t (`paths.signal`) is s less its noise variance.
     """
+    # places: a hop's number along its path.
     factors, places = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # factors (time, path, place)
     F, sK = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)
     denominator = sK - paths.signal * F

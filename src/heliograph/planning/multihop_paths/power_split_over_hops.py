@@ -56,7 +56,9 @@ class SplitPaths(NamedTuple):
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
     """Return the paths as functions of the total power of their free hops, while other hops send the powers `fixed`.
 
-    `fixed`: powers (time, hop). DEAD: a noise factor so large that the path carries nothing, as if a hop is silent.
+    A path's information is j = 1 / (A prod_h (1 + alpha_h / p_h) - t), with the product over its free hops. A (`full`)
+    is s K prod (1 + alpha / p) over the hops of fixed power, s = E y^2 (`second`) and K the product of all kappa.
+    `fixed`: powers (time, hop). DEAD: the A of a path through a hop that sends nothing.
     """
     full = paths.second * compute_path_kappas(paths)
     # Gather alpha of the free hops by path.
@@ -99,7 +101,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
 
 
 def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
-    """Return the noises alpha of a chain's hops (H,), checked to be nonnegative and small enough to be squared."""
+    """Return alpha = (noise variance) / E[gain^2] of a path's hops (H,), nonnegative and small enough to square."""
     noise = require_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
@@ -194,9 +196,10 @@ class Envelope(NamedTuple):
 def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     """Return the concave envelope of each path's information j(P) over its power P on [0, cap], cap (time, path).
 
-    With several hops j is S-shaped, and the envelope begins with a ray from zero. The ray touches j where
-    D (1 - P l) = t: by bisection in log l, as the left side falls with l. D = A prod (1 + alpha_h / p_h(l)) and
-    P = sum_h p_h(l), the best split by the multiplier l.
+    j = 1 / (D - t) with D = A prod_h (1 + alpha_h / p_h): A (`full`) and t (`signal`) are constants of a path, alpha_h
+    the noise of its hops and p_h their powers. The best split of P = sum_h p_h has one multiplier l, dD/dP = -D l. With
+    several hops j is S-shaped, and the envelope begins with a ray from 0. It touches j where j = P dj/dP, which is
+    D (1 - P l) = t: found by bisection in log l, as the left side falls with l.
     """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)

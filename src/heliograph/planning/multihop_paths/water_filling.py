@@ -78,8 +78,9 @@ def _search_line(
 ) -> tuple[Powers, ErrorSlopes]:
     """Return a point of less error on the way from p to p + way, and its slopes.
 
-    It is the end of the way, or where the slopes at both ends say that the error is least. Where rounding hides the way
-    down it is half of it, by which the gap still shrinks. `slopes`: those at p.
+    It is the end of the way if the error is less there and its slope small. Else shorter ways are tried, up to where a
+    parabola with the slopes at both ends has its minimum. If none is accepted, rounding hides the descent: the result
+    is half of `way`, which brings p closer to the minimum still. `slopes`: those at p.
     """
     slope = float(np.sum(slopes.gradient * way))
     length = 1.0
@@ -88,17 +89,18 @@ def _search_line(
         end_slope = float(np.sum(tried.gradient * way))
         if end_slope <= -0.5 * slope and tried.error <= slopes.error:
             return p + length * way, tried
-        # Of a parabola with these slopes at its ends the lowest point, kept off both.
+        # The minimum of a parabola with these slopes at its ends, as a share of the way between 0.1 and 0.9.
         share = slope / (slope - end_slope) if end_slope != slope else 0.0  # equal only by rounding
         length *= min(max(share, 0.1), 0.9)
     return p + way / 2, slopes_at(p + way / 2)
 
 
 def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
-    """Return the powers [y sqrt(w b) - b]^+ / a (time, free) at the level y that the limits determine.
+    """Return the powers p that minimise -sum w j within the limits (time, free), with j = p / (a p + b).
 
-    They are [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. w (`weights`) is -d error / d j of each
-    path, whose information is j = p / (a p + b).
+    They are [y sqrt(w b) - b]^+ / a (water filling). The level y is as high as the limits allow; y^-2 is the multiplier
+    of the power. Here p = [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. j is the information of a
+    path, and w (`weights`) is -d error / d j.
     """
     rise, ground = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
     steps, transmitters = ground.shape

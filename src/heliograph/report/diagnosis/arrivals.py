@@ -63,9 +63,9 @@ class Arrivals:
     def rate(self) -> SendingRate | None:
         """Return the rate of a sender whose clock is not that of the rows, or None if there is no need of a rate.
 
-        There is none if the sender's period is declared, if rows are there because of messages, or if a pattern of rows
-        explains the arrivals as well. In a pattern, messages are due in the same few of each so many rows. The rate or
-        pattern that makes fewer messages due explains more. `arrived` says for each row whether a message came.
+        There is none if the sender's period is declared, or if rows are there because of messages (`of_messages`). Nor
+        if a periodic pattern of rows, such as 3 of each 4, explains the arrivals as well: that with fewer messages due
+        is better, since fewer were then lost. `arrived`: for each row whether a message came.
         """
         if self.declared_period is not None or self.of_messages:
             return None
@@ -82,8 +82,10 @@ class Arrivals:
     def period(self) -> float | None:
         """Time between messages of a sender that is slower than the rows, in seconds or the unit of `time`; else None.
 
-        Declared, or found: it has a rate of its own, or nearly all intervals between arrivals are whole multiples of
-        their median. Losses of a sender that is due in each row leave intervals of all lengths, and no such period.
+        It is declared, or that of the sender's own clock (`rate`), or the median interval between arrivals, if a share
+        REGULAR of all intervals are whole multiples of it to NEAR periods. (Losses of a sender that is due in each row
+        leave intervals of all lengths.) If rows are not there because of messages (`of_messages`), a median of less
+        than SLOWER rows is no period.
         """
         clock = _convert_times_to_numbers(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
@@ -103,9 +105,9 @@ class Arrivals:
 
     @cached_property
     def slots(self) -> Bool[np.ndarray, " slots"] | None:
-        """Whether a message came in each slot that it may have: the rows, or one a period from the first arrival.
+        """Whether a message came in each slot: each row, or of a slow sender each period from its first arrival on.
 
-        None where rows are messages of other nodes and this one has no period: then nobody knows.
+        None if rows are there because of other nodes' messages and this sender has no period: its slots are unknown.
         """
         if self.period is None:
             return None if self.of_messages and not self.arrived.all() else self.arrived
@@ -113,7 +115,8 @@ class Arrivals:
         arrivals = clock[self.arrived]
         if not len(arrivals):
             return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
-        # Whole periods from each arrival to the next; then those after the last, late by more than is usual.
+        # Whole periods from each arrival to the next; then those from the last arrival to the end of the recording. A
+        # message may be late by NEAR periods, and is missing only after that.
         if self.rate is not None:
             steps = np.diff(self.rate.slots)
         else:
@@ -125,9 +128,9 @@ class Arrivals:
 
     @cached_property
     def pattern(self) -> SendingPattern | None:
-        """The slots in which it is due, where these return as a pattern, such as 3 of each 4; None if it is in each.
+        """Periodic pattern of slots (rows, or periods of a slow sender) with a message due, such as 3 of each 4.
 
-        A sender that says when it is due has none.
+        None if a message is due in each slot, if nothing is known of slots, or if the sender's period is declared.
         """
         return None if self.slots is None or self.declared_period is not None else find_pattern(self.slots)
 
@@ -148,7 +151,10 @@ class Arrivals:
 
     @property
     def lost_times(self) -> np.ndarray:
-        """Times at which it was due and did not come; of a sender that is slower than the rows between its arrivals."""
+        """Times at which a message was due and did not come: times of rows, or between them for a slower sender.
+
+        `slots`: whether a message came in each row, or, of a sender slower than the rows, in each `period`.
+        """
         if self.slots is None or not self.arrived.any():
             return self.time[:0] if self.slots is None else self.time
         due = np.ones(len(self.slots), dtype=bool) if self.pattern is None else self.pattern.rows
@@ -172,7 +178,10 @@ class Arrivals:
 
     @property
     def numbers(self) -> Int[np.ndarray, " arrivals"]:
-        """Running number of each message that arrived, from 0, among those that were due; of rows if nobody knows."""
+        """Number of each message that arrived among the messages that were due, from 0 at the first arrival.
+
+        If it is not known when messages were due, each row counts as one.
+        """
         places = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
         return places - places[:1]
 

@@ -133,9 +133,10 @@ class Health:
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def describe_stuck_outputs(self) -> dict[tuple[str, str], str]:
-        """Return by (node, output) a line for each output that repeats one value for longer than its noise allows.
+        """Return {(node, output): line} for each output that repeats one value for longer than its noise allows.
 
-        An output that a node's filter and a central one both use is there once, by the node's.
+        Only filters that the network relies on (`trusted`) count. An output used by a node's filter and by a central
+        one has one line, from the node's filter. `watched`: outputs whose repeats limits refuse already.
         """
         trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
         # Central filters first, whose outputs are named "node: output": a node's own filter takes their place.
@@ -171,13 +172,17 @@ class Health:
         return [line for filter in self.filters if not filter.trusted for line in self._describe_doubts(filter)]
 
     def _describe_doubts(self, health: FilterHealth) -> Iterator[str]:
-        """Yield which claims innovations contradict: the size of each output's, of all together, and their memory."""
+        """Yield sentences on how the innovations of a filter contradict its model, the gravest first.
+
+        These are: outputs left out, a constant error, variances reported with messages (`declared`), an impossible
+        innovation in a short recording, sizes other than claimed, and correlation in time (memory).
+        """
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
         off = self.off.get((health.node, health.filter))
         if off is not None:
             yield say_constant_error(name, off)
-            if off.nothing_else:
+            if off.nothing_else:  # a constant error explains all other doubts too
                 return
         said = say_declared_variances_are_off(health.declared, health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
@@ -204,7 +209,7 @@ class Health:
         """
         name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
         of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
-        # By output (mean square over its claim, the standard error of that, number of innovations); "" of all together.
+        # By output: mean of innovation^2 / claimed variance, its standard error, how many innovations. "": all outputs.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
         measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
         signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
@@ -213,7 +218,7 @@ class Health:
             signs = {"": judge_size(*measured[""], level)}
         sizes = {output: size for output, (size, _, _) in measured.items()}
         larger = [output for output, sign in signs.items() if sign > 0]
-        # One that is far off pulls the estimates, and so makes others a little larger: these are not named.
+        # An output that is far off spoils the estimates, so that others look a little larger too: these are not named.
         largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
         larger = [output for output in larger if sizes[output] - 1 >= PULLED * largest_excess]
         weighs_any = any(output.weighs for output in of_filter)  # without outliers innovations are smaller: no fault
@@ -240,12 +245,12 @@ class Health:
 
         Among N independent numbers, each lag seems to predict 1 / N of the variance.
         """
-        # A filter's gains suit the mean over all runs. In a run whose mean square innovation, relative to all runs
-        # (`expected`), is further from 1 than TYPICAL, the gains are too large or too small.
+        # Gains are optimal for the mean over all possible runs. `expected`: the mean square innovation of this run's
+        # gains and losses over that mean. Beyond a factor TYPICAL innovations of a right model are correlated as well.
         if abs(np.log(health.expected)) > np.log(TYPICAL):
             return False
         by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
-        probability = 2 * min(test.p_value, test.p_value_of_all)  # two tests share the level
+        probability = 2 * min(test.p_value, test.p_value_of_all)  # of two tests the smaller p-value counts (Bonferroni)
         return probability < self._level_of_one_test() and test.predictable - by_chance >= LEAST_SHARE
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
@@ -306,9 +311,10 @@ def examine(
 def _examine_filter(
     network: Network, listener: FilterWithMeasurements, record: Record, inputs: np.ndarray
 ) -> FilterHealth:
-    """Return one filter's innovations in units of its claim (white), and what tests say of them.
+    """Return one filter's innovations scaled to covariance I by its claim (`white`), and what tests say of them.
 
-    There are neither of a filter that claims no covariance, or receives nothing.
+    Both are None for a filter that claims no covariance, or receives nothing. `expected`: mean squares of `white` that
+    the model expects in this recording. `declared`: tests of variances that are reported with messages.
     """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
     white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives

@@ -23,24 +23,28 @@ class SendingPattern(NamedTuple):
 def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
     """Return the pattern of rows in which a message is due, or None if random losses could have left it.
 
-    If messages are due in `due` of each `length` rows, the other rows are always empty. Some due messages may be lost.
-    So the due rows are searched again for a pattern until there is none: the result is the finest pattern. `rows` is
-    the mask of the due rows. `finer` is the mask of a pattern among the due rows.
+    A pattern: messages are due in `due` of each `length` rows, `rows` (time,); all other rows are empty. The due rows
+    may have a pattern themselves (`finer`, a mask over len(finer) due rows), and so on: the result is the finest one.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
     finer = _find_least_probable_rows(arrived[rows])
     while finer is not None:
-        # Only the rows of `finer` among the due rows are due. Both patterns together repeat after `turns` turns of the
-        # first: turns * due must be a multiple of len(finer).
-        turns = len(finer) // np.gcd(due, len(finer))
-        due, length = int(finer.sum()) * due * turns // len(finer), length * turns
+        # Only the rows of `finer` among the due rows are due. Both patterns together repeat after some repetitions of
+        # the first: the fewest for which repetitions * due is a multiple of len(finer).
+        repetitions = len(finer) // np.gcd(due, len(finer))
+        due, length = int(finer.sum()) * due * repetitions // len(finer), length * repetitions
         rows[rows] = np.resize(finer, int(rows.sum()))
         finer = _find_least_probable_rows(arrived[rows])
     return None if length == 1 else SendingPattern(due, length, rows)
 
 
 def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
-    """Return the pattern that chance makes least, as which of its rows are due; None where chance may make each."""
+    """Return the pattern that random losses would make with the least probability; None if all are likely enough.
+
+    A pattern is a mask of the due rows (length,), which repeats. Of each length the smallest pattern is tried: rows in
+    which a message came. Probabilities are bounds, times the number of patterns that might have been found instead;
+    `least` is the logarithm of the least one so far, from CHANCE on.
+    """
     arrivals = np.flatnonzero(arrived)
     intervals = np.diff(arrivals)
     law = BurstLossLaw.fit_to_intervals(intervals)
@@ -49,13 +53,14 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
         places = np.bincount(arrivals % length, minlength=length) > 0
         if places.all():
             continue
-        # Any set of as many places, and any length, would have been taken: 1 / (length (length - 1)) add up to 1.
-        tried = log(comb(length, int(places.sum()))) + log(length * (length - 1))
+        # log of the number of patterns: any set of as many places, and any length, would have been taken. Weights
+        # 1 / (length (length - 1)) of lengths add up to 1.
+        log_patterns = log(comb(length, int(places.sum()))) + log(length * (length - 1))
         # Independent losses leave all n arrivals in d of `length` rows with probability (d / length)^n: if that is no
         # less than the least, bursts need not be looked at.
-        if length > SHORT and len(arrivals) * log(length / places.sum()) < tried - least:
+        if length > SHORT and len(arrivals) * log(length / places.sum()) < log_patterns - least:
             continue
-        chance = _bound_log_chance(places, law, len(intervals)) + tried
+        chance = _bound_log_chance(places, law, len(intervals)) + log_patterns
         if chance < least:
             least, found = chance, places
     return found
@@ -85,33 +90,39 @@ class BurstLossLaw(NamedTuple):
         )
 
     def log_chance_within(self, due: Bool[np.ndarray, " rows"], count: int) -> float:
-        """Return a bound of the log probability that `count` arrivals after a first one are all in due rows.
+        """Return an upper bound of the log probability that the `count` arrivals after a first one are all in due rows.
 
-        For any z > 0 the probability is at most stay(first) / z^count (Chernoff's bound), where
-        stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)) and
-        later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1). Both are 1 at the end, and are computed
-        backward over the rows r. Several z are tried.
+        stay(r) = E[z^(number of later arrivals) 1{all in due rows}] given an arrival in row r. By Chernoff's bound the
+        probability is at most stay(first) / z^count for any z > 0; the least of several z counts. With due(r) 0 or 1,
+        stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)), where `follows` is the probability of an
+        arrival in the next row; later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1), where `ends` is the
+        probability that a burst of losses ends. Both are 1 after the last row.
         """
         # z = share^-exponent with the share of due rows, which is at least 1 / n, so that z is finite.
         share = max(float(np.mean(due)), 1 / len(due))
         return min(self._log_mean_of_powers(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
 
     def _log_mean_of_powers(self, due: Bool[np.ndarray, " rows"], log_z: float, count: int) -> float:
-        """Return log(stay(first) / z^count), by the recursion of `log_chance_within`; numbers are scaled to about 1."""
-        z, logarithm, stay, after, later = exp(log_z), 0.0, 1.0, 1.0, 1.0
+        """Return log(stay(first) / z^count), computed backward over the rows r, first the last but one.
+
+        stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)) and
+        later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1). Given an arrival in row r, stay(r) is
+        E[z^(number of later arrivals) 1{all in due rows}]. All numbers are divided by exp(log_scale), to be near 1.
+        """
+        z, log_scale = exp(log_z), 0.0
+        # due(r + 1) stay(r + 1), due(r + 2) stay(r + 2) and later(r + 1).
+        stay_1, stay_2, later = 1.0, 1.0, 1.0
         for is_due in due[-2::-1].tolist():
-            # `stay` and `after` are those of the row after this one and of the next, 0 where these are not due.
-            later = self.ends * after + (1 - self.ends) * later
-            after = stay
-            now = z * (self.follows * after + (1 - self.follows) * later)
-            stay = now if is_due else 0.0
-            scale = max(stay, after, later)
+            later = self.ends * stay_2 + (1 - self.ends) * later
+            stay = z * (self.follows * stay_1 + (1 - self.follows) * later)
+            stay_1, stay_2 = stay if is_due else 0.0, stay_1
+            scale = max(stay_1, stay_2, later)
             if not 1e-100 < scale < 1e100:
                 if scale == 0:
                     return -np.inf
-                logarithm += log(scale)
-                now, stay, after, later = now / scale, stay / scale, after / scale, later / scale
-        return logarithm + (log(now) if now > 0 else -np.inf) - count * log_z
+                log_scale += log(scale)
+                stay, stay_1, stay_2, later = stay / scale, stay_1 / scale, stay_2 / scale, later / scale
+        return log_scale + (log(stay) if stay > 0 else -np.inf) - count * log_z
 
 
 def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, count: int) -> float:

@@ -39,11 +39,12 @@ class _PeriodicRows(NamedTuple):
 
 
 def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
-    """Return the rate of a sender whose clock is not that of the rows, or None if losses could have left the arrivals.
+    """Return the rate of a sender with its own clock, or None if random losses alone could explain the empty rows.
 
-    A sender that is due each T rows, where T is no integer, comes in the rows r with frac(r / T - phase) < 1 / T. frac
-    is the fractional part. All other rows are empty. If T is hardly above 1, empty rows are rare and have a rate
-    themselves: one in each 1 / (1 - 1 / T) rows, in every such slot. `slots` numbers each arrival among those due.
+    A sender that is due each T rows, where T is no integer, comes in the rows r with frac(r / T - phase) < 1 / T, with
+    frac the fractional part. All other rows are empty. If T is hardly above 1, empty rows are rare, and are found by
+    their own rate: one each 1 / (1 - 1 / T) rows, none missing. `slots` in the result: number of each arrival among
+    the messages due.
     """
     rate = _find_slowest_rate(arrived)
     if rate is not None:

@@ -116,6 +116,7 @@ class OutputHealth(NamedTuple):
 
     def __str__(self) -> str:
         """One line, such as "radio/robust: left: 7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
+        # Its readings were weighted down more often than those of the other outputs.
         blame = "; to blame: more than of the others" if self.judged.to_blame else ""
         return f"{self.name}: {self.judged.summary}{blame}"
 
@@ -136,13 +137,16 @@ class FilterWithMeasurements(NamedTuple):
 
 
 def yield_filters_with_measurements(network: Network, record: Record) -> Iterator[FilterWithMeasurements]:
-    """Yield every filter with its measurements: those of the nodes, then central ones."""
+    """Yield every filter with its measurements: those of the nodes, then central ones.
+
+    A filter is trusted if the network relies on it. It blames (its weights decide which outputs are bad) if it weighs
+    outputs and is trusted, or if it weighs outputs and no trusted filter of the node does.
+    """
     received, relied_on = record.measurements, _list_relied_on_filters(network)
     for node, z in received.items():
         filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
-        # Those that the network relies on say what is to blame; where none of these weighs, the others do.
-        blaming = weighing & relied_on[node] or weighing
+        blaming = (weighing & relied_on[node]) or weighing
         for name, filter in filters.items():
             trusted, blames = name in relied_on[node], name in blaming
             yield FilterWithMeasurements(node, name, filter, z, names, trusted=trusted, blames=blames)
@@ -324,7 +328,12 @@ def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHe
 
 
 def summarise_output(health: OutputHealth) -> dict[str, Json]:
-    """Return the numbers of one output for a summary, by name; None in place of NaN."""
+    """Return the numbers on one output of a sensor for a summary, by name; None in place of NaN.
+
+    They are of its innovations: mean (bias, with interval), mean square, and mean square over the claimed variance
+    (size). If its filter weighs outputs: mean weight, and the share that was weighted down. held: a run of equal
+    readings longer than noise allows.
+    """
     judged, summary = health.judged, health.judged.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
                                 "squared": summary.squared, "size": judged.size,

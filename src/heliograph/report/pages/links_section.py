@@ -84,11 +84,12 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
 
 
 def _list_refused(health: Health) -> list[Table]:
-    """Return a table of what came and was refused, by reason; nothing where nothing was."""
+    """Return a table of refusals by reason: single readings by limits or filters, and whole messages; [] if none."""
     rows = []
     names = {
         node: [link.component for link in health.links if link.node == node] for node in health.record.measurements
     }
+    # Outputs of central filters are those of all nodes, and named with their node.
     names[Network.FUSED] = [f"{link.node}: {link.component}" for link in health.links]
     for refusal in health.record.refusals:
         component = names[refusal.node][refusal.component]

@@ -349,7 +349,7 @@ def _list_baseline_remarks(health: Health) -> list[Text | Points]:
 
 
 def _list_filters_of_other_worlds(health: Health) -> list[Text | Points]:
-    """Return the filters that were made for another world than that of their node."""
+    """Return a paragraph and a list of filters whose assumed model is not that of their node; [] if there are none."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []
 

@@ -61,9 +61,10 @@ def _list_refused(health: Health) -> list[Json]:
 
 
 def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
-    """Return the numbers on one filter by name: its claim, tests of its innovations, and of variances in messages.
+    """Return the numbers on one filter by name: its claim, and tests of its innovations.
 
-    Size: mean squared innovation over its variance, 1 where the claim holds; correlation: of successive innovations.
+    size: mean of innovation^2 / variance, 1 if the covariance holds. correlation: of successive innovations. declared:
+    tests of noise variances that are reported with messages, one for each class of messages.
     """
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:

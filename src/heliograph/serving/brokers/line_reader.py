@@ -104,7 +104,8 @@ class LineReader:
         return last if self._order is None else [*self._order.add_messages(last), *self._order.take_rest()]
 
     def _read_line(self, line: bytes) -> list[Payload]:
-        """Return the messages of a line that is none of a table; [] while a document over several lines goes on."""
+        """Return the messages of a line that is not of a table; [] while a document over several lines goes on."""
+        # `_document`: lines of a document that has begun, else None. `_is_table`: None until a message shows the form.
         if self._document is not None:
             self._document.append(line)
             return self._read_document_or_lines(self._document) if CLOSES.match(line) else []
@@ -135,27 +136,29 @@ class LineReader:
         return payloads
 
     def _interpret_message(self, message: FileMessage | InputError, read: Read | None) -> list[Payload]:
-        """Return the payloads of one message of a line or document.
+        """Return what one message of a line or document says, as payloads for the service.
+
+        A message in another form than ours, or with a topic, goes to the translator of sources. One in our own form is
+        read as a message to a service if it is one, else as an event in a file.
 
         Args:
             message: the message, or why it could not be read.
-            read: how `read_messages` read the line; None of a part of a document, which has not been tried.
+            read: the line as `read_messages` read it; None if the message is a part of a document, not read so far.
         """
         if isinstance(message, InputError):
             return [str(message)]
-        # Messages of others, by topic, are for the sources; those in our own form are tried as a service gets them, and
-        # then as a file has them.
         own = message.topic is None and is_own_message(message.content)
         if self._translator is not None and not own:
             self._is_table = False
             return [*self._translator.decode(message, self._topic)]
-        if read is None:  # a part of a document
+        if read is None:
             (read,) = read_messages([json.dumps(message.content).encode()])
         if not own:
             return [read]
         self._is_table = False
         if not isinstance(read, str | UnreadMessage):
             return [read]
+        # It is no message to a service: read it as an event of a file. If it is none either, `read` says why.
         payloads = read_own_event(self._own, message.where, message.content)
         return payloads if any(isinstance(payload, Message) for payload in payloads) else [read]
 

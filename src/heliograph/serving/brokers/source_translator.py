@@ -42,7 +42,11 @@ class Translator:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
-        """Check a table of sources by topic against the network; messages of the nodes `others` are left out."""
+        """Check a table of sources by topic against the network; messages of the nodes `others` are left out.
+
+        The object holds what messages lack: counts of readings, and the newest values of senders without a count, by
+        which a repeated message is found.
+        """
         instance("network", network, Network, "a Network")
         if isinstance(others, str) or not isinstance(others, Collection):
             raise fail("nodes of other processes", "a list of names", show_value(others))
@@ -98,11 +102,11 @@ class Translator:
     def decode(self, message: FileMessage, topic: str | None) -> list[Message | UnreadMessage | str]:
         """Return the messages in a line or a row, or why it cannot be read; [] of unknown topics.
 
-        It arrived when it says so; else when it was measured, or now if that is later than now.
+        A message's arrival is the time that it states; else the time of the measurement, or now if that is dated later.
 
         Args:
             message: the line or the row.
-            topic: topic of one that names none.
+            topic: topic of a message that names none.
         """
         name = topic if message.topic is None else message.topic
         if name is None:

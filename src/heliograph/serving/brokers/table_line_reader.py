@@ -129,9 +129,9 @@ class TimeRowReader:
         self._cells = list[RecordingRows]()  # the rows of a file, until it ends
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows, as a replay of them has them, and why others cannot be read.
+        """Return the messages of rows, the same as a replay of these rows makes, and errors for rows that are refused.
 
-        Those of a file are kept until its end, and only the latter returned.
+        Rows of a whole file are held until its end: then only the errors are returned here.
         """
         cells = self._rows.read_cells(self._columns.read(rows))
         refused, self._rows.refused = [str(error) for error in self._rows.refused], []

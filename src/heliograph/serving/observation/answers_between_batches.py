@@ -20,7 +20,11 @@ class LastAnswers(Generic[T]):
     """
 
     def __init__(self, lock: threading.Lock, answer: Callable[[str], T], begin: T, most: int = 1):
-        """Hold how a question is answered; no question was asked yet. The class says what the arguments are."""
+        """Hold how a question is answered; no question was asked yet.
+
+        `lock` is held while a batch is taken. `answer` computes the answer to a question, `begin` is the answer if none
+        was computed yet, and `most` is how many answers are kept.
+        """
         self.lock, self.answer, self.begin, self.most = lock, answer, begin, most
         self._last: OrderedDict[str, T] = OrderedDict()
 

@@ -143,10 +143,10 @@ class Store:
             raise fail(f"store {self.name}", expected, str(said)) from None
 
     def _read_identity(self, mine: Identity | None) -> Identity:
-        """Return the identity that the store was made with; a new store takes `mine`.
+        """Return the identity of the network that the store is of; a new store takes `mine`, that of the present one.
 
         Raises:
-            ValueError: a store that is damaged, or is new where there is no `mine`.
+            ValueError: a store that is damaged, or new although it is only read (`_begun`) or there is no `mine`.
         """
         # All tables are there, or none: a store with some missing is damaged.
         tables = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
@@ -318,7 +318,7 @@ class Store:
         return {name.removeprefix(WORD): self._check_count(name, value, written) for name, value, written in rows}
 
     def keep_words(self, words: Mapping[str, int]) -> None:
-        """Keep the last words of devices (online or not), by topic; a topic longer than TOPIC is left out."""
+        """Store the last status of devices, as a number by topic; a topic longer than TOPIC is left out."""
         rows = [add_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
         if rows:
             with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
@@ -331,10 +331,10 @@ class Store:
         return value
 
     def carry(self, carrier: PlantMigration, what: str, stored: Identity) -> None:
-        """Migrate all plants, which are of the network with the identity `stored`, to the carrier's network.
+        """Rewrite all plants of this store for another network, and then the store's identity.
 
         Args:
-            carrier: carries plants over.
+            carrier: translates stored plants into those of the other network.
             what: name of the store that they come from, for reports.
             stored: identity of the network that they are of.
         """
