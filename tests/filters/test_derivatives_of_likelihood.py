@@ -170,3 +170,32 @@ def test_a_traced_known_part_of_an_unknown_start():
     expected = differences(lambda x: float(likelihood(float(x[0]))), [0.0], step=1e-3)[0]
     with jax.enable_x64(True):
         assert float(jax.grad(likelihood)(0.0)) == pytest.approx(expected, rel=1e-8)
+
+
+def test_what_has_no_derivative_is_no_number():
+    """By side information, where nothing is uncertain; elsewhere it is that of the best linear filter."""
+
+    def slopes(build, scales):
+        return slopes_of(lambda x: hg.log_likelihood(build(x), ROWS), scales)
+
+    def by_side_information(x):
+        return hg.filters.side_information_filter(*linear_models(x), fading(x[3]))
+
+    assert np.all(np.isnan(slopes(by_side_information, (0.0, 0.0, 0.5, 0.3))))
+    regular = slopes(by_side_information, (0.8, 0.25, 0.4, 0.3))
+    best = slopes(OTHERS["best linear filter behind modes"], (0.8, 0.25, 0.4, 0.3))
+    np.testing.assert_allclose(regular, best, rtol=1e-10)
+
+
+def test_a_transform_of_moments_alone_has_no_derivative_where_nothing_is_uncertain():
+    class Moments(hg.filters.AbstractTransform):
+        def apply(self, function, mean, covariance):
+            slopes = jax.jacfwd(function)(mean)
+            return hg.filters.Transformed(function(mean), slopes @ covariance @ slopes.T, covariance @ slopes.T)
+
+    def likelihood(x):
+        return hg.log_likelihood(gaussian_filter(*curved_models(x), PERFECT, transform=Moments()), ROWS)
+
+    assert np.isnan(slopes_of(likelihood, (0.0, 0.0, 0.5))[0])
+    expected = slopes_of(lambda x: textbook_likelihood(x, order=1), (0.8, 0.25, 0.4))
+    np.testing.assert_allclose(slopes_of(likelihood, (0.8, 0.25, 0.4)), expected, rtol=1e-9)

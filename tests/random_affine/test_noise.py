@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -66,3 +67,26 @@ def test_a_thousand_independent_components_need_no_eigenvectors():
     noise = hg.Gaussian(np.diag(variances))
     np.testing.assert_array_equal(np.asarray(noise.factor), np.diag(np.sqrt(variances)))
     assert noise.covariance[1, 1] == 1e-20
+
+
+@pytest.mark.parametrize("put", [np.asarray, jax.numpy.asarray])
+def test_a_covariance_put_into_a_noise_is_factored(put):
+    """Of one plant and over steps: what is put there counts for filters and for draws, as a law made anew."""
+    other = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.1], [0.0, 0.1, 3.0]])
+    with jax.enable_x64(True):
+        changed = eqx.tree_at(lambda noise: noise.covariance, hg.Gaussian(COVARIANCE), put(other))
+    np.testing.assert_allclose((changed.factor * changed.weights) @ changed.factor.T, other, rtol=1e-12, atol=1e-15)
+    kept = eqx.tree_at(lambda noise: noise.mean, changed, np.ones(3))
+    assert kept.factor is changed.factor
+    several = jax.tree.map(lambda *leaves: np.stack(leaves), hg.Gaussian(COVARIANCE), hg.Gaussian(other))
+    several = eqx.tree_at(lambda noise: noise.covariance, several, np.stack([other, COVARIANCE]))
+    products = several.factor @ several.factor.swapaxes(-1, -2)
+    np.testing.assert_allclose(products, [other, COVARIANCE], rtol=1e-12, atol=1e-15)
+
+
+def test_a_filter_with_another_covariance_put_into_it_filters_by_it():
+    sensor = hg.LinearSensor(np.eye(3), np.eye(3))
+    old, new = (hg.kalman_filter(hg.LinearPlant(np.eye(3), q, np.zeros(3), np.eye(3)), sensor) for q in (1.0, 5.0))
+    changed = eqx.tree_at(lambda f: f.plant.noise.covariance, old, 5.0 * np.eye(3))
+    z = np.ones((4, 3))
+    assert hg.log_likelihood(changed, z) == hg.log_likelihood(new, z) != hg.log_likelihood(old, z)

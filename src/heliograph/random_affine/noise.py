@@ -18,6 +18,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.factor_of_covariance import WeightsOfFactor
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import (
     GaussianBranches,
@@ -123,10 +124,32 @@ class AbstractNoise(Module):
         raise unwritten(self, "moment")
 
 
+def _factor_by_eigenvectors(covariance: Square) -> np.ndarray:
+    """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
+
+    Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
+    eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
+    have none.
+    """
+    matrix = np.asarray(covariance)
+    if len(matrix) > LARGE and check.is_diagonal(matrix):
+        root: np.ndarray = np.diag(np.sqrt(np.diagonal(matrix)))
+        return root
+    deviation = np.sqrt(np.diagonal(matrix))
+    unit = np.where(deviation > 0, deviation, 1.0)
+    for scale in (np.ones_like(unit), unit):
+        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+        rounding = 10 * len(values) * np.finfo(float).eps * np.max(values, initial=0.0)
+        factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.where(values > rounding, values, 0.0)))
+        if np.all(np.abs(factor @ factor.T - matrix) <= FACTOR_TOLERANCE * np.outer(unit, unit)):
+            break
+    return factor
+
+
 class Gaussian(AbstractNoise):
     """Gaussian noise with the given covariance and mean (zero unless given).
 
-    It holds a factor of the covariance beside it: another covariance is another law, not one put into this object.
+    It holds a factor of the covariance beside it, which is computed anew if another covariance is put into the object.
 
     Shapes: covariance (n, n), mean (n,).
     """
@@ -134,7 +157,7 @@ class Gaussian(AbstractNoise):
     covariance: Square
     mean: Vector
     factor: Square  # A diag(w) A' is the covariance: of eigenvectors, with w = 1; where it is traced, L and d of L D L'
-    weights: Vector
+    weights: Vector = WeightsOfFactor(_factor_by_eigenvectors, FACTOR_TOLERANCE)  # type: ignore[assignment]
 
     def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
         """Hold covariance and mean, and a square root of the covariance: factor diag(weights) factor'."""
@@ -201,28 +224,6 @@ class Gaussian(AbstractNoise):
             return total
 
         return expectation(tuple(powers))
-
-
-def _factor_by_eigenvectors(covariance: Square) -> np.ndarray:
-    """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
-
-    Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
-    eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
-    have none.
-    """
-    matrix = np.asarray(covariance)
-    if len(matrix) > LARGE and check.is_diagonal(matrix):
-        root: np.ndarray = np.diag(np.sqrt(np.diagonal(matrix)))
-        return root
-    deviation = np.sqrt(np.diagonal(matrix))
-    unit = np.where(deviation > 0, deviation, 1.0)
-    for scale in (np.ones_like(unit), unit):
-        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-        rounding = 10 * len(values) * np.finfo(float).eps * np.max(values, initial=0.0)
-        factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.where(values > rounding, values, 0.0)))
-        if np.all(np.abs(factor @ factor.T - matrix) <= FACTOR_TOLERANCE * np.outer(unit, unit)):
-            break
-    return factor
 
 
 class FiniteSupport(AbstractNoise):

@@ -11,7 +11,7 @@ With the nodes 0 and +- 1 / sqrt 6 both are exact to the fourth power of s.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,9 @@ def find_odd_and_even_parts(function: Function, x: Gaussian, scale: Array | floa
         even = jnp.where(linear, scale * variance / 2 * (bend_ahead + bend_behind), even_by_values)
         return Parts(here, slopes, even, linear)
 
-    return jax.vmap(of_column, in_axes=(1, 0, 0), out_axes=Parts(None, 1, 1, 1))(jnp.asarray(x.root), steps, variances)
+    axes: Any = Parts(here=None, slopes=1, even=1, linear=1)  # type: ignore[arg-type]
+    parts: Parts = jax.vmap(of_column, in_axes=(1, 0, 0), out_axes=axes)(jnp.asarray(x.root), steps, variances)
+    return parts
 
 
 def differentiate_twice(function: Function, at: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -82,7 +84,8 @@ def find_quadratic_image(function: Function, x: Gaussian) -> Image:
 
     def slopes_at(point: jax.Array) -> jax.Array:
         """Return f'(x)[L_j] of all columns (p, n)."""
-        return jax.vmap(lambda column: jax.jvp(function, (point,), (column,))[1], in_axes=1, out_axes=1)(root)
+        differentiate: Any = jax.vmap(lambda column: jax.jvp(function, (point,), (column,))[1], in_axes=1, out_axes=1)
+        return jnp.asarray(differentiate(root))
 
     def mixed(i: jax.Array, j: jax.Array) -> jax.Array:
         """Return the coefficient of xi_i xi_j, by values or by slopes in the column over which f is nearly linear."""
@@ -93,13 +96,14 @@ def find_quadratic_image(function: Function, x: Gaussian) -> Image:
         return jnp.where(parts.linear[:, j], by_j, jnp.where(parts.linear[:, i], by_i, both / (s_i * s_j)))
 
     mean = x.mean
-    products = jax.vmap(mixed, out_axes=1)(rows, columns) if len(rows) else jnp.zeros((len(squares), 0))
+    pairs, none = (jnp.asarray(rows), jnp.asarray(columns)), jnp.zeros((len(squares), 0))
+    products = jax.vmap(mixed, out_axes=1)(*pairs) if len(rows) else none
     weights = jnp.concatenate([jnp.full(len(d), 2.0), d[rows] * d[columns]])
     curvature = WeightedColumns(jnp.concatenate([squares, products], axis=1), weights)
     return Image(parts.here + jnp.sum(squares, axis=1), WeightedColumns(parts.slopes, d), np.ones(len(d)), curvature)
 
 
-def find_grid_image(function: Function, x: Gaussian, nodes: Array, weights: Array) -> Image:
+def find_grid_image(function: Function, x: Gaussian, nodes: jax.Array, weights: jax.Array) -> Image:
     """Return the image of x by the product rule of these nodes (points, n) and weights (points,) of a normal vector.
 
     In the columns over which f is nearly linear it is f + 1/2 sum_j d_j f''[L_j, L_j] at the points of all others, with

@@ -1,0 +1,59 @@
+"""A factor held beside its covariance: where another covariance is put in its place, that is factored."""
+
+from collections.abc import Callable
+from typing import Any
+from weakref import ref
+
+import jax
+import numpy as np
+
+
+class WeightsOfFactor:
+    """The field of a noise for the weights w of its factor A, with Cov = A diag(w) A': the last of its fields.
+
+    JAX and Equinox (`eqx.tree_at`) make an object anew by setting its fields one after another. When the weights come,
+    covariance and factor are there; where they are numbers that do not belong together, the covariance counts.
+
+    Args:
+        factor: returns A with A A' = S from a covariance S (n, n).
+        tolerance: what A diag(w) A' may differ from S, in units of two standard deviations.
+    """
+
+    def __init__(self, factor: Callable[[np.ndarray], np.ndarray], tolerance: float):
+        self.factor, self.tolerance = factor, tolerance
+        # By identity of a factor: references to it and to the covariance to which it was found to belong.
+        self._found: dict[int, tuple[ref[Any], ref[Any]]] = {}
+
+    def __get__(self, noise: Any, kind: type | None = None) -> Any:
+        """Return the weights of a noise; the class itself has none."""
+        if noise is None or "weights" not in noise.__dict__:
+            raise AttributeError("weights")
+        return noise.__dict__["weights"]
+
+    def __set__(self, noise: Any, weights: Any) -> None:
+        """Hold the weights, and factor the covariance where the factor is that of another one."""
+        held = noise.__dict__
+        held["weights"] = weights
+        covariance, factor = held.get("covariance"), held.get("factor")
+        if not all(_is_known(part) for part in (covariance, factor, weights)):
+            return
+        found_factor, found_covariance = self._found.get(id(factor), (None, None))
+        if found_factor and found_covariance and found_factor() is factor and found_covariance() is covariance:
+            return
+        S, A, w = np.asarray(covariance), np.asarray(factor), np.asarray(weights)
+        if S.shape[:-1] != A.shape[:-1] or S.dtype.kind != "f":
+            return
+        deviation = np.sqrt(np.maximum(np.diagonal(S, axis1=-2, axis2=-1), 0.0))
+        allowed = self.tolerance * deviation[..., :, None] * deviation[..., None, :]
+        if not np.all(np.abs((A * w[..., None, :]) @ A.swapaxes(-1, -2) - S) <= allowed):
+            n = S.shape[-1]
+            held["factor"] = np.reshape([self.factor(one) for one in S.reshape(-1, n, n)], S.shape)
+            held["weights"] = np.ones(S.shape[:-1])
+            return
+        key = id(factor)
+        self._found[key] = ref(factor, lambda _: self._found.pop(key, None)), ref(covariance)
+
+
+def _is_known(part: object) -> bool:
+    """Return whether a part is an array of numbers, and not traced or a mark of what stands there."""
+    return isinstance(part, np.ndarray) or (isinstance(part, jax.Array) and not isinstance(part, jax.core.Tracer))
