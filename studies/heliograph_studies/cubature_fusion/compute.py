@@ -16,10 +16,9 @@ from heliograph.factors.covariance_factors import (
     WeightedColumns,
     decorrelate,
     join_columns,
-    reciprocal_or_zero,
-    square_root,
 )
 from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.factors.pivots import reciprocal_or_zero, square_root
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
 from heliograph.filters.gaussian.moment_transforms import evaluate_beside_mean
