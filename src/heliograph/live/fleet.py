@@ -243,7 +243,7 @@ class Fleet:
         """Return the verdict on an event of a plant, and hold the event in its row if that is "used".
 
         An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
-        the same; if the next goes on from before it, it is withdrawn (`ClockLeap` says it in full).
+        the same; if the next event is dated before that gap, it is withdrawn (`ClockLeap` has the rule).
 
         Args:
             plant: the plant.
