@@ -273,7 +273,7 @@ class Solution:
         method: Method,
         level: float,
     ) -> tuple[float, float]:
-        """Return the ends of the interval of a number of the table, on the line, where its domain is symmetric.
+        """Return the ends of the interval of a number of the table, in its unbounded coordinate (number, log or logit).
 
         By `method`: estimate +- quantile x standard error, or quantiles of a bootstrap, or where the profile of the
         likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
@@ -306,7 +306,7 @@ class Solution:
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, from its standard error and both ends of its interval on the line."""
+        """Return the row of an identified number, from its error and its interval in the unbounded coordinate."""
         low, high = sorted(float(from_line(entry.domain, end)) for end in ends)
         slope = abs(float(slope_from_line(entry.domain, to_line(entry.domain, value))))
         return Row(
