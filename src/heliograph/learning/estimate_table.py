@@ -181,7 +181,7 @@ class Solution:
 
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates (active,) are real numbers on which only a few stretches of the data inform."""
+        """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
@@ -192,7 +192,7 @@ class Solution:
         """Return the covariance of the active coordinates along the identified directions, and its degrees of freedom.
 
         It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores (gradients of l by row),
-        estimated by `method`. Numbers on which only a few stretches of the data (`few`) inform have J from the model.
+        estimated by `method`. Numbers whose information is in a few stretches of the data (`few`) have the model's J.
         """
         scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
         if self.few.any():
@@ -232,9 +232,9 @@ class Solution:
         ]
 
     def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
-        """Return in words an estimate `value` and its interval, which is symmetric on the unbounded line.
+        """Return in words an estimate `value` and its interval, symmetric in the unbounded coordinate (log or logit).
 
-        `error`: its standard error on the line. `slope`: its derivative, which tells whether it is identified.
+        `error`: its standard error there. `slope`: its derivative, which shows whether it is identified.
         """
         if entry.coordinate is not None and not self.active[entry.coordinate]:
             return f"{value:>10.4g}  (at the end of its domain)"
@@ -273,7 +273,7 @@ class Solution:
         method: Method,
         level: float,
     ) -> tuple[float, float]:
-        """Return the ends of the interval of a number of the table, on the line, where its domain is symmetric.
+        """Return the ends of the interval of a number of the table, in its unbounded coordinate (number, log or logit).
 
         By `method`: estimate +- quantile x standard error, or quantiles of a bootstrap, or where the profile of the
         likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
@@ -289,24 +289,24 @@ class Solution:
             level: probability with which the interval holds the number.
         """
         coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
-        is_told_by_few = False
+        is_in_few = False
         if coordinate is not None:
             hardly_known = self.surface.domains.single[coordinate] and error > WIDE
             if hardly_known or method == "profile":
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
-            is_told_by_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])  # its place among active ones
+            is_in_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])  # its place among active ones
         center = float(to_line(entry.domain, value))
-        # Blocks drawn anew say nothing of numbers of which a few stretches of the data tell all.
-        if method == "bootstrap" and not is_told_by_few:
+        # Resampled blocks do not show how a number varies whose information is in a few stretches of the data.
+        if method == "bootstrap" and not is_in_few:
             low, high = center + self._bootstrap_interval(slopes, level)
             return low, high
         half = student_quantile(freedom, level) * error
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, from its standard error and both ends of its interval on the line."""
+        """Return the row of an identified number, from its error and its interval in the unbounded coordinate."""
         low, high = sorted(float(from_line(entry.domain, end)) for end in ends)
         slope = abs(float(slope_from_line(entry.domain, to_line(entry.domain, value))))
         return Row(

@@ -258,26 +258,29 @@ def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed:
 
 @quickly_compiled
 def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
-    """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before."""
+    """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before.
+
+    Gains or noise variances that are reported with each message are part of z, and drawn from their own law.
+    """
     filter = objective.filter(jnp.asarray(x))
-    told = find_told_filter(filter)
+    reporting = find_told_filter(filter)
 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         """Return the filter's state after row k, and the measurement drawn for it."""
         k, u_k, noise = row
         prior, zeros = filter.predict(state, u_k, k), jnp.zeros(filter.received)
-        # What a message tells of its link is drawn first: it gives the law of the rest.
+        # Draw the reported numbers first: the law of the other components depends on them.
         numbers = jnp.zeros(0)
-        if told is not None:
-            numbers = told.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
-            zeros = told.with_numbers(zeros, numbers)
-        # The innovation of z = 0 is -E z, with covariance S; of what is told both are NaN.
+        if reporting is not None:
+            numbers = reporting.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
+            zeros = reporting.with_numbers(zeros, numbers)
+        # The innovation of z = 0 is -E z, with covariance S; both are NaN for reported numbers.
         received = filter.correct(prior, zeros, k)[1]
         is_value = ~jnp.isnan(received.value)
         S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
         z = cholesky(S) @ noise - received.value
-        if told is not None:
-            z = told.with_numbers(z, numbers)
+        if reporting is not None:
+            z = reporting.with_numbers(z, numbers)
         return filter.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, filter.init())

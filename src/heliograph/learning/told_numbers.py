@@ -9,23 +9,23 @@ from heliograph.filters.base import AbstractFilter
 
 @runtime_checkable
 class TellsNumbers(Protocol):
-    """A filter of messages that tell numbers of their link's law, such as `linear_filter` behind `hop(known=True)`.
+    """A filter of messages that report their link's gain or noise variance, as behind `hop(known=True)`.
 
     Args:
-        numbers: their rows in what is received.
+        numbers: rows of the reported numbers in a message (received,).
     """
 
     numbers: tuple[int, ...]
 
     def draw_numbers(self, key: jax.Array, k: jax.Array | int = 0) -> jax.Array:
-        """Draw what a message tells at step k."""
+        """Draw the numbers that a message reports at step k from their law."""
 
     def with_numbers(self, z: jax.Array, numbers: jax.Array) -> jax.Array:
-        """Return a message with these numbers in the place of its own."""
+        """Return the message z (received,) with these numbers in place of its own reported ones."""
 
 
 def find_told_filter(filter: AbstractFilter) -> TellsNumbers | None:
-    """Return the filter that reads told numbers, which is `filter` or a filter inside it, or None.
+    """Return the filter that reads gains or noise variances reported with messages: `filter`, one inside it, or None.
 
     An outer filter, such as one with limits of states, leaves messages as they are.
     """

@@ -136,7 +136,7 @@ class Fleet:
         self._step_chains(chains)
 
     def end_silence(self, plant: PlantState) -> None:
-        """Forget the row that was predicted for the silence of a plant, and free its slot in the table."""
+        """Forget the row of a plant that was predicted without measurements, and free its slot in the table."""
         if plant.silence is not None:
             self.pool.free_slots([plant.silence.slot])
             plant.silence = None
@@ -192,7 +192,7 @@ class Fleet:
         return values
 
     def count_values_alone(self, node: str) -> int | None:
-        """Return how many values a node's event has without the numbers of lost ones; None if it has none of these."""
+        """Return how many values a node's event has without numbers of lost messages; None if it has none of these."""
         return self._values_before_losses.get(self.sizes[node][0])
 
     def _find_lost_column(self, node: int) -> tuple[str, int] | None:
@@ -243,7 +243,7 @@ class Fleet:
         """Return the verdict on an event of a plant, and hold the event in its row if that is "used".
 
         An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
-        the same; if the next goes on from before it, it is withdrawn (`ClockLeap` says it in full).
+        the same; if the next event is dated before that gap, it is withdrawn (`ClockLeap` has the rule).
 
         Args:
             plant: the plant.

@@ -104,8 +104,8 @@ def _pass_silent_steps(
 ) -> Float[np.ndarray, " state"]:
     """Return the state after `count` steps of silence: a few probes, and the rest at once by what these show.
 
-    A probe is PROBED real steps in a row. Where one moves nothing the state rests; where an affine map predicts it, the
-    map is applied for all steps that are left; else the probes are extrapolated. A state holds factors L, D of
+    A probe is PROBED real steps in a row. If one changes no number, the state stays. If an affine map predicts it, the
+    map is applied for all later steps. Else the probes are extrapolated. A state holds factors L, D of
     covariances at `places`; states are compared and extrapolated with L D L' there, since P' = F P F' + Q is affine in
     P and not in its factors.
 

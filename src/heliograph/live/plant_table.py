@@ -215,7 +215,7 @@ def cut_chain_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> 
 
 
 def group_by_turn(walks: Iterable[list[Single]]) -> list[list[Single]]:
-    """Return groups: the first steps of all walks, then the second steps of those that have one, and so on."""
+    """Return groups: the first steps of all walks, then the second steps of walks with at least two, and so on."""
     turns: list[list[Single]] = []
     for steps in walks:
         for turn, step in enumerate(steps):

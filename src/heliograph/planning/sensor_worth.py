@@ -218,7 +218,7 @@ def _list_cases(
 def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
     """Return the likelihood filter of everything the nodes receive, linear if plant and sensors are, without angles."""
     # The filter skips what is lost (NaN), so a channel without memory is taken given arrival. A channel with memory,
-    # such as bursts, stays as it is, since a loss tells something about the next one.
+    # such as bursts, stays as it is, since one loss changes the probability of the next.
     plant = network.plant
     channels = [
         node.channel if first(node.channel).remembers else at_each_step(_condition_on_arrival, node.channel)

@@ -168,8 +168,8 @@ def _compute_hop_powers(
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
     """Return each hop's power at step k for `moment` = E (y, 1)(y, 1)', or in the long run if `horizon` is None."""
-    link, _, told = separate_told_numbers(at(channel, k))
-    if told:  # a link that tells its gain or noise sends the same power
+    link, _, reported = separate_told_numbers(at(channel, k))
+    if reported:  # a link whose gain or noise variance is reported with each message sends the same power
         if not has_untold_law(link):
             raise fail("power of a link whose gain or noise is told", "a known law of what is told", "none")
         link = believe_untold(link)

@@ -1,4 +1,4 @@
-"""Status of devices, online or offline, by their last words, kept in the store with the state of the plants."""
+"""Status of devices, online or offline, by their last messages, stored with the state of the plants."""
 
 from collections.abc import Sequence
 
@@ -10,18 +10,18 @@ from heliograph.serving.storage.store_protocol import StoreProtocol
 
 
 class DeviceStatusService:
-    """A service that keeps the last words of devices: a device that was offline is so after a restart.
+    """A service that stores the last status of each device: one that was offline is so after a restart.
 
     Args:
         service: the service.
-        words: the words, which begin with those that are kept.
-        store: where they are kept.
+        words: the last statuses that devices sent; stored ones are restored into it.
+        store: where they are stored.
     """
 
     def __init__(self, service: BatchService, words: DeviceStatuses, store: StoreProtocol):
-        """Hold the service, the words of its devices (online or offline) and the store, and restore stored words."""
+        """Hold the service, the statuses of its devices (online or offline) and the store, and restore stored ones."""
         self._service, self._words, self._store = service, words, store
-        self._unkept = dict[str, int]()  # words that the store does not have yet, as numbers by topic
+        self._unkept = dict[str, int]()  # statuses that the store does not have yet, as numbers by topic
         words.restore(store.words())
 
     def unpublished(self) -> list[Output]:
@@ -29,7 +29,7 @@ class DeviceStatusService:
         return self._service.unpublished()
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Use messages and commit, and the words that came before them; return the outputs to publish."""
+        """Store the statuses that came before these messages, use the messages, and return the outputs to publish."""
         self._keep_words()
         return self._service.take(payloads)
 

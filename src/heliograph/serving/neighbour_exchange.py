@@ -53,13 +53,13 @@ class NeighbourMessenger:
         ]
 
     def _find_due_rows(self, plant: PlantState) -> list[HeldRow]:
-        """Return the rows (steps) whose message to the neighbours became due by the changes of this batch.
+        """Return the rows (steps) whose message to the neighbours became due since rows last became final.
 
         A message is due once its row has the node's measurement, or once there is a later row: the step is then over.
         """
         assert self._node is not None
-        # `plant.changes`: (row, what it was before the batch), where None stands for a new row. By changed row: whether
-        # it had the node's measurement before.
+        # `plant.changes`: (row, what it was then), where None stands for a new row. By changed row: whether it had the
+        # node's measurement then.
         measured_before: dict[int, bool] = {}
         for row, old in plant.changes:
             measured_before.setdefault(id(row), old is not None and self._has_measurement(old[1]))

@@ -123,7 +123,7 @@ class Service:
             self._silence.resume(self.plants)
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
-        """Return provisional estimates of the plants in which a sender has timed out by now; nothing is committed."""
+        """Return provisional estimates of plants in which a sender has newly timed out by now; nothing is committed."""
         late = self._silence.find_plants_overdue(self.plants.values(), now)
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
@@ -341,7 +341,7 @@ class Service:
         return outputs
 
     def _forget_plant(self, name: str) -> None:
-        """Let a plant leave the memory."""
+        """Remove a plant from memory and free its rows; a stored state stays in the store."""
         self.fleet.end_plant(self.plants.pop(name))
         self._silence.forget_plant(name)
 

@@ -153,11 +153,11 @@ class SilenceWatch:
         return bool(((mean_change > enough) | (deviation_change > enough)).any())
 
     def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
-        """Return the dead senders of a plant, by now."""
+        """Return the senders of a plant that have been silent for longer than they may, by `now` or its newest row."""
         return tuple(name for name, status in self.fleet.find_sender_status(plant, now).items() if status.dead)
 
     def _published_dead_senders(self, plant: PlantState) -> tuple[str, ...]:
-        """Return the senders of a plant that were told to be dead."""
+        """Return the senders of a plant that its last published estimate named as dead; () if none was published."""
         return self._published[plant.name].dead if plant.name in self._published else ()
 
 

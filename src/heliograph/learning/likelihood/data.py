@@ -97,20 +97,20 @@ def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> objec
 def _split_truth(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
     """Return the true states (steps, n) of each run of each recording, NaN where they are not known.
 
-    `truth`: True for those that the recordings hold, else the states, or a list of them; `steps`: length of each run.
+    `truth`: True for those in the recordings, else the states, or a list of them. `steps`: length of each run.
 
     Raises:
         ValueError: recordings without them, other shapes.
     """
-    held = [getattr(single, "truth", None) for single in several] if truth is True else truth
-    listed = held if isinstance(held, list | tuple) and len(held) == len(several) else [held]
+    states = [getattr(single, "truth", None) for single in several] if truth is True else truth
+    listed = states if isinstance(states, list | tuple) and len(states) == len(several) else [states]
     if len(listed) != len(several) or any(single is None for single in listed):
         got = "none" if truth is True else f"{len(listed)} of them"
         raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
     runs = [
         run
-        for states in (np.asarray(fill_masked(part)) for part in listed)
-        for run in (states if states.ndim == 3 else [states])
+        for of_recording in (np.asarray(fill_masked(single)) for single in listed)
+        for run in (of_recording if of_recording.ndim == 3 else [of_recording])
     ]
     if len(runs) != len(steps):
         raise fail("truth", f"the true states of each of the {len(steps)} runs", f"{len(runs)} of them")
@@ -128,9 +128,9 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
         recording: measurements by node, or of the only node; or an object with `measurements`, `inputs`, `time`.
         inputs: (steps, inputs); None for those of the recording, if it has any.
     """
-    held = getattr(recording, "measurements", recording)
+    measurements = getattr(recording, "measurements", recording)
     given_inputs = getattr(recording, "inputs", None) if inputs is None else inputs
-    by_node = _arrange_by_node(network, recording, held)
+    by_node = _arrange_by_node(network, recording, measurements)
     # The times of the rows are those that the recording holds, or the dates in the index of its tables.
     clock = getattr(recording, "time", None)
     if isinstance(clock, np.ndarray):
@@ -144,15 +144,16 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
     return [_join_nodes(network, run, given_inputs) for run in runs]
 
 
-def _arrange_by_node(network: Network, recording: Any, held: Any) -> Mapping[str, Any]:
-    """Return the measurements `held` by a recording as {node: measurements}; a plain array is that of the only node.
+def _arrange_by_node(network: Network, recording: Any, measurements: Any) -> Mapping[str, Any]:
+    """Return a recording's `measurements` as {node: measurements}; a plain array is that of the only node.
 
     Raises:
         ValueError: an array although there are several nodes, or other nodes than the network's.
     """
-    if not isinstance(held, Mapping) and len(network.names) > 1:
+    if not isinstance(measurements, Mapping) and len(network.names) > 1:
         raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
-    by_node: Mapping[str, Any] = held if isinstance(held, Mapping) else {network.names[0]: held}
+    is_by_node = isinstance(measurements, Mapping)
+    by_node: Mapping[str, Any] = measurements if is_by_node else {network.names[0]: measurements}
     if set(by_node) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(by_node))
     return by_node
@@ -176,8 +177,8 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
         u = np.array(check_rows("inputs", inputs, steps, count, missing=False, names=network.inputs))
     check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
     # Readings that the nodes refuse, by limits, codes or as stuck, count as not arrived, as where filters run.
-    kept = network.drop_refused_readings(measured, u)
-    return np.concatenate([kept[name] for name in network.names], axis=1), u
+    used = network.drop_refused_readings(measured, u)
+    return np.concatenate([used[name] for name in network.names], axis=1), u
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:

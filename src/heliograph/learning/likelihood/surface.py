@@ -141,7 +141,7 @@ class LikelihoodSurface:
         return [rows[:steps] for rows, steps in zip(information, self.data.lengths, strict=True)]
 
     def standard_errors(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """Return each coordinate's standard error at x if the others were known, (p,); infinite if nothing tells it."""
+        """Return each coordinate's standard error at x if the others were known, (p,); infinite without information."""
         information: np.ndarray = np.diag(self.evaluations(x[None]).information[0])
         return np.where(information > 0, 1 / np.sqrt(np.where(information > 0, information, 1.0)), np.inf)
 

@@ -222,7 +222,7 @@ class MarkovLosses(AbstractLossLaw):
 
 
 def _measure_spans(parts: Fates) -> np.ndarray:
-    """Return the steps from the first to the last packet of each stretch that was chosen for its ends, (stretches,)."""
+    """Return the steps from the first to the last packet of each stretch that was cut where packets arrived."""
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 

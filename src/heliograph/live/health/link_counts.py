@@ -1,4 +1,4 @@
-"""Counts of a node's messages by verdict, of those that its running count says were lost, and of long silences."""
+"""Counts of a node's messages by verdict, of lost ones (gaps in its running count), and of long silences."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -93,7 +93,7 @@ class LossChain(NamedTuple):
 
 
 class SilenceRule(NamedTuple):
-    """What tells how long a node may be silent.
+    """Rule on how long a node may be silent.
 
     Args:
         trigger: when its sender transmits, if that decides; None of one that sends whatever it measures.

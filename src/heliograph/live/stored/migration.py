@@ -123,7 +123,7 @@ def _number_state_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, di
     for name, state in sorted(central.items()):
         for path, columns in counter.number_parts(state).items():
             counter.note_part(f"{Network.FUSED}/{name}", path, columns)
-    # What centres and neighbours remember goes on only if the nodes are the same, which are part of its name.
+    # What fusions remember is carried over only if the nodes are the same: their names are part of its name.
     for path, columns in counter.number_parts(memory).items():
         counter.note_part(f"memory of the fusions of {', '.join(network.names)}", path, columns)
     return counter.filters, counter.count

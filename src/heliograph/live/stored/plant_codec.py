@@ -106,7 +106,7 @@ def _pack_parts(head: dict[str, Any], *flat_arrays: Sequence[float] | np.ndarray
     keys, events, _, _, values = flat_arrays  # of shapes (rows, 2), (events, 3) and (numbers,) once they are unpacked
     counts = len(keys) // 2, len(events) // 3, len(values)
     arrays = [np.array(numbers, dtype=kind) for numbers, kind in zip(flat_arrays, TYPES, strict=True)]
-    # Of a table that is mostly zeros a bit for each number, and those that are not zero.
+    # A table that is mostly zeros is stored as a bit for each number, and the numbers that are not zero.
     table = arrays[TABLE]
     is_stored = table.view("<i8") != 0  # by their bits, so that -0.0 is stored as well
     stored_count = int(np.count_nonzero(is_stored))

@@ -132,7 +132,7 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     below = whole.full - whole.signal * ratio
     sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
     slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
-    # Without power a path tells nothing: with one hop its slope is 1 / (A alpha), with several 0.
+    # Without power the information j is 0; its slope is 1 / (A alpha) with one hop, and 0 with several.
     slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
     return PowerSplit(
         powers=np.where(sends[..., None], p, 0.0),

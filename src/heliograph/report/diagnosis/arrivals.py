@@ -136,7 +136,7 @@ class Arrivals:
 
     @property
     def due_slots(self) -> Bool[np.ndarray, " due"] | None:
-        """Whether a message came in each slot in which one was due; None where nobody knows."""
+        """Whether a message came in each slot in which one was due; None if it is not known when messages were due."""
         return self.slots if self.slots is None or self.pattern is None else self.slots[self.pattern.rows]
 
     @property
@@ -173,7 +173,7 @@ class Arrivals:
 
     @property
     def due(self) -> int | None:
-        """Number of messages that were due; None where nobody knows."""
+        """Number of messages that were due; None if it is not known when messages were due."""
         return None if self.due_slots is None else len(self.due_slots)
 
     @property
@@ -187,7 +187,7 @@ class Arrivals:
 
     @property
     def share(self) -> float:
-        """Share of the messages that were due which arrived; NaN where nobody knows how many were."""
+        """Share of the messages that were due which arrived; NaN if it is not known how many were due."""
         return np.nan if self.due is None else min(float(self.arrived.sum()) / self.due, 1.0)
 
     def contradicts(self, level: float) -> bool:

@@ -15,9 +15,9 @@ LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below w
 def judge_size(size: float, error: float, numbers: int, level: float) -> int:
     """Return 1 (too large) or -1 (too small) if a mean square differs from its claim, 1, significantly; else 0.
 
-    It must be off by its interval and by a tenth. The logarithm of a mean square is nearly Gaussian, and its error is
-    the relative error. N numbers tell this error badly, so it counts as at least sqrt(2 / N), the error for N
-    independent Gaussian numbers.
+    It must be off by its interval at `level`, and by the factor LEAST_SIZE. log(size) is nearly Gaussian with the
+    standard error error / size. Estimated from N `numbers` that error is itself uncertain, so it counts as at least
+    sqrt(2 / N), the one of N independent Gaussian numbers.
     """
     if not (size > 0 and error > 0):
         return 0

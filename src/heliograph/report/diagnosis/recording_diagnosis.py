@@ -156,7 +156,7 @@ class Health:
     def doubted(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts.
 
-        Filters that use a stuck output are left out: their innovations tell nothing else.
+        Filters that use a stuck output are left out: their innovations show only that.
         """
         stuck = {node for node, _ in self.describe_stuck_outputs()}
 

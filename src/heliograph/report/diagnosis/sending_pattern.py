@@ -1,4 +1,4 @@
-"""Rows in which a sender is due, where these return as a pattern: told from losses by how seldom chance makes one."""
+"""Periodic patterns of rows in which a sender is due: tested against random losses, which seldom make a pattern."""
 
 from math import comb, exp, log
 from typing import NamedTuple

@@ -36,7 +36,7 @@ class ArrivalOrder:
     """
 
     def __init__(self, source: str, steps: bool) -> None:
-        """Begin without messages; the class says what the arguments are."""
+        """Begin without messages. `source`: name of the file, for errors. `steps`: whether times are step numbers."""
         self._source, self._steps = source, steps
         self._held = list[HeldPayload]()  # a heap, ordered by moment and then by count
         self._count, self._last = 0, float("-inf")  # how many payloads came so far; the moment of the newest

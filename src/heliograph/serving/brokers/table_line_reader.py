@@ -66,7 +66,7 @@ class TableLineReader:
         return self._read_rows([row for line in lines for row in self._text.add(f"{line}\n")])
 
     def end(self) -> list[Payload]:
-        """Return the messages of what is left at the end."""
+        """Return the messages of the last row, if it is not ended, and of the rows of a file, held until its end."""
         rest = self._read_rows(self._text.end())
         return rest + (self._reader.end() if isinstance(self._reader, TimeRowReader) else [])
 

@@ -73,7 +73,7 @@ class Store:
         carrier: PlantMigration | None = None,
         begun: bool = False,
     ):
-        """Open the database at `location`, or make it, and check that it is of `mine`; the class says all else."""
+        """Open the database at `location`, or make it, and check that it is of the network `mine`."""
         self.process, self.journal, self._begun = process, journal, begun
         self.identity: Identity = {}
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
@@ -311,7 +311,7 @@ class Store:
         return 0 if row is None else self._check_count(*row)
 
     def words(self) -> dict[str, int]:
-        """Return the last words of devices (online or not) that are kept, as numbers by topic."""
+        """Return the last stored status of each device (online or not), as a number by topic."""
         select_words = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             rows = connection.execute(select_words).all()

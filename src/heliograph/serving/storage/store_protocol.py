@@ -87,10 +87,10 @@ class StoreProtocol(Protocol):
         """Return the names of all stored plants."""
 
     def words(self) -> dict[str, int]:
-        """Return the last words of devices that are kept, as numbers by topic."""
+        """Return the last stored status of each device (online or not), as a number by topic."""
 
     def keep_words(self, words: Mapping[str, int]) -> None:
-        """Keep the last words of devices, as numbers by topic."""
+        """Store the last status of each device (online or not), as a number by topic."""
 
     def close(self) -> None:
         """Release the resources of the store."""
