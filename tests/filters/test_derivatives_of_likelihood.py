@@ -199,3 +199,12 @@ def test_a_transform_of_moments_alone_has_no_derivative_where_nothing_is_uncerta
     assert np.isnan(slopes_of(likelihood, (0.0, 0.0, 0.5))[0])
     expected = slopes_of(lambda x: textbook_likelihood(x, order=1), (0.8, 0.25, 0.4))
     np.testing.assert_allclose(slopes_of(likelihood, (0.8, 0.25, 0.4)), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (1.0, 0.25, 0.0)])
+def test_a_planned_filter_has_the_gradient_of_the_filter_itself(scales):
+    """Its matrices are recorded in the same trace; to some thousand roundings of the largest."""
+    zero = np.zeros((len(ROWS), 0))
+    slopes = slopes_of(lambda x: hg.log_likelihood(hg.kalman_filter(*linear_models(x)).planned(zero), ROWS), scales)
+    expected = slopes_of(lambda x: hg.log_likelihood(hg.kalman_filter(*linear_models(x)), ROWS), scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))

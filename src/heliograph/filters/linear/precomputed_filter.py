@@ -16,6 +16,7 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import in_float64, quickly_compiled
 from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.trace_settings import write_for_derivatives
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 
@@ -156,7 +157,8 @@ def plan_filter(
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
     if is_traced(arguments):
-        return _record_matrices(*arguments)
+        with write_for_derivatives():  # they are derivatives of covariances, also where these are zero
+            return _record_matrices(*arguments)
     return cast(PlannedFilter, compute_once(_record_matrices, _plan_by_xla, arguments, most=SHORT))
 
 
