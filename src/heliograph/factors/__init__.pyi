@@ -51,7 +51,7 @@ from .high_low_mean_gaussian import center_gaussian as center_gaussian
 from .high_low_mean_gaussian import center_known as center_known
 from .high_low_mean_gaussian import centred_from_covariance as centred_from_covariance
 from .pivots import reciprocal_or_zero as reciprocal_or_zero
-from .pivots import replace_value as replace_value
+from .pivots import spoil_derivatives as spoil_derivatives
 from .pivots import square_root as square_root
 from .pivots import unit_of as unit_of
 from .repeated_measurements import rounding_of_products as rounding_of_products

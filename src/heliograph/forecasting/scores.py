@@ -105,7 +105,7 @@ def _compute_distance_of_two(law: MixtureLaws) -> np.ndarray:
     for i in range(law.weights.shape[1]):
         differences, variances = law.means[:, [i]] - law.means[:, i:], law.variances[:, [i]] + law.variances[:, i:]
         pairs = law.weights[:, [i]] * law.weights[:, i:] * _compute_mean_size(differences, variances)
-        total += 2 * pairs.sum(axis=1) - pairs[:, 0]
+        total += pairs[:, 0] + 2 * pairs[:, 1:].sum(axis=1)
     return total
 
 

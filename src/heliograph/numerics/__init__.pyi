@@ -9,6 +9,11 @@ from .angles.angle import insert_gaps as insert_gaps
 from .angles.angle import read_angles as read_angles
 from .angles.angle import wrap_angles as wrap_angles
 from .angles.angle import wrap_near as wrap_near
+from .angles.manifold import Manifold as Manifold
+from .angles.rotation_vectors import matrix_of as matrix_of
+from .angles.rotation_vectors import quaternion_of as quaternion_of
+from .angles.rotation_vectors import rotation_vector_of as rotation_vector_of
+from .angles.rotation_vectors import turn as turn
 from .caching import cache_arrays as cache_arrays
 from .caching import cache_by_object as cache_by_object
 from .caching import share_by_object as share_by_object
@@ -36,6 +41,7 @@ from .check import file_path as file_path
 from .check import flag as flag
 from .check import function as function
 from .check import instance as instance
+from .check import is_diagonal as is_diagonal
 from .check import is_whole as is_whole
 from .check import items as items
 from .check import mark_checked as mark_checked
@@ -57,6 +63,7 @@ from .compensated_arithmetic import compensate as compensate
 from .compensated_arithmetic import split_sum as split_sum
 from .confidence_intervals import Share as Share
 from .confidence_intervals import average_correlated as average_correlated
+from .confidence_intervals import correlate_over_steps as correlate_over_steps
 from .confidence_intervals import count_independent as count_independent
 from .confidence_intervals import round_to as round_to
 from .confidence_intervals import wilson as wilson
@@ -97,9 +104,8 @@ from .linalg import squared_distance as squared_distance
 from .linalg import squared_distance_terms as squared_distance_terms
 from .linalg import symmetric as symmetric
 from .linalg import symmetrize as symmetrize
-from .linalg import whiten as whiten
 from .linalg import where as where
-from .angles.manifold import Manifold as Manifold
+from .linalg import whiten as whiten
 from .masked_arrays import fill_masked as fill_masked
 from .masked_arrays import is_absent as is_absent
 from .module import LINES as LINES
@@ -140,10 +146,6 @@ from .process.stop_signals import STOPPING as STOPPING
 from .process.stop_signals import handle_stop_signals as handle_stop_signals
 from .process.stop_signals import hold_signals as hold_signals
 from .random_keys import seed_key as seed_key
-from .angles.rotation_vectors import matrix_of as matrix_of
-from .angles.rotation_vectors import quaternion_of as quaternion_of
-from .angles.rotation_vectors import rotation_vector_of as rotation_vector_of
-from .angles.rotation_vectors import turn as turn
 from .times.data_row_checks import check_rows as check_rows
 from .times.dates import MISSING as MISSING
 from .times.dates import UNITS as UNITS
@@ -162,10 +164,12 @@ from .times.row_times import backwards_text as backwards_text
 from .times.row_times import check_dates as check_dates
 from .times.row_times import check_times as check_times
 from .times.row_times import find_backwards_row as find_backwards_row
+from .times.row_times import find_lost_digits as find_lost_digits
 from .times.row_times import is_mix_of_units as is_mix_of_units
 from .times.row_times import row_dates as row_dates
 from .times.timestamp_order import SECOND as SECOND
 from .times.timestamp_order import YEAR as YEAR
+from .times.timestamp_order import find_clock_set_back as find_clock_set_back
 from .times.timestamp_order import find_out_of_order as find_out_of_order
 from .times.timestamp_order import find_unset_stamps as find_unset_stamps
 from .trace_settings import KEPT as KEPT
@@ -175,6 +179,7 @@ from .trace_settings import precision_in_use as precision_in_use
 from .trace_settings import use_precision as use_precision
 from .trace_settings import write_for_derivatives as write_for_derivatives
 from .trace_settings import write_short_programs as write_short_programs
+from .trace_settings import writes_for_derivatives as writes_for_derivatives
 from .trace_settings import writes_short_programs as writes_short_programs
 from .trees.flattened_trees import FlatLayout as FlatLayout
 from .trees.flattened_trees import flatten_to_row as flatten_to_row

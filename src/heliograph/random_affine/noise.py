@@ -18,7 +18,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.factor_of_covariance import WeightsOfFactor
+from heliograph.random_affine.factor_of_covariance import FACTOR_TOLERANCE, WeightsOfFactor, factor_by_eigenvectors
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import (
     GaussianBranches,
@@ -29,9 +29,6 @@ from heliograph.random_affine.moments.mixture_components import (
     stack_branches,
 )
 from heliograph.random_affine.moments.monomials import Exponents, list_exponents
-
-LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
-FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
 
 Number = float | jax.Array
 Vector = Float[jax.Array | np.ndarray, " n"]
@@ -124,28 +121,6 @@ class AbstractNoise(Module):
         raise unwritten(self, "moment")
 
 
-def _factor_by_eigenvectors(covariance: Square) -> np.ndarray:
-    """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
-
-    Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
-    eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
-    have none.
-    """
-    matrix = np.asarray(covariance)
-    if len(matrix) > LARGE and check.is_diagonal(matrix):
-        root: np.ndarray = np.diag(np.sqrt(np.diagonal(matrix)))
-        return root
-    deviation = np.sqrt(np.diagonal(matrix))
-    unit = np.where(deviation > 0, deviation, 1.0)
-    for scale in (np.ones_like(unit), unit):
-        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-        rounding = 10 * len(values) * np.finfo(float).eps * np.max(values, initial=0.0)
-        factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.where(values > rounding, values, 0.0)))
-        if np.all(np.abs(factor @ factor.T - matrix) <= FACTOR_TOLERANCE * np.outer(unit, unit)):
-            break
-    return factor
-
-
 class Gaussian(AbstractNoise):
     """Gaussian noise with the given covariance and mean (zero unless given).
 
@@ -157,7 +132,7 @@ class Gaussian(AbstractNoise):
     covariance: Square
     mean: Vector
     factor: Square  # A diag(w) A' is the covariance: of eigenvectors, with w = 1; where it is traced, L and d of L D L'
-    weights: Vector = WeightsOfFactor(_factor_by_eigenvectors, FACTOR_TOLERANCE)  # type: ignore[assignment]
+    weights: Vector = WeightsOfFactor(factor_by_eigenvectors, FACTOR_TOLERANCE)  # type: ignore[assignment]
 
     def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
         """Hold covariance and mean, and a square root of the covariance: factor diag(weights) factor'."""
@@ -167,7 +142,7 @@ class Gaussian(AbstractNoise):
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
             self.factor, self.weights = columns_of(self.covariance)
             return
-        self.factor = _factor_by_eigenvectors(self.covariance)
+        self.factor = factor_by_eigenvectors(np.asarray(self.covariance))
         self.weights = np.ones(n)
 
     @property

@@ -62,7 +62,7 @@ from heliograph.simulation.node import (
     get_parts_of_reception,
 )
 from heliograph.simulation.recordings.screened_recording import ScreenedRecording, screen_recording
-from heliograph.simulation.sender_checks import check_type
+from heliograph.simulation.sender_checks import check_type, refuse_words
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
@@ -265,15 +265,12 @@ class Network(Module):
             name: max((filter.received for filter in by_name.values()), default=0) for name, by_name in filters.items()
         }
         if sum(received.values()) != first(channel).outputs:
-            raise fail(
-                "nodes that share a channel", f"to receive its {first(channel).outputs} outputs, each once", received
-            )
+            expected = f"to receive its {first(channel).outputs} outputs, each once"
+            raise fail("nodes that share a channel", expected, received)
         for name, by_name in filters.items():
             check_filters(by_name, received[name])
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
-        nodes = {
-            name: ReceivingNode(dict(by_name), received[name], names, complete) for name, by_name in filters.items()
-        }
+        nodes = {name: ReceivingNode(dict(own), received[name], names, complete) for name, own in filters.items()}
         return Network(plant, nodes, fused, common=CommonReception(sensor, channel))
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
@@ -350,9 +347,8 @@ class Network(Module):
 
     def with_nominal_claims(self) -> "Network":
         """Return the network whose covariances claim "nominal" at most, as where rounding may spoil any digit."""
-        lowered = copy(self)  # without the constructor, which would check all again
+        lowered = copy(self)  # without the constructor, which would check all again; fields are frozen
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
-        # Fields are frozen.
         object.__setattr__(lowered, "nodes", make_nodes_nominal(self))
         object.__setattr__(lowered, "fused", make_fusions_nominal(self))
         object.__setattr__(lowered, "claimed", claimed)
@@ -387,6 +383,10 @@ class Network(Module):
         for line in screened.said:
             warnings.warn(line, stacklevel=3)
         return screened.measurements
+
+    def check_sends_numbers(self, what: str) -> None:
+        """Raise ValueError if a node rounds to codewords (`encoder`), since `what` is for the numbers themselves."""
+        refuse_words(what, self.nodes)
 
     def check_sends_each_step(self, what: str) -> None:
         """Raise ValueError if a node has a trigger, since `what` needs senders that transmit at each step."""

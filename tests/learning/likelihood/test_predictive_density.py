@@ -179,3 +179,16 @@ def test_a_channel_that_delivers_a_number_without_noise_has_no_density():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 0.5), hg.LinearSensor([[1.0]], 0.2)
     with pytest.raises(hg.InputError, match="expected one behind which every measurement has a density"):
         hg.learning.predictive(plant, sensor, hg.dropout(hg.perfect(), 0.7), [[1.3]])
+
+
+@pytest.mark.parametrize("rows", [10, 40])
+def test_the_standard_error_of_few_rows_is_not_too_small(rows):
+    """Of independent differences it is 1 / sqrt(n); 2,000 recordings tell its root mean square to 3 %.
+
+    About the mean of the recording itself it was 0.81 of that for ten rows, 0.94 for forty.
+    """
+    draws, zeros = np.random.default_rng(0).normal(size=(2000, rows)), np.zeros((rows, 1))
+    nothing = hg.learning.Predictive(np.zeros(rows), zeros)
+    compared = [hg.learning.compare_laws(hg.learning.Predictive(row, zeros), nothing) for row in draws]
+    said = np.sqrt(np.mean([result.standard_error**2 for result in compared]))
+    assert said == pytest.approx(1 / np.sqrt(rows), rel=0.05)

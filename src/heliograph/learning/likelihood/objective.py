@@ -24,7 +24,6 @@ from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.sender_checks import refuse_words
 
 
 def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
@@ -33,7 +32,7 @@ def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     Raises:
         ValueError: relays that filter and forward, senders of words (a sensor with a resolution can be learned).
     """
-    refuse_words("network to be learned", network.nodes)
+    network.check_sends_numbers("network to be learned")
     if network.relays is not None:
         raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
     # All nodes receive through one common channel.

@@ -35,7 +35,7 @@ def check_rows(
     check_columns(name, value, names)
     try:
         values = np.asarray(fill_masked(value))
-        if holds_texts_or_dates(values):
+        if holds_texts_or_dates(values) or values.dtype.kind == "c":
             raise ValueError
         values = values.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError):

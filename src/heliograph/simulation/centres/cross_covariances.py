@@ -21,7 +21,6 @@ from heliograph.simulation.centres.observation_model import SharedObservation
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.precomputed_filters import precompute_filters
-from heliograph.simulation.sender_checks import refuse_words
 
 REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
 
@@ -205,7 +204,7 @@ def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | No
     """
     network.check_horizon(check_horizon(horizon))
     network.check_sends_each_step("covariances before data")
-    refuse_words("covariances before data", network.nodes)
+    network.check_sends_numbers("covariances before data")
     u = read_plant_inputs(network, inputs, horizon)
     filters = AllFilters(network)
     if not filters.centres:

@@ -36,7 +36,6 @@ from heliograph.simulation.centres.mesh_check import find_claim_of_errors
 from heliograph.simulation.centres.mesh_state_and_step import MeshStep
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.network import Network
-from heliograph.simulation.sender_checks import refuse_words
 
 SPARSE = 2000  # nodes whose joint covariance fits in memory
 
@@ -372,7 +371,7 @@ def find_mesh(network: Network, fusion: str) -> Mesh:
     """
     what = "errors between neighbours before any data"
     instance("network", network, Network, "a Network").check_sends_each_step(what)
-    refuse_words(what, network.nodes)
+    network.check_sends_numbers(what)
     if not isinstance(fusion, str) or fusion not in network.meshes:
         raise fail("fusion", f"one between neighbours, of {list(network.meshes)}", repr(fusion))
     if len(network.mesh_nodes(fusion)) > SPARSE:

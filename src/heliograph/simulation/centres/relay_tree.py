@@ -31,7 +31,6 @@ from heliograph.simulation.centres.observation_model import (
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.stacked_filters import StackedFilters
-from heliograph.simulation.sender_checks import refuse_words
 
 BLOCK = 1000  # nodes that are followed together
 
@@ -118,7 +117,7 @@ def relay_tree(
         one_leaf = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
         one_leaf.check_horizon(steps)
         one_leaf.check_sends_each_step("covariances before data")
-        refuse_words("covariances before data", one_leaf.nodes)
+        one_leaf.check_sends_numbers("covariances before data")
         u = read_plant_inputs(one_leaf, inputs, steps)
         # Leaves in blocks of about BLOCK, each of them all leaves of some relays; of each block the covariances, the
         # weights, and the errors of the relays above.
