@@ -260,7 +260,10 @@ def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed:
 def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before.
 
-    Gains or noise variances that are reported with each message are part of z, and drawn from their own law.
+    Such measurements follow the law that the likelihood assumes, which tests of identifiability need. Each row is drawn
+    given those before, by the filter's own prediction. Gains or noise variances that are reported with each message are
+    part of z, and drawn from their own law. `x`: the free numbers (p,), from which `objective` makes the filter. `u`:
+    inputs (steps, inputs).
     """
     filter = objective.filter(jnp.asarray(x))
     reporting = find_told_filter(filter)
@@ -274,10 +277,12 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
         if reporting is not None:
             numbers = reporting.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
             zeros = reporting.with_numbers(zeros, numbers)
-        # The innovation of z = 0 is -E z, with covariance S; both are NaN for reported numbers.
+        # The innovation of z = 0 is -E z, with covariance S. Both are NaN for reported numbers, which get S = I and are
+        # overwritten below.
         received = filter.correct(prior, zeros, k)[1]
         is_value = ~jnp.isnan(received.value)
         S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
+        # z = E z + L noise, with L L' = S.
         z = cholesky(S) @ noise - received.value
         if reporting is not None:
             z = reporting.with_numbers(z, numbers)

@@ -233,8 +233,10 @@ def _climb_simplex(
     at_start = likelihood(start)
     if not len(start) or at_start > enough:  # nothing to search, or nothing to improve
         return _BestPoint(start, at_start, converged=True, stopped=False)
+    # First simplex (p + 1, p): the start, and a step of `size` along each coordinate.
     simplex = start + size * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     most = MOST_EVALUATIONS * len(start)
+    # `minimize` takes -l, and stops by size of the simplex, by values, or after too many evaluations.
     options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": most}
     climb: Any = minimize  # its types do not know an initial simplex
 

@@ -178,7 +178,10 @@ def worth_of_changes(
 def _list_changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
     """Return {name of a change: the design problem of the changed network}.
 
-    Changes are each sensor once more, each left out, and if `exponent` (of the path loss) is given a relay in each hop.
+    Comparing their optimal designs says which change of the network would be worth most. Changes are: each sensor once
+    more, each sensor left out, and, if `exponent` (of the path loss: power falls as distance^-exponent) is given, a
+    relay in the middle of each hop. `problem` holds the powers that are free (`free`, names of transmitters or nodes)
+    and the budget or the target error.
     """
     senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     nodes = {name: Node(node.sensor, node.channel, {}) for name, node in senders.items()}  # without filters
@@ -189,7 +192,7 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
 
     problems = {}
     for name, node in nodes.items():
-        # The sensor once more; it is free as the others are.
+        # The sensor once more. If some powers are free by name, the new sensor's are too.
         twin = f"{name} again"
         with_twin = None if free is None else (*free, twin)
         problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)

@@ -99,31 +99,39 @@ class MessageLayout:
     def _locate_field_numbers(self, begin: int, node: str, of: Any, path: str) -> int:
         """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins.
 
-        The bytes are those of CDR, the encoding of ROS 2: each number is aligned to its size.
+        A bag has many messages of the same layout. Once the byte of each wanted number is known, all of them are read
+        at once, without decoding one by one. The bytes are those of CDR, the encoding of ROS 2: each number is aligned
+        to its size. `self._paths`: dotted paths of the wanted numbers.
 
         Args:
-            begin: the byte behind the field before it.
+            begin: the first byte behind the previous field.
             node: what the field is, as rosbags names it: "NAME" of a message, "BASE" of a number or text, "ARRAY" or
                 "SEQUENCE" of a list of fixed or of any length.
             of: of "NAME" the message's type; of "BASE" the basic type, first in a tuple; of a list what each of its
                 items is, as a pair like `node` and `of`, and how many there are ("SEQUENCE": at most).
             path: dotted path of the field in the whole message.
         """
+        # A message within the message: locate its fields in turn.
         if node == "NAME":
             return self._locate_message_numbers(begin, of, f"{path}.")
+        # A text: four bytes with its length, then its characters. The length is part of the layout.
         if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
             begin = _align_to_size(begin, 4)
             return begin + 4 + self._note_length(begin)
+        # A single number.
         if node == "BASE":
             return self._locate_numbers_in_row(begin, of[0], 1, [path])
+        # A list. If it may have any length, its length stands in four bytes before its items.
         (item_node, item_of), count = of
         if node == "SEQUENCE":  # the length that it has in this message stands before its items
             begin = _align_to_size(begin, 4)
             count, begin = self._note_length(begin), begin + 4
+        # A list of numbers is located at once, since it may have millions; names are made only if some are wanted.
         if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
             names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
             return self._locate_numbers_in_row(begin, item_of[0], count, names)
+        # Other items one after the other.
         for i in range(count):
             begin = self._locate_field_numbers(begin, item_node.name, item_of, f"{path}.{i}")
         return begin

@@ -284,9 +284,12 @@ def examine(
     """
     _check_record(network, record)
     shape = len(record.time), len(network.inputs)
+    # Inputs (time, inputs), without columns for a plant without inputs.
     u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
     # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
+    # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, their correlations over time, and the
+    # health of each sensor output.
     for listener in yield_filters_with_measurements(network, record):
         advance(f"testing {listener.node}/{listener.name}")
         filters.append(_examine_filter(network, listener, record, u))
@@ -313,16 +316,23 @@ def _examine_filter(
 ) -> FilterHealth:
     """Return one filter's innovations scaled to covariance I by its claim (`white`), and what tests say of them.
 
-    Both are None for a filter that claims no covariance, or receives nothing. `expected`: mean squares of `white` that
-    the model expects in this recording. `declared`: tests of variances that are reported with messages.
+    `white` (time, m): innovations L^-1 (z - E z), with L L' the claimed covariance. If the claim (what the covariance
+    is said to be) holds they have variance 1 and no correlation over time, which `test` examines. Both are None for a
+    filter that claims no covariance, or receives nothing. `expected`: mean square of `white` that the model expects in
+    this recording, which random gains may move from 1. `declared`: tests of noise variances that are reported with
+    messages. `listener` holds the filter, its names, and the measurements that it received.
     """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
+    # Without a claim there is nothing to test; 1 is the mean square that a true claim gives.
     white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
     if filter.claim != "none" and filter.received:
+        # Whiten the innovations, test their correlation over time (of a filter that weighs outliers down, about their
+        # mean), and compare their size with the expected one.
         white = np.asarray(score_innovations(filter, z, inputs)[1])
         test = find_memory(subtract_mean(white) if weighs(filter) else white)
         expected = compute_expected_squares(filter, z, inputs)
         test = None if test is None else scale_size_to_expected(test, white, expected)
+    # Whether the filter lost its claim in some row: then it has none for the recording.
     lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
     return FilterHealth(
         node=node,
