@@ -161,9 +161,10 @@ def _list_needs(node: Any) -> list[Any]:
 def _list_dependencies(node: Any) -> list[Any]:
     """Return what a node, store, guard or loop needs before it can be computed.
 
-    A "parameter" is a number that a loop carries, as its body reads it, and a "result" the same after the loop. A
-    "counter" is the number of a loop's iteration, and "guarded" a number that a guarded block computes. Of these, and
-    of a load, the attribute `value` says to which statement or buffer they belong.
+    A node is an operation on numbers; a store writes to memory, a guard is a conditional block. A "parameter" is a
+    number that a loop carries, as its body reads it, and a "result" the same after the loop. A "counter" is the number
+    of a loop's iteration, and "guarded" a number that a guarded block computes. The attribute `value` of these nodes,
+    and of a load, says to which statement or buffer they belong.
     """
     if isinstance(node, Store):
         return [node.node, *node.indices]

@@ -47,12 +47,15 @@ def known_channel_design(
 def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
     """Return a design by the Riccati recursion at one level; it ends, infeasible, at a step for which no gain exists.
 
-    The weight before step k is P_k = diag(p I, P2), with a number p for x and a matrix P2 for e.
+    The filter bounds the energy of the error e by level^2 = gamma^2 times that of the disturbances. A storage function
+    (x, e)' P_k (x, e) proves it, with P_k = diag(p I, P2), a number p for the state x and a matrix P2 for e. A Riccati
+    step gives the best gain and the next P2. The design ends, infeasible, at a step for which no gain exists.
 
     Args:
-        system: the system.
-        level: gamma.
-        multipliers: of f~ and h~, in the user's units.
+        system: the system x+ = A x + f(x) + B v with its measurements, its initial weight W, and growth bounds of f and
+            h.
+        level: gamma, the bound to be reached.
+        multipliers: multipliers of the growth bounds of the differences f~ and h~ (steps, 2), in the user's units.
     """
     n, m, steps = system.states, system.received, system.steps
     # A little below the level, so that the certificate has a margin.

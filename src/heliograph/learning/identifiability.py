@@ -182,14 +182,16 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
 
-    Such as "Of a and b only the product a * b (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a
-    `solution`, the maximum of the likelihood.
+    Confounded numbers are free numbers that the data do not tell apart. Such as "Of a and b only the product a * b
+    (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a `solution`, the maximum of the likelihood.
+    `group` has the numbers' indices, how many must be fixed (`fix`), and the combinations that are identified:
+    `exponents` of products, `weights` of sums (combinations, numbers).
     """
     names = [parameters.coordinates[i] for i in group.places]
     if group.fix == len(names):  # no combination of them is identified
         return f"Nothing in the data tells {_join_names(names)}."
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
-    # Products x^a y^b and sums a x + b y that are identified, each with its interval.
+    # Identified products x^a y^b and sums a x + b y, each with its interval.
     combinations = []
     for row in group.exponents:
         combinations.append(format_product(names, row) + _format_interval(parameters, group, row, solution, log=True))
@@ -199,6 +201,7 @@ def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers,
     unnamed = len(names) - group.fix - len(combinations)
     if not combinations:
         return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
+    # Choose the words. a / b is no product but a combination; if there are sums, there are no products.
     kind = "product" if np.all(group.exponents >= 0) else "combination"  # a / b is no product
     if len(group.weights):  # then there are no products
         kind = "sum"

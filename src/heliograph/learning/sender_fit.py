@@ -174,9 +174,9 @@ def _search_from_starts(
     """Return the best end of searches from several starts; after Ctrl-C the best point at which the likelihood was.
 
     Args:
-        likelihood: the log-likelihood at a point of the line (p,).
-        points: where the searches begin.
-        say: called with a line of text behind each search.
+        likelihood: the log-likelihood at a point (p,), whose coordinates are unbounded.
+        points: starts of the searches, (p,) each.
+        say: called with a line of text after each search.
 
     Raises:
         KeyboardInterrupt: before there was a first point.

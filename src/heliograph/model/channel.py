@@ -106,7 +106,7 @@ def hop(
         power: E, not negative (default 1).
         amplification: of a relay, z per unit of what it receives (default 1).
         dimension: number of components where `noise` is a variance (default 1).
-        delay: steps by which messages are late, or the law of this delay (default: none).
+        delay: in steps, or its law (default: none).
         known: True for a coherent receiver, to which each message reports the gain, z = (a sqrt(E) g y + n, g); a
             `Pilot` if it reports a reading of the gain. Reported numbers pass unchanged through all that the hop is
             built into, and stand at the end of z. False unless given.
@@ -116,15 +116,11 @@ def hop(
 
     Source: cubature fusion under amplify-and-forward relays, equations (3) and (5).
     """
-    # A fixed gain is a law with one value.
     law = gain if isinstance(gain, AbstractLaw) else Constant(gain)
-    # Number of components: that of the noise, or `dimension` where the noise is one variance.
     count = count_components(noise) or check_count("dimension of a hop", dimension)
     p = scalar("hop power", power, 0.0)
-    # z = factor g y + n, with factor = amplification sqrt(power).
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
     radio_hop = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
-    # Append the gain that each message reports, if the receiver knows it; then the delay, if there is one.
     link = append_told_gain(radio_hop, known)
     return link if delay is None else delayed(link, delay)
 

@@ -128,6 +128,7 @@ def gauss_markov(
     size, rate = _read_deviation_and_rate(deviation, time)  # rate: 1 / T
     names = name_list("states", states)
     identity = np.eye(len(names))
+    # A = -1/T I. Stationary variance s^2 needs noise of intensity 2 s^2 / T, and s^2 at the start, s the deviation.
     matrix, intensity, initial_covariance = -rate * identity, 2 * size**2 * rate * identity, size**2 * identity
     return continuous_plant(
         matrix, intensity, np.zeros(len(names)), initial_covariance, dt=dt, states=_keep_units(names)

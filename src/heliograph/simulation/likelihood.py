@@ -45,9 +45,11 @@ def log_likelihood(
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter")
+    # Traced by JAX, as in a gradient: by a scan that can be differentiated.
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return filter.trace_log_likelihood(_sum_log_likelihoods, *arguments[1:])
+    # Numbers: in chunks side by side if the filter can; else row by row.
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if total is not None:  # None: the filter cannot be run in chunks
         return float(total)

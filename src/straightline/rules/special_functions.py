@@ -42,16 +42,15 @@ class ContinuedFraction(NamedTuple):
 def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P, each to its digits.
 
-    With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is a series, above it Q is a continued fraction
-    (`_sum_lower_series`, `_evaluate_upper_fraction`); for a > LARGE both are expanded in 1 / a. NaN where a or x is
-    below zero.
-
-    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31.
+    With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is computed by a series, above it Q by a continued
+    fraction (`_sum_lower_series`, `_evaluate_upper_fraction`), as each is accurate there. For a > LARGE both are
+    expanded in 1 / a. NaN where a or x is below zero.
     """
     is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
-    # Where neither series nor fraction serves, 1 stands for a and x, so that no NaN comes into the loops.
+    # Where neither series nor fraction is used, compute with 1 for a and x, so that no NaN comes into the loops.
     serves_none = is_large | ~is_valid
     shape, place = jnp.where(serves_none, 1.0, a), jnp.where(serves_none, 1.0, x)
+    # x > a + 1: the fraction is used; else the series.
     above = place > shape + 1
     density = jnp.exp(shape * jnp.log(place) - place - jax.lax.lgamma(shape))
     lower = density * _sum_lower_series(shape, place, skipped=above)
@@ -59,9 +58,11 @@ def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array
     # The smaller mass as computed, to all its digits; the other one is 1 minus it.
     p = jnp.where(place == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
     q = jnp.where(above & (place < jnp.inf), upper, 1 - p)
+    # Large a: take the expansion.
     expanded_p, expanded_q = regularised_incomplete_gammas_of_large_shape(a, x)
     use_expansion = is_large & (x < jnp.inf)
     p, q = jnp.where(use_expansion, expanded_p, p), jnp.where(use_expansion, expanded_q, q)
+    # Limits: all mass is below x = inf, and a law of shape 0 is all at 0.
     p, q = jnp.where(x == jnp.inf, 1.0, p), jnp.where(x == jnp.inf, 0.0, q)
     at_zero = (a == 0) & (x > 0)  # a law of shape 0 is all at 0
     p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)

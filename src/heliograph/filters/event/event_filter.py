@@ -280,14 +280,13 @@ class EventFilter(AbstractSizedFilter):
     def _truncate_with_lost_references(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, if a value y that was lost is its next reference r.
 
-        A sender sends its signal y if |y - r| > delta, r its reference: the value sent last, which may be lost. `xry`:
-        Gaussians of (x, r, y), x the plant's state; the filter knows r in the first `known`. `by_cause`: probabilities
-        of each one's sender status with each cause of silence. Returned are `known` Gaussians with a known r, one for
-        each piece of |y - r| <= delta, then `lost` with a lost r.
+        A sender sends its signal y if |y - r| > delta; r, the value sent last, may be lost. `xry`: Gaussians of (x, r,
+        y), x the plant's state, r known in the first `known`. `by_cause`: probabilities of sender status and cause of
+        silence. Returned are `known` with a known r, one for each piece of |y - r| <= delta, then `lost` ones.
         """
         n, sender = len(self.states), self.senders[s]
         x_and_r = np.arange(n + self.outputs)
-        # Cause 1, nothing was sent: |y - r| <= delta, and r stays.
+        # Not sent: |y - r| <= delta, and r stays.
         unsent = xry.relabel_sender(s, by_cause.unsent)
         known, lost_before = self.region.truncate_inside(
             unsent.select_range(0, self.known), unsent.select_range(self.known), sender

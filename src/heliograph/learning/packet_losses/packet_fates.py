@@ -233,7 +233,9 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
 def check_fates(value: object) -> Fates:
     """Return fates, checked, as a list of stretches (packets,) without empty ones.
 
-    Ends that were chosen for having arrived (`BetweenArrivals`), and so are no trials, become CHOSEN.
+    Fates of packets are the data from which laws of losses are fitted. A stretch (run of successive packets) may have
+    been cut where packets arrived (`BetweenArrivals`): its ends say nothing of losses, are not counted as trials, and
+    are marked by the value CHOSEN.
 
     Args:
         value: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a sequence of several.
@@ -241,15 +243,18 @@ def check_fates(value: object) -> Fates:
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
+    # What this function returned before is not checked again.
     if isinstance(value, CheckedFates):
         return value
     stretches = _list_stretches(value)
+    # Check the values of each stretch.
     parts = [array("fates", cast(ArrayLike, stretch), (None,), missing=True) for stretch in stretches]
     for fate in parts:
         if np.any((fate != 0) & (fate != 1) & ~np.isnan(fate)):
             raise fail(
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
+    # Mark chosen ends, and leave out empty stretches.
     chosen = [getattr(stretch, "chosen", False) for stretch in stretches]
     fates = CheckedFates(
         _mark_chosen_ends(fate) if is_chosen else fate

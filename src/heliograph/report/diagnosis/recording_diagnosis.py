@@ -204,12 +204,17 @@ class Health:
     def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
         """Yield a sentence on the outputs whose innovations are larger than claimed, and one on those that are smaller.
 
-        Each output is judged by itself, since a mean over outputs hides the one that is wrong; all together where none
-        is wrong by itself. `test`: that of the filter's innovations.
+        A filter claims a covariance of its innovations; squares that are larger than claimed mean overconfidence. Each
+        output is judged by itself, since a mean over outputs hides the one that is wrong; all are judged together where
+        none is wrong by itself. `health`: the filter's innovations. `test`: of these over all outputs, with their mean
+        square `power` and its standard error.
         """
+        # `level`: probability of a false alarm that one test may have.
         name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
         of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
-        # By output: mean of innovation^2 / claimed variance, its standard error, how many innovations. "": all outputs.
+        # Outputs with enough innovations. `measured`: for each output the mean of innovation^2 / claimed variance, its
+        # standard error, and the number of innovations; under the name "" for all outputs together. `signs`: 1 of
+        # outputs that are significantly larger, -1 smaller, 0 neither.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
         measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
         signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
@@ -221,6 +226,7 @@ class Health:
         # An output that is far off spoils the estimates, so that others look a little larger too: these are not named.
         largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
         larger = [output for output in larger if sizes[output] - 1 >= PULLED * largest_excess]
+        # A filter that weighs outliers down has smaller innovations where there are none: no fault.
         weighs_any = any(output.weighs for output in of_filter)  # without outliers innovations are smaller: no fault
         smaller = [output for output, sign in signs.items() if sign < 0 and not weighs_any]
         for named, say in ((larger, say_overconfident), (smaller, say_underconfident)):

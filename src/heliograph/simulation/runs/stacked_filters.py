@@ -121,12 +121,15 @@ class StackedFilters(Module):
     ) -> tuple[PyTree, StepOutput]:
         """Step each filter: return the next states (filter and node, ...), and outputs (filter, node, ...).
 
+        A stack holds filters of one structure at the nodes of a group, `self.count` filters at each of `self.nodes`
+        nodes; all are stepped by one map.
+
         Args:
-            states: before the step (filter and node, ...).
+            states: states before the step (filter times node, ...).
             z: measurements (node, received) of the group.
             u: inputs of the plant over the step.
             k: number of the step.
-            skip: codes of the reasons not to use them (filter, node), 0 where there is none; None: use all.
+            skip: codes of reasons not to use the measurements (filter, node), 0 to use them; None: use all.
         """
 
         def step_one(
@@ -139,9 +142,11 @@ class StackedFilters(Module):
             """
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
+        # Join the axes of filters and nodes; each filter of a node gets the node's z.
         reasons = None if skip is None else skip.reshape(-1)
         step_all = map_all(step_one, self.count * self.nodes)
         after, outputs = step_all(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
+        # Outputs get separate axes (filter, node) again.
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
 
     def compute_by_node(
