@@ -87,8 +87,10 @@ class Identifiability:
 def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int = 400, seed: int = 0) -> Identifiability:
     """Examine what a recording of this network could identify of its free numbers, before there is one.
 
-    Data are drawn as the filter expects them, at three points around the start, and the information that their second
-    half holds is examined: that of the first is helped by what is known of the initial state, and does not grow.
+    Free numbers (marked by `hg.free`) are identifiable if the data's information about them has full rank. Data are
+    drawn as the filter expects them, at three points around the start, and the information that their second half holds
+    is examined: the information of the first half is helped by what is known of the initial state, and does not grow
+    with more data.
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
@@ -103,11 +105,13 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     seed = check_seed("seed", seed)
     description = describe(network)
     description.start.check_sends_each_step("identifiability")
+    # The filter's likelihood as a function of the free numbers.
     objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
     u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
+    # At each point: draw a recording, and find the rank of the information of its second half (`late`).
     points = _draw_points_near(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):

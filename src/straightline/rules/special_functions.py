@@ -186,11 +186,10 @@ def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
 def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     """Compute e^-|x| I_v(x), the scaled modified Bessel function of order v = 0 or 1.
 
-    Up to |x| = FAR by the power series I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond by the
-    asymptotic series I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1,
-    whose terms fall to 1e-26. Both are summed by one loop, whose ratio of terms is that of the series that serves.
-
-    Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
+    The factor e^-|x| keeps it finite for large x. Up to |x| = FAR it is summed by the power series I_v = (x / 2)^v
+    sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond it is summed by the asymptotic series I_v = e^x / root(2 pi
+    x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1, whose terms fall to 1e-26. One loop sums
+    both, so that each lane takes the ratio of terms of its own series.
     """
     size = jnp.abs(x)
     is_far = size > FAR
@@ -211,9 +210,10 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
         """Return whether the last term is above rounding."""
         return jnp.abs(state.term) > EPSILON / 8 * state.total
 
-    # The term of k = 0 is 1, or (x / 2) of I_1's power series.
+    # Term of k = 0: 1, or x / 2 in the power series of I_1.
     first = jnp.where(is_far | (order == 0), 1.0, size / 2)
     total = jax.lax.while_loop(has_more_terms, add_term, SeriesState(jnp.ones_like(x), first, first)).total
+    # Factor before the sum: 1 / root(2 pi x) far out (e^x e^-x cancel), else e^-|x|.
     scale = jnp.where(is_far, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(is_far, size, 1.0))), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
     if order == 0:

@@ -300,21 +300,26 @@ def _make_node_readings(
 ) -> NodeReadings:
     """Return the readings of one source from the fields of many messages.
 
+    A source says which fields of a topic's messages are which values of a node, with scale and offset; here all
+    messages are read at once, column by column.
+
     Args:
-        rows: numbers of the messages, (messages,).
-        columns: their fields by path, (messages,) each.
-        source: the source.
-        places: index of each of its values among those that its node receives.
+        rows: numbers of the messages in the bag (messages,).
+        columns: {path of a field: its values (messages,)}.
+        source: paths, scales and offsets of the values, the time stamp, and the running count, if there is one.
+        places: for each of its values the index among the values that its node receives.
         size: how many values the node receives.
 
     Raises:
         LayoutNotFixedError: a stamp, a count or part of a value that is none; reading message by message then names it.
     """
+    # Values (messages, size), NaN where a field is not finite or not in the message.
     values = np.full((len(rows), size), np.nan)
     for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         value = _compute_value_column(columns, path)
         values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
-    # A stamp has to be set, so not 0, and of 32 bits, so that the nanoseconds fit into 64.
+    # A time stamp of seconds and nanoseconds. It has to be set, so not 0, and of 32 bits, so that the nanoseconds fit
+    # into 64.
     time = np.full(len(rows), NONE)
     if source.time is not None:
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)

@@ -90,12 +90,12 @@ def bound_overload(
     range [-a, a]. If it lies between a + (m - 1/2) D and a + (m + 1/2) D, the end of the range is sent, with an error e
     = m D in addition to that of rounding. So
 
-    E e^2 = D^2 sum_{m >= 1} (2m - 1) P(|y - c + d| > a + (m - 1/2) D)
+        E e^2 = D^2 sum_{m >= 1} (2m - 1) P(|y - c + d| > a + (m - 1/2) D)
 
     since m^2 is the sum of the first m odd numbers. The link's gain g multiplies e, the filter's gain K adds g e to the
     estimate, and (I - K H) A takes it to the next step. By Minkowski's inequality the rms error changes by at most
 
-    sum_j |((I - K H) A)^j K| sqrt(E g^2) sqrt(E e^2)
+        sum_j |((I - K H) A)^j K| sqrt(E g^2) sqrt(E e^2)
 
     y is taken for Gaussian, with its moments before any data and inputs zero.
 

@@ -222,7 +222,7 @@ def _step_lanes(evaluate: Evaluate, state: _Lanes, moving: np.ndarray, domains: 
 
     Args:
         evaluate: log-likelihood (lanes,), gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
-        state: the lanes before the step.
+        state: lanes (searches side by side) before the step.
         moving: coordinates that move (lanes, p).
         domains: coordinates whose domains end at infinity.
         close: g' I^-1 g at which a lane has arrived.

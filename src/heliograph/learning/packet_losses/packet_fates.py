@@ -177,7 +177,8 @@ def fates_by_node(
 def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[str, Fates]:
     """Return {hop: fates (packets,)} of the packets of a route, by which of them arrived behind each of its hops.
 
-    A packet that was lost says nothing of the hops that it did not reach: its fate is NaN there.
+    Fates are 1 (lost), 0 (arrived) or NaN (unknown); laws of losses are fitted to them. A packet that was lost says
+    nothing of the hops that it did not reach: its fate is NaN there.
 
     Args:
         arrived: {hop: (packets,)} in the order of the route, true or 1 where the packet arrived behind this hop.
@@ -190,6 +191,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
     by_hop: dict[str, Fates] = {}
     reached: np.ndarray | None = None  # 1 of packets that passed the hop before; None at the first hop, all of them
     for name, value in arrived.items():
+        # Which packets arrived behind this hop. None can without having arrived behind the hop before.
         passed = array(f"arrivals behind {name!r}", value, (None if reached is None else len(reached),))
         if np.any((passed != 0) & (passed != 1)):
             raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
@@ -199,7 +201,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
             raise fail(
                 f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
             )
-        # A packet has a fate at a hop if it reached it.
+        # A packet has a fate at a hop only if it reached the hop.
         by_hop[name] = [np.where(reached == 1, 1.0 - passed, np.nan)]
         reached = passed
     return by_hop

@@ -213,12 +213,13 @@ def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
 def stack_by_kind(network: Network, smoothed_kinds: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
     """Return the filters of a network's nodes as stacks: filters that differ in numbers alone along one axis.
 
-    A group holds the nodes of one structure. A kind holds filters of one structure at all nodes of one group; along its
-    axis are the first filter of all nodes, then the second one, and so on.
+    Filters of one structure differ in numbers alone, so that one `vmap` steps them all. A group holds the nodes of one
+    structure. A kind holds filters of one structure at all nodes of one group; along its axis are the first filter of
+    all nodes, then the second one, and so on.
 
     Args:
         network: the network.
-        smoothed_kinds: numbers of the kinds whose estimates are to be smoothed.
+        smoothed_kinds: indices of the kinds whose estimates are to be smoothed.
         judges: whether filters judge if their measurements are plausible.
     """
     alike = []
