@@ -252,7 +252,7 @@ def _write_lagged_estimates(
 
     window, ahead = options.limits
     # In continuous time the initial law of the state is that of the first row's time; in steps that of step 0.
-    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
+    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0
     capacity = max(LEAST_CAPACITY, len(data.events))  # with less room than rows the oldest become final early
     lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if lagged is None:

@@ -76,7 +76,7 @@ def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first
     import pyarrow as pa
 
     # A dictionary column stores each distinct value once, and an index in each row: expand it.
-    if pa.types.is_dictionary(column.type):  # each value once, and which one a row has
+    if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     kind = column.type
     # Dates and times.

@@ -186,7 +186,7 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
 
-    Confounded numbers are free numbers that the data do not tell apart. Such as "Of a and b only the product a * b
+    Confounded numbers are free numbers that the data do not tell apart. An example: "Of a and b only the product a * b
     (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a `solution`, the maximum of the likelihood.
     `group` has the numbers' indices, how many must be fixed (`fix`), and the combinations that are identified:
     `exponents` of products, `weights` of sums (combinations, numbers).

@@ -173,6 +173,8 @@ def _search_from_starts(
 ) -> "_BestPoint":
     """Return the best end of searches from several starts; after Ctrl-C the best point at which the likelihood was.
 
+    The likelihood may have several maxima, so that several searches are made, by the simplex method.
+
     Args:
         likelihood: the log-likelihood at a point (p,), whose coordinates are unbounded.
         points: starts of the searches, (p,) each.

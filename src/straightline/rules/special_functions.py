@@ -45,6 +45,8 @@ def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array
     With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is computed by a series, above it Q by a continued
     fraction (`_sum_lower_series`, `_evaluate_upper_fraction`), as each is accurate there. For a > LARGE both are
     expanded in 1 / a. NaN where a or x is below zero.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31.
     """
     is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
     # Where neither series nor fraction is used, compute with 1 for a and x, so that no NaN comes into the loops.
@@ -190,6 +192,8 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond it is summed by the asymptotic series I_v = e^x / root(2 pi
     x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1, whose terms fall to 1e-26. One loop sums
     both, so that each lane takes the ratio of terms of its own series.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
     """
     size = jnp.abs(x)
     is_far = size > FAR

@@ -115,7 +115,7 @@ class MessageLayout:
         if node == "NAME":
             return self._locate_message_numbers(begin, of, f"{path}.")
         # A text: four bytes with its length, then its characters. The length is part of the layout.
-        if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
+        if node == "BASE" and of[0] == "string":
             begin = _align_to_size(begin, 4)
             return begin + 4 + self._note_length(begin)
         # A single number.
@@ -123,11 +123,11 @@ class MessageLayout:
             return self._locate_numbers_in_row(begin, of[0], 1, [path])
         # A list. If it may have any length, its length stands in four bytes before its items.
         (item_node, item_of), count = of
-        if node == "SEQUENCE":  # the length that it has in this message stands before its items
+        if node == "SEQUENCE":
             begin = _align_to_size(begin, 4)
             count, begin = self._note_length(begin), begin + 4
         # A list of numbers is located at once, since it may have millions; names are made only if some are wanted.
-        if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
+        if item_node.name == "BASE" and item_of[0] in NUMBERS:
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
             names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
             return self._locate_numbers_in_row(begin, item_of[0], count, names)

@@ -111,7 +111,6 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
             continue
         # The remaining columns are the time and the tags, which all fields of one row share: they are the key.
         name, value = str(row.pop("_field")), row.pop("_value")
-        # What is left are the time and the tags, which all fields of one row share.
         fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
         if name in fields and name not in row and fields[name] != value:
             remedy = "a query that yields several results, such as a mean and a maximum, sets _field of each"

@@ -107,7 +107,7 @@ def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Ar
         mixture: the sum of K Gaussians.
         directions: D (m, N).
         radius: radius of the ball, a number.
-        inside: True for |D x| <= radius, False for |D x| > radius.
+        inside: True for |D x| <= radius, else |D x| > radius.
     """
 
     def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:

@@ -145,6 +145,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
     ) -> tuple[jax.Array, MoveLaw | None]:
         """Return f(x, u) + w for B particles x, and the law of this move if the optimal proposal is to draw from it.
 
+        A particle filter moves each particle x by the plant's law. The optimal proposal draws given the next
+        measurement, and needs the law of the move for it.
+
         Args:
             x: particles (B, n).
             numbers: their indices (B,), on which their noise depends; None for all particles.

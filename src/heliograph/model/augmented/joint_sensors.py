@@ -34,7 +34,7 @@ class JointSensor(AbstractSensor):
 def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor | JointSensor:
     """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
 
-    With the `parallel` of their channels it serves a fusion centre, which receives all measurements. The noises of
+    A fusion centre receives the measurements of all nodes, as from one sensor behind one channel. The noises of
     different sensors are independent. If all sensors are linear, the result is linear. Angles stay angles, and outputs
     keep their units.
 

@@ -228,7 +228,6 @@ class Discrete(AbstractLaw):
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
         """
         free = np.flatnonzero(self.radius > 0)
-        # A single uncertain probability cannot move: the known ones leave it the rest of the sum 1.
         if len(free) < 2:  # a single uncertain probability cannot move: the known ones leave it the rest of the sum 1
             return self.probabilities[None]
         if len(free) > CORNER_LIMIT:

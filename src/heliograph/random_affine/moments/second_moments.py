@@ -282,7 +282,6 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     off_diagonal = (part_of_output[:, None] != part_of_output[None, :])[:, :, None, None]
     # Off-diagonal blocks: |D_i Y Y' D_j'| by the product of reaches; of the power (M_i + D_i) Y Y' (M_j + D_j)'.
     xp = library(mean, reaches)
-    # Off-diagonal blocks: |D_i Y Y' D_j'| by the product of reaches; of the power (M_i + D_i) Y Y' (M_j + D_j)'.
     reach, size = xp.concatenate(reaches), xp.abs(mean)
     cross = symmetric_product(reach, reach)
     power_cross = drop_constant(symmetric_product(size, reach) + symmetric_product(reach, size) + cross)

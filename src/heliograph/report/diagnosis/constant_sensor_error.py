@@ -170,8 +170,8 @@ def _estimate_error(
         deviation: standard deviation of the output's innovations.
     """
     # r' w of each row; sum r' r and sum r' w over all rows.
-    row_agreements = np.sum(white_response * white, axis=1)  # r' w of each row
-    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))  # over all rows
+    row_agreements = np.sum(white_response * white, axis=1)
+    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
     if not (weight > 0 and np.isfinite(agreement)):
         return None
     error = agreement / weight

@@ -227,7 +227,7 @@ class Health:
         largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
         larger = [output for output in larger if sizes[output] - 1 >= PULLED * largest_excess]
         # A filter that weighs outliers down has smaller innovations where there are none: no fault.
-        weighs_any = any(output.weighs for output in of_filter)  # without outliers innovations are smaller: no fault
+        weighs_any = any(output.weighs for output in of_filter)
         smaller = [output for output, sign in signs.items() if sign < 0 and not weighs_any]
         for named, say in ((larger, say_overconfident), (smaller, say_underconfident)):
             if named:  # an only output, or all together, needs no name in the sentence
@@ -292,7 +292,6 @@ def examine(
     shape = len(record.time), len(network.inputs)
     # Inputs (time, inputs), without columns for a plant without inputs.
     u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
-    # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, their correlations over time, and the
     # health of each sensor output.
@@ -330,7 +329,7 @@ def _examine_filter(
     """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
     # Without a claim there is nothing to test; 1 is the mean square that a true claim gives.
-    white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
+    white, test, expected = None, None, np.ones(1)
     if filter.claim != "none" and filter.received:
         # Whiten the innovations, test their correlation over time (of a filter that weighs outliers down, about their
         # mean), and compare their size with the expected one.
@@ -339,7 +338,7 @@ def _examine_filter(
         expected = compute_expected_squares(filter, z, inputs)
         test = None if test is None else scale_size_to_expected(test, white, expected)
     # Whether the filter lost its claim in some row: then it has none for the recording.
-    lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
+    lost_claim = np.any(record.estimates[node][name].claims == "none")
     return FilterHealth(
         node=node,
         filter=name,

@@ -286,7 +286,6 @@ class Mesh(Module):
             blocks: joint covariance of each neighbourhood (node, degree, n, degree, n); None where no rule needs it.
             present: which messages arrive (node, degree).
             *rest: further arguments, with a leading axis of nodes.
-            *rest: further arguments, with a leading axis of nodes.
             precomputed: weights that were computed before, one for each bucket; () to compute them here.
             senders: row of `covariance` for each message that a node receives (node, degree); None for the graph's.
         """

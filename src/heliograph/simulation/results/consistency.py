@@ -140,8 +140,8 @@ def _compute_normalised_square(
 ) -> Float[np.ndarray, "*steps"]:
     """Return x' P^-1 x of each step over the components of x that are not NaN, or NaN if all are.
 
-    It is the normalised squared error of a filter, whose mean is n if the covariance is right; all steps are computed
-    at once.
+    For errors of a filter it is the normalised squared error, whose mean is n if the covariance P is right. All steps
+    are computed at once.
 
     Args:
         x: errors or innovations (..., n), NaN where a component is missing.
