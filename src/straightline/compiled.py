@@ -327,7 +327,7 @@ def compile(
     """
     find_processor_features()  # refuses a processor that LLVM does not know
     # Which inputs differ between runs: all leaves of the arguments that are not shared.
-    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]  # leaf by leaf
+    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
     return CompiledFunction(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
 

@@ -99,7 +99,7 @@ def _yield_events_of_plants(
 
     # None is returned for rows of time, which become events one row after the other.
     table = read_events(path, reference, network, module, options, no_progress)
-    if table is None:  # rows of time
+    if table is None:
         rows = read_rows(path, network, options)
         for line in [*rows.warnings, *_describe_too_fine_dates(path, rows.recording.time)]:
             print(f"heliograph: {visible(line)}", file=sys.stderr)

@@ -206,8 +206,8 @@ def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers,
     if not combinations:
         return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
     # Choose the words. a / b is no product but a combination; if there are sums, there are no products.
-    kind = "product" if np.all(group.exponents >= 0) else "combination"  # a / b is no product
-    if len(group.weights):  # then there are no products
+    kind = "product" if np.all(group.exponents >= 0) else "combination"
+    if len(group.weights):
         kind = "sum"
     kind += "s" if len(combinations) > 1 else ""
     others = f" and {_count_in_words(unnamed, 'other combination')}" if unnamed else ""

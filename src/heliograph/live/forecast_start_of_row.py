@@ -29,7 +29,7 @@ def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.n
     inputs = latest_inputs if program.dt is None else np.insert(latest_inputs, program.dt, np.nan, axis=-1)
     spacing = float("nan") if program.dt is not None else 1.0
     # A forecast starts with the step after the row's.
-    step = row[..., pool.at.start].astype(int) + 1  # one after the row's step number
+    step = row[..., pool.at.start].astype(int) + 1
     return Origin(
         model=program.network,
         state=program.step_rows.state.tree(row[..., pool.state]),

@@ -180,8 +180,8 @@ class PlantState:
     def undo_leap(self, leap: ClockLeap, longest_gap: float, names: Sequence[str]) -> bool:
         """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
 
-        A leap is a gap in time that one clock alone shows, as by a wrong stamp. Its rows go with the next finalisation,
-        and time is what it was. Returns False, and changes nothing, if the row before the leap is not known any more.
+        A leap is a gap in time that one clock alone shows, as by a wrong stamp. Returns False, and changes nothing, if
+        the row before the leap is not known any more.
 
         Args:
             leap: the leap, or an earlier one that it follows.
@@ -190,7 +190,7 @@ class PlantState:
         """
         held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
         # If all rows held are of the leap, only the row kept from before it is left.
-        all_after = first_after == 0  # all rows held are of the leap: only the one kept from before it is left
+        all_after = first_after == 0
         if all_after and self.kept is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.

@@ -264,7 +264,7 @@ class Stream:
             why = Judgement.describe(float(judgement.reason), float(judgement.distance)) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         # Step anew, since zeros may have been tried in between, and accept.
-        stepper.step(z, u, self.steps)  # anew, since zeros may have been tried in between
+        stepper.step(z, u, self.steps)
         stepper.accept()
 
     def _name_faulty_function(self, u: np.ndarray) -> str:

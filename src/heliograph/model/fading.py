@@ -142,7 +142,6 @@ def with_flag(
     Raises:
         ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
     """
-    # The chain, or all memories of the channel. Classes need a single chain, of whose modes they tell.
     late = flag("late", late)
     # Find the chain. `held`: all memories of the channel (chains, and gains that drift). Classes tell of the modes of a
     # single chain, so with several memories the chain must be given.

@@ -106,6 +106,9 @@ class RelayNetwork(Module):
     def steps(self, horizon: int) -> "RelaySteps":
         """Return the matrices and moments of steps 0 to horizon - 1, the first leading from x_0 to x_1.
 
+        The links of a step are those of its slot; slots follow one another and repeat. Second moments of the network
+        (of the state and all filters' errors) are computed from these matrices, which stand one step after another.
+
         Raises:
             ValueError: a horizon beyond what varies over time; links with uncertain probabilities.
         """

@@ -130,12 +130,12 @@ def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDe
 def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Schedule]:
     """Return every filter of a design as a schedule of gains, by name, to save, to simulate or to run.
 
-    A filter's estimate moves by s+ = A s + a + K (z - B s - b), where z is what it receives and B s + b its mean if
-    the filter's own estimate were that of every relay. Claim: "exact" for complete data from the network it was
+    A filter's estimate s moves by s+ = A s + a + K (z - B s - b) with its gain K. z is what it receives, and B s + b
+    the mean of z if s were the estimate of every relay. Claim: "exact" for complete data from the network it was
     designed for, "upper" where noise is known by bounds.
 
     Args:
-        network: relays that filter.
+        network: relays that filter what they receive.
         design: of this network, from its start on: of a periodic one take `given_design` with its gains repeated.
 
     Raises:

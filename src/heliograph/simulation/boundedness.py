@@ -116,7 +116,7 @@ def _judge_links(network: Network, a: np.ndarray, q: np.ndarray, links: JointLin
         gains = find_gains(usable.system)
         radius = certify_radius(usable.system, gains)
         if radius < BELOW_ONE:
-            # The steady error covariance bounds that of the best filter.
+            # The steady covariance with these gains bounds the mean error covariance E P in the long run.
             bound = usable.system.solve_steady_covariances(gains).sum(axis=0) if usable.exact else None
             return Boundedness(
                 verdict="certified",

@@ -66,7 +66,7 @@ def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array
     p, q = jnp.where(use_expansion, expanded_p, p), jnp.where(use_expansion, expanded_q, q)
     # Limits: all mass is below x = inf, and a law of shape 0 is all at 0.
     p, q = jnp.where(x == jnp.inf, 1.0, p), jnp.where(x == jnp.inf, 0.0, q)
-    at_zero = (a == 0) & (x > 0)  # a law of shape 0 is all at 0
+    at_zero = (a == 0) & (x > 0)
     p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
     return jnp.where(is_valid | at_zero, p, jnp.nan), jnp.where(is_valid | at_zero, q, jnp.nan)
 

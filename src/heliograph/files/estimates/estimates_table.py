@@ -41,7 +41,7 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
             parts = _make_columns(record.states, record.units, estimate, angles)
             columns += [(prefix + key, values) for key, values in parts]
             smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
-            if name in smoothed:  # which may cover the last rows alone
+            if name in smoothed:
                 parts = _make_columns(record.states, record.units, smoothed[name], angles)
                 columns += [
                     (f"{prefix}smoothed.{key}", _pad_rows_before(values, len(record.time))) for key, values in parts

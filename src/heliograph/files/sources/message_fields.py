@@ -69,8 +69,8 @@ def fail_of_doubled(name: str, field: str) -> InputError:
 def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
     """Return the content of JSON, and each object in it that has a field twice, with the field's name.
 
-    A field that stands twice in an object is an error only if it is used, so such objects are listed for the caller.
-    `name`: of the text, for errors. Words such as nan or inf, which are no JSON, are read as null.
+    Decoders keep the last of two fields of one name without a word, so the caller refuses such an object. `name`: of
+    the text, for errors. Words such as nan or inf, which are no JSON, are read as null.
     """
     doubled: list[tuple[dict[str, Any], str]] = []
 

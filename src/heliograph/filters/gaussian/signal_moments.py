@@ -103,10 +103,9 @@ def find_signal_moments(
         image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
     # E y, and the columns of the covariance of c + v, which acts as the noise of the signal.
     mean = image.mean + law.mean
-    # The noise of the signal is c + v.
     signal_noise = join_columns(law.columns if noise is None else noise, image.curvature)
     # E[y y'] = Cov y + E y E y'. The size of the numbers bounds their rounding.
-    second = join_columns(image.explained, signal_noise).covariance + jnp.outer(mean, mean)  # Cov y + E y E y'
+    second = join_columns(image.explained, signal_noise).covariance + jnp.outer(mean, mean)
     size = bound_signal_power_at_start(sensor, initial_power) if isinstance(sensor, LinearSensor) else diagonal(second)
     return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=signal_noise, second=second, size=size)
 

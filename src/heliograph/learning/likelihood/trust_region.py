@@ -225,10 +225,10 @@ def _step_lanes(evaluate: Evaluate, state: _Lanes, moving: np.ndarray, domains: 
         state: lanes (searches side by side) before the step.
         moving: coordinates that move (lanes, p).
         domains: coordinates whose domains end at infinity.
-        close: g' I^-1 g at which a lane has arrived.
+        close: a lane has arrived where g' I^-1 g of gradient g and information I is below this.
     """
     going = ~state.done
-    # The best step by the quadratic model; coordinates that are at an end of their domain stay.
+    # The step p of greatest g' p - p' B p / 2 within the radius; coordinates at an end of their domain stay.
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     step, length, foretold = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free

@@ -176,7 +176,7 @@ def assemble_moments(moments: SumMoments, outputs: int, inputs: int, order: int)
     """
     size, corners = len(moments.components) + 1, len(moments.by_degree[0])
     # Indices of the polynomials' variables in (y, 1); 1 is the last one, number `inputs`.
-    variables = np.array([*moments.components, inputs])  # of the polynomials, as numbers in (y, 1)
+    variables = np.array([*moments.components, inputs])
     xp = library(moments.by_degree)
     matrix: Corners = xp.zeros((corners, count_monomials(outputs + 1, order), count_monomials(inputs + 1, order)))
     for degree, polynomials in enumerate(moments.by_degree):

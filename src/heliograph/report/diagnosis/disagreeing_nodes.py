@@ -53,7 +53,6 @@ def find_constant_error_between_nodes(
     # The error in standard errors, by the worse of both tests. The level is shared by all outputs and both signs
     # (Bonferroni).
     deviations = min(found.significance, abs(found.error) / found.standard_error)
-    # The level is shared by all outputs and both signs (Bonferroni).
     return found if deviations > -ndtri(level / (2 * len(names))) else None
 
 

@@ -59,11 +59,11 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
 def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
     """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
 
-    A sender with its own clock sends at a rate below that of the rows, so that some rows are empty without a loss. A
-    sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. The pattern
-    of such a rate is a line: the phases of arrivals (row times frequency, less whole periods) lie in a narrow interval.
-    Rows whose phase is in it are due. The pattern is accepted if random losses would make it with a probability below
-    CHANCE.
+    A sender with its own clock sends at a rate below that of the rows, so that some rows are empty without a loss. It
+    may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. The pattern of
+    such a rate is a line: the phases of arrivals (row times frequency, less whole periods) lie in a narrow interval.
+    Rows whose phase is in it are due. The pattern is accepted if losses in bursts would make it with a probability
+    below CHANCE.
     """
     rows = np.flatnonzero(arrived)
     span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last

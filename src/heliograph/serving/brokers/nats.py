@@ -233,7 +233,7 @@ class Nats:
         # Begin after the last message that any reader acknowledged, ours or an earlier one; at the newest at most. A
         # stream without consumers was made anew, so our old position means nothing there.
         by_others = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
-        by_us = self._acknowledged if consumers else 0  # a stream without its consumers is a new one
+        by_us = self._acknowledged if consumers else 0
         self._acknowledged = min(max([by_us, *by_others]), newest)
         # Make the new consumer before the old ones are removed, so that there is always one.
         self._name, self._read = prefix + uuid.uuid4().hex[:12], 0

@@ -285,7 +285,6 @@ def _classify_rows(
     edges = np.unique(inner[inner < np.max(sizes, initial=-np.inf)])
     # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
     outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
-    # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
     deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
     return DeclaredRows(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, log_size), -1)

@@ -319,7 +319,7 @@ def _find_refused_rows(
         outputs: results of filtering with judgements, by row.
         z: {node: measurements (steps, received)}.
         z_by_group: the same (steps, node, received) by group.
-        task: what the recording is filtered with: filters, inputs and more.
+        task: what the recording is filtered with: filters, inputs, and all else.
         before: rows that were refused already: {node: {row: reason}}.
 
     Returns:

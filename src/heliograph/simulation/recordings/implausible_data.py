@@ -212,7 +212,7 @@ def describe_doubts(
             reason, distance = np.asarray(judgement.reason)[rows[0]], np.asarray(judgement.distance)[rows[0]]
             why = Judgement.describe(reason, distance) + faults.name_fault(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
-    # Inputs are implausible if the votes of all filters say so.
+    # Inputs are implausible if some filter finds them so, and no filter finds them plausible.
     if network.inputs:
         votes = JudgementReader(network).read_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
