@@ -33,8 +33,8 @@ def measure_uncorrelated(
 
     xi and omega are uncorrelated, with variances `d` and r. N^-1 z has uncorrelated noises, so that its components can
     be used one by one, each a scalar update without a matrix inverse. Returned are the rows (n + m, n) and variances
-    (n,) given all components (L of the posterior, then the slopes), the mean with minus the rest of z - E z below it (n
-    + m,), the m innovations, each given those before it, and their variances.
+    (n,) given all components (L of the posterior, then the slopes), the mean with minus the rest of z - E z below it
+    (n + m,), the m innovations, each given those before it, and their variances.
 
     Args:
         root: L (n, n), the root of the prior covariance L diag(d) L'.

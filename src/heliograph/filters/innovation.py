@@ -186,10 +186,10 @@ class InnovationSummary(NamedTuple):
         """Return the indices of outputs with a larger share of down-weighted values than all others together.
 
         A filter against outliers gives values that do not fit a small weight; a sensor with many of them is suspect.
-        Let p_1 be the share of down-weighted values of one output and p_2 that of the others together, with Wilson's 95
-        % intervals (l, u). The output is named if p_1 - p_2 > sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are
-        alike, some 3 of 100 are named. `summary.independent` is the number of independent values that would give the
-        same interval.
+        Let p_1 be the share of down-weighted values of one output and p_2 that of the others together, with Wilson's
+        95 % intervals (l, u). The output is named if p_1 - p_2 > sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that
+        are alike, some 3 of 100 are named. `summary.independent` is the number of independent values that would give
+        the same interval.
 
         Args:
             summaries: a summary of each output.

@@ -232,8 +232,8 @@ def smoother_step_of(
     """Build the smoother step from the Gaussians that a filter's states hold.
 
     A smoother goes back over the steps of a filter (Rauch, Tung and Striebel). It needs the regression of the state x
-    before the step on the state x+ after it. With x = m + L xi before the step, the predicted state is x+ = E x+ +
-    slopes xi + w: E x+, the slopes and Cov w are all that the regression needs.
+    before the step on the state x+ after it. With x = m + L xi before the step, the predicted state is
+    x+ = E x+ + slopes xi + w: E x+, the slopes and Cov w are all that the regression needs.
 
     Args:
         step: the filter's states before the step, after the prediction, and after the correction; each holds a Gaussian

@@ -55,9 +55,10 @@ def fused_error_norm(
     """Return a bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
 
     Each local H-infinity filter i guarantees ||M e_i|| <= gamma_i ||w_i|| for its error e_i and its disturbance w_i.
-    Its estimate is sent as xq_i, quantized with an error mu_i, |mu_i| <= D_i by component. The fused error is z - zhat
-    = sum c_i (M e_i - M mu_i), so the bound is sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||). ||D_i|| is the root of the
-    sum of squares over steps and components. NaN where a quantizer saturated: its D is NaN, and nothing is guaranteed.
+    Its estimate is sent as xq_i, quantized with an error mu_i, |mu_i| <= D_i by component. The fused error is
+    z - zhat = sum c_i (M e_i - M mu_i), so the bound is sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||). ||D_i|| is the
+    root of the sum of squares over steps and components. NaN where a quantizer saturated: its D is NaN, and nothing is
+    guaranteed.
 
     Args:
         levels: gamma_i (N,).

@@ -97,10 +97,10 @@ def _compute_best_gain(
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
     """Return the best gain K* of a step and the largest weight P2+ of e after it, or None where there is no gain.
 
-    eta = (x, e, f, f~, h, h~, v, rho) is all that a step depends on; the part (e, f~, h~, v, rho) moves the error: e+ =
-    E eta before the correction, and U eta is what is received less its prediction. S^-1 is the quadratic form that the
-    H-infinity bound with this level allows for eta. The correction e+ = (E - K U) eta has least size for K* = E S U' (U
-    S U')^-1, and then P2+ = (E S E' - K* U S E')^-1.
+    eta = (x, e, f, f~, h, h~, v, rho) is all that a step depends on; the part (e, f~, h~, v, rho) moves the error:
+    e+ = E eta before the correction, and U eta is what is received less its prediction. S^-1 is the quadratic form that
+    the H-infinity bound with this level allows for eta. The correction e+ = (E - K U) eta has least size for
+    K* = E S U' (U S U')^-1, and then P2+ = (E S E' - K* U S E')^-1.
 
     Args:
         system: the system x+ = A x + f(x) + B v with growth bounds of f and h.

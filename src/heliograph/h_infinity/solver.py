@@ -275,8 +275,9 @@ class HorizonProblem:
 
         The problem is a semidefinite program: find weights P and gains of all steps for the least level^2. A quadratic
         form Phi must be negative at each step, so that the storage (x, e)' P (x, e) does not grow by more than the
-        disturbances (v, rho) supply. eta'Phi eta = E[x+'P1 x+ + e+'P2 e+] + |M e|^2 - level^2 |(v, rho)|^2 + growth
-        forms - (x, e)'P (x, e), for the vector eta of all that the step depends on, of length q.
+        disturbances (v, rho) supply. eta'Phi eta =
+        E[x+'P1 x+ + e+'P2 e+] + |M e|^2 - level^2 |(v, rho)|^2 + growth forms - (x, e)'P (x, e), for the vector eta of
+        all that the step depends on, of length q.
 
         Args:
             k: number of the step. In the vector of unknowns level^2 stands at place 0, the unknowns of this step at

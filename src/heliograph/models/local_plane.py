@@ -228,9 +228,10 @@ def _subtract_on_meridian(
     """Return r - r_0 and z - z_0, in metres, of a point on the ellipsoid's meridian relative to the origin.
 
     They are the point's coordinates in the plane of its meridian: r = (N + h) cos lat is the distance from the earth's
-    axis, z = (N (1 - e^2) + h) sin lat the height above the plane of the equator. N = a / w, w = sqrt(1 - e^2 sin^2
-    lat), is the radius of curvature across the meridian, with a the semi-major axis and e the eccentricity. All
-    differences are written as products, since subtracting the large numbers themselves would lose digits.
+    axis, z = (N (1 - e^2) + h) sin lat the height above the plane of the equator. N = a / w,
+    w = sqrt(1 - e^2 sin^2 lat), is the radius of curvature across the meridian, with a the semi-major axis and e the
+    eccentricity. All differences are written as products, since subtracting the large numbers themselves would lose
+    digits.
 
     Args:
         origin: latitude lat_0 of the origin in radians.

@@ -188,10 +188,10 @@ def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
 def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     """Compute e^-|x| I_v(x), the scaled modified Bessel function of order v = 0 or 1.
 
-    The factor e^-|x| keeps it finite for large x. Up to |x| = FAR it is summed by the power series I_v = (x / 2)^v
-    sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond it is summed by the asymptotic series I_v = e^x / root(2 pi
-    x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1, whose terms fall to 1e-26. One loop sums
-    both, so that each lane takes the ratio of terms of its own series.
+    The factor e^-|x| keeps it finite for large x. Up to |x| = FAR it is summed by the power series
+    I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond it is summed by the asymptotic series
+    I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1, whose terms fall to
+    1e-26. One loop sums both, so that each lane takes the ratio of terms of its own series.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
     """

@@ -52,8 +52,8 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
 def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
     """Return the moments of e ~ N(centre, diag(variance)), inside or outside the ball |e| <= radius, at nodes of e_1.
 
-    Slices of the ball at fixed e_1 are balls of one dimension less, so moments in m dimensions follow from those in m -
-    1 by quadrature over e_1. With e_1 = radius sin(t) and density p of e_1, the mass where |e_1| <= radius is the
+    Slices of the ball at fixed e_1 are balls of one dimension less, so moments in m dimensions follow from those in
+    m - 1 by quadrature over e_1. With e_1 = radius sin(t) and density p of e_1, the mass where |e_1| <= radius is the
     integral over t of
 
         p(e_1) (de_1 / dt) P(the other components lie inside, or outside, the ball of radius sqrt(radius^2 - e_1^2))

@@ -135,9 +135,9 @@ def zero_mean_fixed_point_map(
     """Return the next t = log beta, and its slope, in the search of the beta that minimises the bound's trace.
 
     beta > 0 is the free scalar of Young's inequality a b' + b a' <= beta a a' + b b' / beta, by which the filter bounds
-    the covariance P after an update if correlations are unknown. The bound's trace is tr P - tr(Omega^-1 C' C) + beta
-    e, with Omega = base + S / beta. It is stationary where beta^2 e = tr(W S) with W = Omega^-1 C' C Omega^-1. So the
-    next beta is sqrt(tr(W S) / e), and a fixed point of this map is the minimum.
+    the covariance P after an update if correlations are unknown. The bound's trace is
+    tr P - tr(Omega^-1 C' C) + beta e, with Omega = base + S / beta. It is stationary where beta^2 e = tr(W S) with W =
+    Omega^-1 C' C Omega^-1. So the next beta is sqrt(tr(W S) / e), and a fixed point of this map is the minimum.
 
     Args:
         t: log beta (1,).

@@ -119,9 +119,9 @@ def _predict_joint_moments(
 ) -> np.ndarray:
     """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after the prediction of a step.
 
-    They follow plant and filter together, to find the true error of a filter that was designed for another model. x+ =
-    A x + b + w (Cov w = Q) is the true state, s- = F s + f the filter's predicted mean s, and the modes of the channel
-    move by their Markov chain. 1{mode} is 1 in a mode of the channel, else 0.
+    They follow plant and filter together, to find the true error of a filter that was designed for another model.
+    x+ = A x + b + w (Cov w = Q) is the true state, s- = F s + f the filter's predicted mean s, and the modes of the
+    channel move by their Markov chain. 1{mode} is 1 in a mode of the channel, else 0.
 
     Args:
         moments: E[r r' 1{mode}] before the step (M, size, size), one for each of M modes.

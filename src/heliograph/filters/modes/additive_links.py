@@ -210,10 +210,11 @@ class AdditiveModalFilter(AbstractModalFilter):
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, with columns of Cov v, for the products zeta = (x~, x~ phi_1, ...).
 
-        The filter estimates zeta, since links with memory make the gain depend on a hidden mode: x~ = (x - c, 1), c =
-        E[x] before data, and phi_a = 1{a link is in mode j} - P(j). Received is z = G y~ + n, the sum of several links,
-        of y~ = (y, 1) = C~ x~ + noise of the sensor with covariance R~. Given the modes the mean of (G, n) is sum_a D_a
-        phi_a, with phi_0 = 1. `state` holds `second` = E[x~ x~'], `laws` = P(j) of each link's modes, and `centre` = c.
+        The filter estimates zeta, since links with memory make the gain depend on a hidden mode: x~ = (x - c, 1),
+        c = E[x] before data, and phi_a = 1{a link is in mode j} - P(j). Received is z = G y~ + n, the sum of several
+        links, of y~ = (y, 1) = C~ x~ + noise of the sensor with covariance R~. Given the modes the mean of (G, n) is
+        sum_a D_a phi_a, with phi_0 = 1. `state` holds `second` = E[x~ x~'], `laws` = P(j) of each link's modes, and
+        `centre` = c.
         """
         terms: tuple[ChannelByMode, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)

@@ -87,8 +87,8 @@ def bound_overload(
     how much that may add to its error.
 
     y - c + d (y the sensor's signal, c the centre of the codewords, d the random dither) is rounded to steps D in the
-    range [-a, a]. If it lies between a + (m - 1/2) D and a + (m + 1/2) D, the end of the range is sent, with an error e
-    = m D in addition to that of rounding. So
+    range [-a, a]. If it lies between a + (m - 1/2) D and a + (m + 1/2) D, the end of the range is sent, with an error
+    e = m D in addition to that of rounding. So
 
         E e^2 = D^2 sum_{m >= 1} (2m - 1) P(|y - c + d| > a + (m - 1/2) D)
 

@@ -164,9 +164,9 @@ def assemble_moments(moments: SumMoments, outputs: int, inputs: int, order: int)
     """Return E[Sym^order(H)] of z = H (y, 1) for each extreme law, from the polynomials E[z^a | y], |a| <= order.
 
     H is the random matrix of a channel, and Sym^order(H) the matrix that takes the monomials of (y, 1) of degree
-    `order` to those of (z, 1). An extreme law is a vertex of the set of possible laws ("corner"). Row z^a 1^(order -
-    |a|) of the result has the coefficients of E[z^a | y] in the monomials of (y, 1); a monomial of lower degree |a| is
-    filled up by the factor 1^(order - |a|).
+    `order` to those of (z, 1). An extreme law is a vertex of the set of possible laws ("corner"). Row z^a
+    1^(order - |a|) of the result has the coefficients of E[z^a | y] in the monomials of (y, 1); a monomial of lower
+    degree |a| is filled up by the factor 1^(order - |a|).
 
     Args:
         moments: the polynomials E[z^a | y] by degree |a|, in the components of y on which z depends.
