@@ -318,19 +318,22 @@ class CSource:
     def _write_loop(self, loop: Loop, indent: str) -> list[str]:
         """Return the lines of a loop: a variable for each carried number that is read, the body, and new values.
 
-        A loop without a length has in its body the `break` that ends it.
+        The loop is one of a computation graph: in each iteration its body maps carried numbers (`parameters`, which
+        start at `initial`) to their next values (`following`); after the loop they are its `results`. A loop without a
+        length has in its body the `break` that ends it.
         """
         deeper, lines = f"{indent}    ", []
-        # Carried numbers that are needed, by their place in the loop's carry: one variable each, declared with the
-        # initial number. It stands for the parameter within the loop, and for the result after it.
+        # Indices of the carried numbers that are read. Each becomes one C variable, declared with the initial number.
+        # It stands for the parameter within the loop, and for the result after it.
         carried = [k for k, node in enumerate(loop.parameters) if {node, loop.results[k]} & self.needed.keys()]
         for k in carried:
             name, start = self._new_name(), loop.initial[k]
             lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name_node(start)};")
             self.names[loop.parameters[k]] = self.names[loop.results[k]] = name
+        # Head and body of the loop.
         lines += [f"{indent}{self._write_loop_head(loop)}", *self.write_statements(loop.body, deeper)]
-        # The next turn's values are assigned at the end, all at once: a value that is itself a carried variable is
-        # copied first, since the assignments change that variable.
+        # The values of the next iteration are assigned at the end, all at once. A value that is itself a carried
+        # variable is copied first, since the assignments change that variable.
         next_values: list[str] = []
         for k in carried:
             node = loop.following[k]

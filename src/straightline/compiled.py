@@ -326,7 +326,8 @@ def compile(
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
     find_processor_features()  # refuses a processor that LLVM does not know
-    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]  # leaf by leaf
+    # Which inputs differ between runs: all leaves of the arguments that are not shared.
+    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
     return CompiledFunction(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
 

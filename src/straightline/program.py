@@ -161,9 +161,9 @@ def _list_needs(node: Any) -> list[Any]:
 def _list_dependencies(node: Any) -> list[Any]:
     """Return what a node, store, guard or loop needs before it can be computed.
 
-    A "parameter" is a number that a loop carries, as its body reads it, and a "result" the same after the loop. A
-    "counter" is the number of a loop's iteration, and "guarded" a number that a guarded block computes. Of these, and
-    of a load, the attribute `value` says to which statement or buffer they belong.
+    A store writes to memory, a guard is a conditional block. A "parameter" is a number that a loop carries, as its body
+    reads it, and a "result" the same after the loop. A "counter" is the number of a loop's iteration, and "guarded" a
+    number that a guarded block computes. The attribute `value` of these, and of a load, is the statement or buffer.
     """
     if isinstance(node, Store):
         return [node.node, *node.indices]
@@ -344,13 +344,14 @@ def find_crossing_items(items: Iterable[Any], differing: set[Any]) -> set[Any]:
 def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:
     """Return the items on which a node, buffer or statement depends: it differs between runs if one of them does.
 
-    `list_owners` returns the loops and guards around a block on whose conditions its contents depend.
+    Nodes are operations on numbers. A store, a guard (conditional block) and a loop are statements. `list_owners`
+    returns the loops and guards around a block on whose conditions its contents depend.
     """
     # Memory inside other memory differs with it.
     if isinstance(item, Buffer):
         whole, _ = item.owner
         return [whole]
-    # Runs differ in the turns of a loop only if it ends by a condition, which carried numbers decide.
+    # Runs differ in the iterations of a loop only if it ends by a condition, which carried numbers decide.
     if isinstance(item, Loop):
         return [item.condition, *item.parameters] if item.length is None else []
     if isinstance(item, Guard):

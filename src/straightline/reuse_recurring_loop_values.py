@@ -251,19 +251,24 @@ def _move_to_guarded_block(
 ) -> Node:
     """Move the recurring numbers to a guarded block of the loop's body; return whether a cycle closes there.
 
-    An iteration skips the block unless it has to compute the numbers. The block also stores the iteration's row in the
-    two rings: the outcomes of the tests, and the numbers that the rest of the program needs (`stored`). A cycle closes
-    if the next values of the carried numbers, from which the recurring ones follow, have the bits that they had before
-    row 0. In iterations that skip the block the result is False.
+    Numbers of a loop's iterations, such as covariances of a filter, may recur in a cycle; rings store the rows of
+    recent iterations, so that later ones read them. An iteration skips the block unless it has to compute the numbers
+    (`turn.computes`). The block also stores the iteration's row in the two `rings`: the outcomes of the tests, and the
+    numbers that the rest of the program needs (`stored`). A cycle closes if the next values of the carried numbers,
+    from which the recurring ones follow, have the bits that they had before row 0. In iterations that skip the block
+    the result is False.
     """
+    # Make a conditional block in the loop's body, and move the recurring nodes there.
     guard = Guard(Block(loop.body, pinned=True), turn.computes)
     graph.current, guard.body.items = guard.body, [*recurring.nodes]
     for n in recurring.nodes:
         n.block = guard.body
+    # Store the row, and compare the carried numbers with those before row 0.
     test_ring, value_ring = rings
     test_ring.store(recurring.tests, turn.row)
     value_ring.store(stored, turn.row)
     guard.values = [_compare_with_start(graph, loop, recurring.carried, turn.restarts)]
+    # Back in the loop's body: the block's result is a node there.
     graph.current = loop.body
     guard.results = [graph.make_fresh_node("guarded", "bool", (), loop.body, (guard, 0))]
     loop.body.items.append(guard)

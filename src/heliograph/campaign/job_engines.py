@@ -213,14 +213,15 @@ def _run_jobs_on_cluster(
 ) -> Iterator[tuple[Job, Reply]]:
     """Run jobs on a Dask cluster, a few more at once than it has threads; yield each with its reply, as they end.
 
-    Where none ends within `timeout` seconds all that are left are given up, each with a reply that says so.
+    If no job ends within `timeout` seconds, all running jobs are given up, each with a reply that says so: the cluster
+    may be dead.
 
     Args:
-        client: of the cluster.
-        campaign: as JSON.
+        client: Dask client of the cluster.
+        campaign: definition of the campaign, as JSON.
         store: path of the store, which the workers see too.
-        waiting: the jobs, which are taken out of it.
-        timeout: seconds.
+        waiting: the jobs to run; each is removed when it is submitted.
+        timeout: seconds without any reply after which to give up.
     """
     from distributed import as_completed
 

@@ -204,12 +204,17 @@ def _group_into_panels(campaign: Campaign, scores: Sequence[Score], parameter: s
 
 @matplotlib.rc_context(STYLE)
 def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: ScoreColumn) -> Figure:
-    """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node."""
+    """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node.
+
+    A campaign simulates several settings of a network; `scores` has a mean and its standard error for each setting,
+    node and filter. `quantity`: which score is plotted. At most PANELS nodes and SETTINGS settings are drawn.
+    """
     nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
+    # One panel for each node, with a row for each setting and a colour for each filter.
     figure, grid = _make_panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
     colours = _assign_colours(scores)
-    # A row for each setting, in which the filters are shifted so that their error bars do not overlap.
+    # Filters are shifted within a row, so that their error bars do not overlap.
     shifts = np.linspace(-0.2, 0.2, len(colours))
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(shifts, colours, strict=True):

@@ -35,8 +35,11 @@ def sweep(
 ) -> int:
     """Run what is missing of a campaign, print its table and write its report; return the exit code.
 
+    A campaign simulates a network in many settings, each in chunks of runs. Chunks that are stored already are not
+    computed again.
+
     Args:
-        path: of the campaign's TOML file.
+        path: path of the campaign's TOML file.
         out: the results folder.
         workers: number of worker processes; None for one a processor, or for none where a setting is named.
         scheduler: address of a Dask scheduler that is used instead; None for none.
@@ -61,6 +64,7 @@ def sweep(
     # Compute with a progress bar, then write the report from the new scores.
     with show_campaign_progress(workers or os.cpu_count() or 1) as progress:
         outcome = run_campaign(campaign, out, workers, scheduler, only, progress)
+    # The table on the terminal, then how many chunks were done, and problems.
     scores = read_summary(out / SUMMARY)
     report = write_campaign_report(campaign, scores, out)
     print_scores(campaign, scores)

@@ -123,7 +123,9 @@ def list_stored_variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...]
 def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
     """Create the store of a campaign, complete except for the claims and the chunks of runs.
 
-    `labels`: names along its axes.
+    A campaign simulates many settings with many runs each; jobs write chunks of runs into this store later, each into
+    files of its own. `labels`: names along the store's axes (nodes, filters, states and so on). `campaign`: the
+    definition, with the text and versions that the store records.
     """
     with whole_folder(path) as folder:
         attributes = {

@@ -59,13 +59,16 @@ def filter_plant(
 ) -> FilteredPlant:
     """Filter a plant's rows, and smooth them, forecast behind them and predict each of them where that is asked for.
 
-    `horizons`: how far ahead to forecast; None for no forecasts.
+    `data` holds the plant's measured rows and messages. `smooth`: how to smooth (whole interval, or a fixed lag), None
+    for not. `horizons`: how far ahead to forecast, None for no forecasts. `predicts`: whether to predict each row from
+    the rows before it. The result also has lines for the user on what was doubted and done.
     """
     record, doubts = filter_rows(network, data.recording, smooth)
     # Times of dated messages count from a date, in seconds.
     if data.events is not None and data.events.dated and record.origin is not None:
         record = record.with_units({"time": "s"} | record.units)
     said = [*_describe_doubted_values(network, record), *data.summary]
+    # Forecasts after the last row.
     forecasts: ByFilter = {}
     if horizons is not None:
         forecasts = _make_forecasts(record, horizons)
@@ -238,7 +241,9 @@ def _write_lagged_estimates(
 ) -> list[str]:
     """Write the estimates of each row given all that came up to a lag after it, in a file or table of their own.
 
-    Return a line on it; none without a lag, and of rows of time.
+    Such estimates use messages that come late, but wait no longer than the lag. They are found by replaying the
+    messages as they came. Returned is a line for the user; none without a lag, and none for rows of time, which have no
+    order of arrival. `place`: where the estimates are written; `write` writes a table there.
     """
     if lag is None or data.events is None:
         return []
@@ -246,7 +251,8 @@ def _write_lagged_estimates(
     from heliograph.model.plant import TIME_STEP
 
     window, ahead = options.limits
-    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
+    # In continuous time the initial law of the state is that of the first row's time; in steps that of step 0.
+    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0
     capacity = max(LEAST_CAPACITY, len(data.events))  # with less room than rows the oldest become final early
     lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if lagged is None:

@@ -150,7 +150,12 @@ def read_events(
     options: ReadingOptions,
     advance: "Advance",
 ) -> "EventTable | None":
-    """Read the messages of a bag, a file or a store; None for rows of time."""
+    """Read the messages of a bag, a file or a store; None for rows of time.
+
+    Measured data are a table with a row for each time, or messages that come whenever they come; the latter need
+    `sources` in the network's file, which say which topic and field is which output. `reference`: the network as the
+    user named it, for errors. `module`: the names that the network's file defines. `advance`: called with the progress.
+    """
     from heliograph.files.bags.ros_bag import is_bag
     from heliograph.files.logs.vehicle_log import is_log
     from heliograph.files.messages.folder_of_message_files import is_message_folder
@@ -158,9 +163,11 @@ def read_events(
     from heliograph.files.messages.messages_to_events import read_events as read_mapped
     from heliograph.numerics.check import fail
 
+    # Rows of time are read elsewhere.
     sources = module.get("sources")
     if not is_of_messages(path, sources):
         return None
+    # A bag, log or folder of messages cannot be read without sources. The error says which command suggests them.
     if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path) or is_message_folder(path)):
         hint = f"heliograph inspect {path} --network {reference} suggests them"
         raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")

@@ -83,7 +83,9 @@ def _yield_events_of_plants(
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield name, events and date of time 0 of each plant; the date is None where times are no dates.
 
-    A recording has events, or rows of time, which are those of one plant. Warnings and notes go to the standard error.
+    The command replays a recording as messages on the standard output. A recording has events (messages), or rows of
+    time, which are those of one plant, named "". Warnings and notes go to the standard error. `reference`: the network
+    as the user named it.
     """
     from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
@@ -95,8 +97,9 @@ def _yield_events_of_plants(
     def no_progress(what: str, done: int = 0, total: int = 0) -> None:
         """Show nothing: the standard output is a pipe."""
 
+    # None is returned for rows of time, which become events one row after the other.
     table = read_events(path, reference, network, module, options, no_progress)
-    if table is None:  # rows of time
+    if table is None:
         rows = read_rows(path, network, options)
         for line in [*rows.warnings, *_describe_too_fine_dates(path, rows.recording.time)]:
             print(f"heliograph: {visible(line)}", file=sys.stderr)
@@ -106,6 +109,7 @@ def _yield_events_of_plants(
 
     from heliograph.cli.measured_data import describe_unreadable_messages
 
+    # Events of several plants: warn of dates that are finer than a replay can hold, then yield plant by plant.
     lines_on_digits: list[str] = []
     if table.dated:
         times = [columns.time for name in table.plants for columns in table.of(name).columns.values()]

@@ -149,13 +149,15 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     Source: Gentleman, Least squares computations by Givens transformations without square roots (1973).
     """
     n, dtype = len(factors.matrix), jnp.asarray(columns.matrix).dtype
+    # L is held as a flat list of its entries below the diagonal; `flat_place`: index of entry (i, j) in it.
     rows, places = np.tril_indices(n, -1)
-    # Index of entry (i, j) of L in the flat array of the entries below its diagonal.
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
         """Return the factors of L diag(d) L' + w c c', (c, w) = `column`. Row j takes c_j L_ij off each c_i below."""
         (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
+        # Row j takes its part of the column: d_j' = d_j + w c_j^2, s = d_j / d_j', g = w c_j / d_j'
+        # (1 and 0 if d_j' = 0).
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
             reciprocal = reciprocal_or_one(d)

@@ -31,21 +31,25 @@ def measure_uncorrelated(
 ) -> Measured:
     """Measure z = E z + slopes xi + N omega of x = m + L xi, component after component of N^-1 z.
 
-    Returns the rows (n + m, n) and variances (n,) given all components, the mean with what is left of z - E z times -1
-    below, the m innovations, each given those before it, and their variances.
+    xi and omega are uncorrelated, with variances `d` and r. N^-1 z has uncorrelated noises, so that its components can
+    be used one by one, each a scalar update without a matrix inverse. Returned are the rows (n + m, n) and variances
+    (n,) given all components (L of the posterior, then the slopes), the mean with minus the rest of z - E z below it
+    (n + m,), the m innovations, each given those before it, and their variances.
 
     Args:
-        root: L (n, n).
+        root: L (n, n), the root of the prior covariance L diag(d) L'.
         d: variances (n,) of xi.
         mean: m (n,).
-        rows: slopes (m, n), and z - E z as a last column; 0 of what is missing.
-        noise: N (m, m), unit lower triangular, and the variances r (m,) of omega.
+        rows: slopes (m, n), and z - E z as a last column; rows of missing components are 0.
+        noise: matrix N (m, m), unit lower triangular, and weights: the variances r (m,) of omega.
         present: which components arrived (m,).
         least: variance (m,) up to which slopes are rounding.
     """
     n = len(d)
+    # N^-1 slopes and N^-1 (z - E z); a missing component gets variance 1, with slopes of 0.
     rows, variance = decorrelate(noise.matrix, rows), jnp.where(present, noise.weights, 1.0)
-    # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
+    # Each scalar update changes the rows of L and the slopes of components to come in the same way, so these are
+    # stacked. So are the mean and, negated, the innovations.
     root, news = jnp.concatenate([root, rows[:, :n]]), jnp.concatenate([mean, -rows[:, n]])
     return update_by_rows(root, d, news, variance, least)
 

@@ -60,10 +60,11 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     """Load a function that returns a network from Python source, which need not be the file's present one.
 
-    The module finds others in the file's folder, when it is loaded and when the function is called.
+    A campaign keeps the source with which it was started, so the text may be older than the file. Modules that it
+    imports are found in the file's folder, both when the source is run and when the function is called.
 
     Args:
-        path: the file that the source is of.
+        path: path of the file from which the source was read.
         source: its text.
         name: name of the function in it.
 

@@ -75,14 +75,17 @@ def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first
     """
     import pyarrow as pa
 
-    if pa.types.is_dictionary(column.type):  # each value once, and which one a row has
+    # A dictionary column stores each distinct value once, and an index in each row: expand it.
+    if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     kind = column.type
+    # Dates and times.
     if pa.types.is_timestamp(kind):
         moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
         return convert_to_nanoseconds(moments, name, first)
     if pa.types.is_date(kind):
         return convert_to_nanoseconds(column.cast(pa.date32()).to_numpy(), name, first)
+    # Integers keep digits that doubles would lose; decimal numbers without fraction are integers.
     if pa.types.is_integer(kind):
         return convert_integers_of_arrow(column)
     if pa.types.is_decimal(kind):
@@ -91,6 +94,7 @@ def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first
         if whole:
             return convert_integers_of_arrow(pa.chunked_array([pa.array([v and int(v) for v in values], pa.int64())]))
         return np.array([np.nan if value is None else float(value) for value in values], dtype=np.float64)
+    # All other numbers; a column without values (null) is NaN.
     if not (pa.types.is_null(kind) or (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind))):
         raise fail(where, "numbers", f"{kind} {column[:1].to_pylist()}")
     return np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)

@@ -49,33 +49,39 @@ class BlockOrderCheck:
     def check_block(self, came: RecordingRows, ordered: RecordingRows) -> None:
         """Check that a block goes on from the rows before it, and note what decides on the order of all rows.
 
+        A large file is read in blocks, and each block is sorted by itself. The result must be that of sorting all rows;
+        if blocks cannot show this, the error makes the caller read the file as a whole.
+
         Args:
-            came: rows of the block as they came.
-            ordered: those that are left of them, in the order of their times.
+            came: rows of the block in the order in which they came.
+            ordered: the rows that remain after sorting the block by time and leaving out stamps that cannot be right.
 
         Raises:
             RowsNotInBlocksError: only all rows together say in which order they are.
         """
+        # All blocks must have times of one kind (numbers or dates).
         if self.last is not None and self.last.time.dtype != ordered.time.dtype:
             where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
+        # The block must not begin before the last row of the block before it.
         rows = ordered if self.last is None else _join_times(self.last, ordered)
         if (row := find_backwards_row(rows.time)) is not None:
             raise self._make_refusal(rows.select(slice(row - 1, row + 1)), "a time that does not go backwards")
         self.last = ordered.select(slice(-1, None))
         if self._first is None:
             self._first = ordered.select(slice(1))
+        # Where each row is a step, nothing else depends on other blocks.
         if self._rows_are_steps:
             return
-        # A step of more than a year, and rows out of order, in whichever blocks: the rows behind the step may all have
-        # stamps that were not set, which a block cannot tell.
+        # A step of more than a year together with rows out of order, in whichever blocks: the rows behind the step may
+        # all have stamps that were not set, which one block cannot tell.
         if len(jumps := np.flatnonzero(np.diff(rows.time) > _year_in_unit_of(rows.time))):
             self._jump = rows.select(slice(int(jumps[0]), int(jumps[0]) + 2))
         if (row := find_backwards_row(came.time)) is not None:
             self._disordered = came.select(slice(row - 1, row + 1))
         if self._jump is not None and self._disordered is not None:
             raise self._make_refusal(self._disordered, "times in order, in a recording with steps of more than a year")
-        # What the block left out is compared with all rows at the end: its earliest and its latest stand for it.
+        # Left out rows are compared with all rows at the end. The earliest and the latest of the block suffice.
         left_out = came.select(~np.isin(came.numbers, ordered.numbers))
         if len(left_out.numbers):
             self._left_out.append(left_out.select(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))

@@ -81,7 +81,12 @@ def _has_index(values: object) -> bool:
 
 
 def _convert_column(values: Any, name: str) -> np.ndarray:
-    """Return one column as numbers or dates; what its own kind marks as missing becomes NaN or NaT."""
+    """Return one column as numbers or dates; what its own kind marks as missing becomes NaN or NaT.
+
+    Tables may be pandas, Arrow, NumPy or plain lists; each kind marks missing values in its own way. Whole numbers keep
+    all digits, also those that doubles do not have. `name`: of the column, for errors.
+    """
+    # Numbers of pandas, with a mask of missing values; whole numbers of Arrow; masked whole numbers of NumPy.
     if hasattr(values, "isna") and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         kind = {"i": np.int64, "u": np.uint64, "b": np.bool_}.get(values.dtype.kind, np.float64)
         absent = np.asarray(values.isna(), dtype=bool)
@@ -90,6 +95,7 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
         return convert_integers_of_arrow(values)
     if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
         return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
+    # All others as a NumPy array. Large whole numbers in a list that also has other numbers keep their digits.
     if hasattr(values, "to_numpy"):
         column = values.to_numpy()
     else:
@@ -103,6 +109,7 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
             column = np.array(
                 values, dtype=object
             )  # among these whole numbers keep the digits that doubles do not have
+    # Convert by the type of the array: dates, numbers, or objects one by one.
     if column.ndim != 1:
         raise fail(name, "one number or date in each row", f"shape {column.shape}")
     if column.dtype.kind == "M":

@@ -283,6 +283,9 @@ def _find_unit_of_date(value: object) -> TimeUnit | None:
 def inspect_file(path: Path) -> tuple[dict[str, TopicStatistics], str]:
     """Return the topics of a file of messages, and the first reason why one cannot be read, "" if all can be.
 
+    The statistics (fields, times, values of each topic) help a user to say which field is which measurement. Messages
+    that cannot be read are skipped.
+
     Raises:
         ValueError: no such file, or one that cannot be read at all.
     """
@@ -291,13 +294,16 @@ def inspect_file(path: Path) -> tuple[dict[str, TopicStatistics], str]:
         if isinstance(message, InputError):
             broken = broken or str(message)
             continue
+        # A file without topics has one topic, named after the file. A stamp of arrival that cannot be read is left out.
         name = message.topic or make_default_topic(path)
         arrival = None
         with suppress(InputError):
             arrival = None if message.arrival is None else parse_arrival(message.arrival, message.where)
+        # A text payload of a broker's message, with its arrival.
         if message.topic is not None and isinstance(message.content, str) and arrival is not None:
             note_payload(topics, name, message.content, arrival)
             continue
+        # Else the decoded content; if it is no JSON, only the message is counted.
         try:
             _note_message(
                 topics, name, decode_message_content(message), "JSON" if is_message_file(path) else "row", arrival

@@ -183,11 +183,13 @@ class InnovationSummary(NamedTuple):
 
     @staticmethod
     def find_outlying(summaries: "Sequence[InnovationSummary]") -> list[int]:
-        """Return the numbers of outputs with a larger share of down-weighted values than all others together.
+        """Return the indices of outputs with a larger share of down-weighted values than all others together.
 
-        Let p_1 be the share of one output and p_2 that of the others together, with Wilson's 95 % intervals (l, u). The
-        output is named if p_1 - p_2 > sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike, some 3 of 100
-        are named. `summary.independent` is the number of independent values that would give the same interval.
+        A filter against outliers gives values that do not fit a small weight; a sensor with many of them is suspect.
+        Let p_1 be the share of down-weighted values of one output and p_2 that of the others together, with Wilson's
+        95 % intervals (l, u). The output is named if p_1 - p_2 > sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that
+        are alike, some 3 of 100 are named. `summary.independent` is the number of independent values that would give
+        the same interval.
 
         Args:
             summaries: a summary of each output.
@@ -196,12 +198,15 @@ class InnovationSummary(NamedTuple):
         """
         outliers = []
         for i, summary in enumerate(summaries):
+            # The other outputs that received anything.
             others = [other for j, other in enumerate(summaries) if j != i and other.received]
             if not summary.received or not others:
                 continue
+            # p_2, and its interval.
             pooled = sum(other.down_weighted for other in others) / sum(other.received for other in others)
             independent_count = sum(other.independent for other in others)
             interval_of_others = wilson(pooled * independent_count, independent_count)
+            # p_1, and the test.
             share = summary.share
             if share.estimate - pooled > np.hypot(share.estimate - share.low, interval_of_others.high - pooled):
                 outliers.append(i)

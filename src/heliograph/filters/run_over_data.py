@@ -164,16 +164,18 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
         filter: the filter.
         z: measurements (rows, received), an array or a table; NaN for what did not arrive.
         u: inputs (rows, inputs); None of a filter without any.
-        after: result of the rows before these, from whose last state the filter goes on; None for the first rows.
+        after: result of the rows before these, if the filter goes on from its last state; None to begin anew.
     """
+    # The state and step number at the end of earlier rows, if there are any.
     before = None if after is None else _find_origin_of_earlier_result(filter, after)
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
+    # Dates of the rows, if the data are tables with a time index; they must go on from the earlier rows.
     dates = find_common_dates(_name_tables(z, u))
     dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
     if before is not None and dates is not None:
         _check_dates_increase(before, dates)
-    # The rows begin behind the state of those before, or of a linear filter behind its start, which is known.
+    # The state before the first row: that behind the earlier rows, or of a linear filter its start, which is known.
     state = initial_state_if_linear(filter) if before is None else before.state
     start = () if state is None else (state, np.asarray(begin))
     # Three ways, the fastest first: chunks side by side, the filter's own native code for rows, one scan. The first two
@@ -182,6 +184,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     result = result or filter.filter_rows(rows_z, rows_u, *start)
     state, outputs = result or step_over_known_rows(filter, rows_z, rows_u, _collect_row_results, start)
     mean, covariance, innovation, modes, counts = outputs
+    # Warn of estimates that are no numbers, and of particle filters whose weight is on few particles.
     _warn_of_lost_estimate(filter, mean, begin)
     if counts is not None:
         _warn_of_few_particles(counts, innovation.log_likelihood, begin)

@@ -231,19 +231,23 @@ def smoother_step_of(
 ) -> SmootherStep:
     """Build the smoother step from the Gaussians that a filter's states hold.
 
-    With x = m + L xi before the step, the predicted state is x+ = E x+ + slopes xi + w. This is all that the regression
-    of x on x+ needs.
+    A smoother goes back over the steps of a filter (Rauch, Tung and Striebel). It needs the regression of the state x
+    before the step on the state x+ after it. With x = m + L xi before the step, the predicted state is
+    x+ = E x+ + slopes xi + w: E x+, the slopes and Cov w are all that the regression needs.
 
     Args:
-        step: the states around the step, each with the Gaussian of N numbers.
+        step: the filter's states before the step, after the prediction, and after the correction; each holds a Gaussian
+            of N numbers.
         moved: (slopes (N, N), columns of the noise's covariance Cov w (N, columns)).
-        claim: what smoothed covariances are said to be.
+        claim: what smoothed covariances are said to be: exact, upper bound or nominal.
         manifold: which of the plant's states are angles and attitudes.
         projection: from the filter's state to the plant's (n, N).
     """
     slopes, noise = moved
     states = step.before, step.prior, step.after
+    # The Gaussian of each state.
     before, prior, after = (Gaussian(*map(jnp.asarray, gaussian_of(state))) for state in states)
+    # `condition_on_next_state` is the regression.
     return SmootherStep(
         after,
         condition_on_next_state(before, jnp.asarray(slopes), prior.mean, noise),

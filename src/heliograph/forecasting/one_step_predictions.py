@@ -59,7 +59,7 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
     A fusion of estimates is left out, since it has no state of its own to predict.
 
     Args:
-        record: what `hg.run` returned.
+        record: what `hg.run` returned, which still knows its network and filters.
         inputs: (steps, inputs), as they were given to `hg.run`; by default a plant without inputs is assumed.
 
     Returns:
@@ -71,11 +71,13 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
 
     Source: the prediction step of the filter.
     """
+    # The network that made the record.
     network = find_origin(instance("record", record, Record, "a Record")).model
     assert isinstance(network, Network)  # nothing else makes a record with an origin
     u = read_plant_inputs(network, inputs, len(record.time))
     filters_with_state = list_single_filters(network)  # (node, filter), without fusion rules
     forecasts: Forecasts = {}
+    # A target is a filter at a node. Its predictor gives the forecast of row k from rows before k.
     for target in list_targets(find_origin(record)):
         if (target.node, target.filter) in filters_with_state:
             z = select_measurements(target, record)

@@ -38,23 +38,26 @@ def draw_limited_components(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return means (draws, n) and covariances (K, n, n) of Gaussians given their limited components, which are drawn.
 
-    One component after the other is drawn from its normal law, given those before it, cut to its limits. Where there
-    are several, each draw has the product of the probabilities of being within as its weight, by which it is drawn
-    anew.
+    Some states have limits (such as a level that is not negative), so that draws of a Gaussian mixture must respect
+    them. The limited components are drawn one after the other, each from its normal law given those before, cut to its
+    limits. If several are limited, this sequence alone favours some draws: each draw gets as weight the product of the
+    probabilities of being within the limits, and draws are drawn anew by weight.
 
     Args:
-        part: the Gaussian of each draw (draws,).
-        means: of the Gaussians (K, n).
-        covariances: of them (K, n, n).
+        part: index of the Gaussian of each draw (draws,).
+        means: means of the Gaussians (K, n).
+        covariances: covariances of the Gaussians (K, n, n).
         limits: index, lowest and highest value of each limited component.
         generator: of the random numbers.
 
     Source: the simulator of Geweke, Hajivassiliou and Keane; Genz and Bretz, Computation of multivariate normal and t
         probabilities (2009), 4.2.
     """
+    # `center` (draws, n) and `left` (K, n, n): mean and covariance given the components drawn so far.
     center, left, weight = means[part], covariances, np.ones(len(part))
     for place, low, high in limits:
-        # A number between the least and the most of its distribution function; a component without variance stays.
+        # Draw the component by the inverse of its distribution function, between that function's values at the limits.
+        # A component without variance stays.
         variance = left[:, place, place]
         is_random = variance > 0
         divisor = np.where(is_random, variance, 1.0)
@@ -63,12 +66,15 @@ def draw_limited_components(
         units = ndtri(least + generator.random(len(part)) * (most - least))
         moved = np.where(is_random[part], deviation * units, 0.0)
         drawn = np.clip(center[:, place] + moved, low, high)
+        # The probability of being within the limits.
         weight *= np.where(is_random[part], most - least, 1.0)
-        # The others given this one.
+        # Condition the others: center + slope (drawn - mean), P - P_j P_j' / P_jj, with P_j the column of this
+        # component.
         slopes = np.where(is_random[:, None], left[:, :, place] / divisor[:, None], 0.0)
         center = center + slopes[part] * (drawn - center[:, place])[:, None]
         center[:, place] = drawn
         left = left - slopes[:, :, None] * left[:, None, place]
+    # Resample the draws of each Gaussian by weight.
     if len(limits) > 1 and np.ptp(weight) > 0:
         for number in np.unique(part):
             own = np.flatnonzero(part == number)

@@ -54,9 +54,11 @@ def fused_error_norm(
 ) -> float:
     """Return a bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
 
-    sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||), since z - zhat = sum c_i (M e_i - M mu_i) and |mu_i| <= D_i by
-    component; ||D_i|| is the root of the sum over steps and components. NaN where a quantizer saturated: its D is NaN,
-    and nothing is guaranteed.
+    Each local H-infinity filter i guarantees ||M e_i|| <= gamma_i ||w_i|| for its error e_i and its disturbance w_i.
+    Its estimate is sent as xq_i, quantized with an error mu_i, |mu_i| <= D_i by component. The fused error is
+    z - zhat = sum c_i (M e_i - M mu_i), so the bound is sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||). ||D_i|| is the
+    root of the sum of squares over steps and components. NaN where a quantizer saturated: its D is NaN, and nothing is
+    guaranteed.
 
     Args:
         levels: gamma_i (N,).
@@ -71,7 +73,7 @@ def fused_error_norm(
 
     Source: Minkowski's inequality, in place of H-infinity quantized fusion, equations (34) to (37).
     """
-    # Shapes and signs.
+    # Check shapes and signs.
     gamma, c = _check_levels_and_weights(levels, weights)
     norms, m = array("disturbances", disturbances, (len(gamma),)), array("output matrix", matrix, (None, None))
     d = np.asarray(errors, dtype=np.float64)
@@ -79,7 +81,7 @@ def fused_error_norm(
         raise fail("errors", f"shape ({len(gamma)}, any, {m.shape[1]})", f"shape {d.shape}")
     if np.any(norms < 0) or np.any(d < 0):
         raise fail("disturbances and errors", "no negative number", float(min(norms.min(), np.nanmin(d))))
-    # ||M|| ||D_i||.
+    # ||M|| ||D_i|| of each node, ||M|| the largest singular value.
     quantization = np.linalg.norm(m, 2) * np.sqrt(np.sum(d**2, axis=(1, 2)))
     return float(c @ (gamma * norms + quantization))
 

@@ -47,9 +47,11 @@ def _with_joint_check(weights: Weights) -> Weights:
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Return the matrix weights W_i with sum_i W_i = I that minimise W P W', for P = `joint` (node, n, node, n).
 
-    W = (E' U^+ E)^-1 E' U^+ with E = [I; ...; I] and U = P + E D E'. P^+ alone would be wrong if a combination of the
-    estimates has no error. With D > 0 the range of E is in that of U, and U gives the weights of P since W E = I. D is
-    the mean of the estimates' variances, so that units do not matter. An eigenvalue below RANK roundings counts as 0.
+    The estimates of all nodes, x + e_i, are fused to sum_i W_i (x + e_i); these weights make the covariance of its
+    error least. They are W = (E' U^+ E)^-1 E' U^+ with E = [I; ...; I] and U = P + E D E'. P^+ (the pseudoinverse)
+    alone would be wrong if a combination of the estimates has no error. With D > 0 the range of E is in that of U, and
+    U gives the weights of P since W E = I. D is diagonal, the mean of the estimates' variances, so that units do not
+    matter. An eigenvalue below RANK roundings counts as 0.
 
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
@@ -58,14 +60,15 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     """
     nodes, n = joint.shape[:2]
     joint = jnp.asarray(joint)
-    # D, and P in units of its roots.
+    # The diagonal of D, and P in units of its roots.
     variances = jnp.einsum("iaia->a", joint) / nodes
     unit = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
     P = joint / (unit[:, None, None] * unit)
-    # U = P + E E' in these units.
+    # U = P + E E' in these units, in which D = I.
     U = symmetrize((P + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     E = jnp.tile(jnp.eye(n), (nodes, 1))
     E_U_inverse = pseudo_solve(U, E, rounding(0.0, U, RANK)).T  # E' U^+
+    # (E' U^+ E)^-1 E' U^+, then back to the states' own units.
     weights = regular_solve(E_U_inverse @ E, E_U_inverse).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 

@@ -166,8 +166,7 @@ class UniformQuantizer(AbstractQuantizer):
         scale: unit u of x, positive, a number or (n,); 1 by default.
 
     Raises:
-        ValueError: fewer than two levels, an amplitude or scale that is not positive, an amplitude or an error beyond
-            the range of numbers.
+        ValueError: fewer than two levels, an amplitude or scale that is not positive, or numbers beyond their range.
 
     Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10), (11) and (13).
     """
@@ -252,9 +251,7 @@ class EscapeQuantizer(AbstractQuantizer):
     Where x is outside [-d, d], an escape symbol doubles the amplitude, as often as needed: m = ceil(log2(|x| / d)).
     Then the segment is sent, so |error| <= d 2^m / levels always, and both ends go on with
     d+ = max(smallest, decay d 2^m + growth |sent|). Levels are odd, so that zero is one. Only a value whose d 2^m would
-    be no number saturates.
-
-    A value that is lost on the way leaves the receiver with a wrong d. It detects that from the number of the next one:
+    be no number saturates. A lost value leaves the receiver with a wrong d, which it sees by the number of the next:
     from then on it delivers NaN, without an error bound, and its state is not `synchronised`, until the sender restarts
     from the first amplitude. That is so with every `interval`-th value, and with any that `encode` restarts with. So
     after a loss the error bound holds again within `interval` values; without either, never.
@@ -341,10 +338,13 @@ class EscapeQuantizer(AbstractQuantizer):
     def decode(self, state: UplinkState, symbols: UplinkSymbols) -> tuple[UplinkState, Quantized]:
         """Return the receiver's next state and the decoded value, from its present state and the symbols alone.
 
+        The quantizer sends the number of a segment of [-d, d]. The amplitude d adapts to the values: both ends compute
+        it from what was sent.
+
         Args:
-            state: the receiver's, of its amplitude d and the number that it expects next.
-            symbols: m escapes, each of which doubles d; the segment of the value, or that it is above or below all of
-                them, or that nothing is sent; the number of the message; and whether the amplitude restarts.
+            state: the receiver's amplitude d, and the number of the message that it expects next.
+            symbols: m escapes, each of which doubles d; the segment of the value, or that it is ABOVE or BELOW all of
+                them, or NOTHING was sent; the number of the message; and whether d restarts.
         """
         escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
         restarts, is_sent, is_beyond = restart != 0, segment != NOTHING, segment <= BELOW

@@ -47,12 +47,15 @@ def known_channel_design(
 def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
     """Return a design by the Riccati recursion at one level; it ends, infeasible, at a step for which no gain exists.
 
-    The weight before step k is P_k = diag(p I, P2), with a number p for x and a matrix P2 for e.
+    The filter bounds the energy of the error e by level^2 = gamma^2 times that of the disturbances. A storage function
+    (x, e)' P_k (x, e) proves it, with P_k = diag(p I, P2), a number p for the state x and a matrix P2 for e. A Riccati
+    step gives the best gain and the next P2. The design ends, infeasible, at a step for which no gain exists.
 
     Args:
-        system: the system.
-        level: gamma.
-        multipliers: of f~ and h~, in the user's units.
+        system: the system x+ = A x + f(x) + B v with its measurements, its initial weight W, and growth bounds of f and
+            h.
+        level: gamma, the bound to be reached.
+        multipliers: multipliers of the growth bounds of the differences f~ and h~ (steps, 2), in the user's units.
     """
     n, m, steps = system.states, system.received, system.steps
     # A little below the level, so that the certificate has a margin.
@@ -94,15 +97,17 @@ def _compute_best_gain(
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
     """Return the best gain K* of a step and the largest weight P2+ of e after it, or None where there is no gain.
 
-    Over the part (e, f~, h~, v, rho) of eta: e+ = E eta before the correction, U eta is received less its prediction,
-    and S^-1 is the quadratic form of what a level allows. K* = E S U' (U S U')^-1 and P2+ = (E S E' - K* U S E')^-1.
+    eta = (x, e, f, f~, h, h~, v, rho) is all that a step depends on; the part (e, f~, h~, v, rho) moves the error:
+    e+ = E eta before the correction, and U eta is what is received less its prediction. S^-1 is the quadratic form that
+    the H-infinity bound with this level allows for eta. The correction e+ = (E - K U) eta has least size for
+    K* = E S U' (U S U')^-1, and then P2+ = (E S E' - K* U S E')^-1.
 
     Args:
-        system: the system.
-        step: its matrices at this step, of which E is `error` and U `received`.
-        weight: P2 before the step.
-        level: gamma.
-        multipliers: lambda of f~ and h~.
+        system: the system x+ = A x + f(x) + B v with growth bounds of f and h.
+        step: its matrices at this step: `error` E, `received` U, `target` M'M, `energy` of (v, rho).
+        weight: P2, the weight of e before the step.
+        level: gamma, the bound on the error's energy per energy of the disturbances.
+        multipliers: multipliers lambda of the growth bounds of f~ and h~.
     """
     errors = slice(system.states, 2 * system.states)
     grows = [not growth.absent for growth in (system.growth, system.output_growth)]
@@ -112,11 +117,13 @@ def _compute_best_gain(
     inverse_s[errors, errors] += weight
     if np.linalg.eigvalsh(inverse_s[errors, errors])[0] <= 0:
         return None
+    # Take only parts of eta that the form has, and solve for K*; least squares, as U S U' may be singular.
     used = np.flatnonzero(np.diag(inverse_s))
     S, E, U = np.linalg.inv(inverse_s[np.ix_(used, used)]), step.error[:, used], step.received[:, used]
     cross, spread = U @ S @ E.T, U @ S @ U.T
     solution, *_ = np.linalg.lstsq(spread, cross, rcond=None)
     gain = solution.T
+    # P2+, a little smaller (SLACK) for a margin of rounding, and symmetric.
     next_weight = np.linalg.inv(E @ S @ E.T - gain @ cross)
     return gain, (1 - SLACK) * (next_weight + next_weight.T) / 2
 

@@ -37,6 +37,9 @@ class Interval(NamedTuple):
 def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
     """Return intervals that hold a traced function's results wherever its arguments lie in these intervals.
 
+    It is used to bound a function over a whole region, where values at points would prove nothing. Each operation of
+    the traced program is applied to intervals in place of numbers.
+
     Args:
         jaxpr: the function, traced by JAX.
         arguments: an interval for each argument, arrays of lower and upper ends.
@@ -58,6 +61,7 @@ def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], contin
     for equation in jaxpr.jaxpr.eqns:
         inputs = [read(atom) for atom in equation.invars]
         name = equation.primitive.name
+        # A call of another program, such as a jitted function, is bounded in the same way.
         if (called := called_program(equation)) is not None:
             results = bound_program(called, inputs, continuous)
         elif name == "mul" and equation.invars[0] is equation.invars[1]:  # x x is never below 0, as x y may be

@@ -273,22 +273,27 @@ class HorizonProblem:
     ) -> None:
         """Add the inequality -Phi >= MARGIN level^2 of step k, and that its positive matrices are positive.
 
-        eta'Phi eta = E[x+'P1 x+ + e+'P2 e+] + |M e|^2 - level^2 |(v, rho)|^2 + growth forms - (x, e)'P (x, e), for the
-        vector eta of all that the step depends on, of length q.
+        The problem is a semidefinite program: find weights P and gains of all steps for the least level^2. A quadratic
+        form Phi must be negative at each step, so that the storage (x, e)' P (x, e) does not grow by more than the
+        disturbances (v, rho) supply. eta'Phi eta =
+        E[x+'P1 x+ + e+'P2 e+] + |M e|^2 - level^2 |(v, rho)|^2 + growth forms - (x, e)'P (x, e), for the vector eta of
+        all that the step depends on, of length q.
 
         Args:
-            k: the step; its unknowns are at place k + 1 of the vector, the level squared at place 0.
-            step: its matrices in scaled coordinates.
-            forms: matrices of the step as linear maps of its unknowns.
-            weight_forms: P, the weight before the step, as linear maps of unknowns by their place.
+            k: number of the step. In the vector of unknowns level^2 stands at place 0, the unknowns of this step at
+                place k + 1.
+            step: its matrices in scaled coordinates: `target` M'M, `energy` of (v, rho).
+            forms: matrices of the step as linear maps of its unknowns, each matrix written row by row.
+            weight_forms: {place: P, the weight before the step, as a linear map of the unknowns there}.
             weight_constant: the part of P without unknowns.
             start: an initial weight that may couple x and e, at the first step; else None.
         """
         q, width = len(step.energy), len(weight_constant)
-        # Phi is block-diagonal after a permutation: `block` holds the indices of eta of one block, `entries` those of
-        # its entries in the matrix (q, q) written row by row.
+        # The part of -Phi without unknowns: P's constant part - M'M.
         constant = -step.target
         constant[:width, :width] += weight_constant
+        # Phi is block-diagonal after a permutation, and small blocks are solved faster. `block`: indices in eta of one
+        # block; `entries`: of its entries in the matrix (q, q) written row by row.
         for block in find_independent_parts(step, forms, start):
             entries = (block[:, None] * q + block).ravel()
             # -Phi as a linear map of the unknowns at each place: of the level squared, this step's, and those of P.
@@ -298,7 +303,7 @@ class HorizonProblem:
                 padded[:width, :width] = form.reshape(width, width, -1)
                 maps[place] = maps.get(place, 0.0) + padded.reshape(q * q, -1)[entries]
             self._require_semidefinite(maps, constant[np.ix_(block, block)])
-        # Positive matrices of the unknowns.
+        # Matrices of the unknowns that must be positive.
         for form in forms.positive:
             size = math.isqrt(len(form))
             self._require_semidefinite(

@@ -96,30 +96,38 @@ def _make_step_matrices(
 ) -> StepMatrices:
     """Return the matrices of step k over eta = (x, e, f, f~, h, h~, v, rho), without functions that are absent.
 
+    An H-infinity filter bounds the error energy by level^2 times the energy of the disturbances. Its inequality at step
+    k is a quadratic form in eta = (x, e, f, f~, h, h~, v, rho): state x, error e, nonlinear functions f and h with
+    their differences f~ and h~ between state and estimate, disturbances v and rho. Parts of functions that are absent
+    are left out.
+
     Args:
         system: x+ = A x + f(x) + B v, what is received G (C x + h(x) + D v) + N rho, and the target M e.
         k: the step.
-        spreads: the random part of (G, N) as a sum of independent matrices, (matrix, m, y + size of rho).
+        spreads: the random part of (G, N) about its mean, as a sum of independent matrices (spreads, m, y + size of
+            rho).
         separate: whether each of f, f~, h, h~ has a multiplier of its own; else f and f~ share one, and h and h~.
     """
     A, B, M = system.transition[k], system.disturbance[k], system.target[k]
     C, D = system.output[k], system.feedthrough[k]
     n, y, m, link = system.states, system.output.shape[1], system.received, system.channel[k]
+    # Slices of the parts in eta, which has q entries. Of an absent f or h no columns are used.
     eta = _locate_parts_of_eta(system, k)
     q, of_f, of_h = eta.rho.stop, slice(0, eta.f.stop - eta.f.start), slice(0, eta.h.stop - eta.h.start)
-    # x+ = A x + f + B v, and e+ = A e + f~ + B v before the correction.
+    # State x+ = A x + f + B v, and error e+ = A e + f~ + B v before the correction.
     state, error = np.zeros((n, q)), np.zeros((n, q))
     state[:, eta.x], state[:, eta.f], state[:, eta.v] = A, np.eye(n)[:, of_f], B
     error[:, eta.e], error[:, eta.f_error], error[:, eta.v] = A, np.eye(n)[:, of_f], B
-    # Received less its prediction: E[G] (C e + h~ + D v) + E[N] rho, and the random part of G (C x + h + D v) + N rho.
+    # Mean of what is received less its prediction: E[G] (C e + h~ + D v) + E[N] rho.
     G, N = link.mean[:, :y], link.mean[:, y:]
     mean = np.zeros((m, q))
     mean[:, eta.e], mean[:, eta.h_error], mean[:, eta.v], mean[:, eta.rho] = G @ C, G[:, of_h], G @ D, N
+    # Random part of G (C x + h + D v) + N rho, for each of the spreads.
     G, N = spreads[..., :y], spreads[..., y:]
     random = np.zeros((len(spreads), m, q))
     random[..., eta.x], random[..., eta.h], random[..., eta.v] = G @ C, G[..., of_h], G @ D
     random[..., eta.rho] = N
-    # M'M and the disturbances' energy as quadratic forms.
+    # |M e|^2 = e' M'M e and |v|^2 + |rho|^2 as quadratic forms in eta.
     target, energy = np.zeros((q, q)), np.zeros((q, q))
     target[eta.e, eta.e] = M.T @ M
     energy[eta.v, eta.v], energy[eta.rho, eta.rho] = np.eye(B.shape[1]), np.eye(link.disturbances)

@@ -20,13 +20,14 @@ METHOD: Method = "hessian"  # the curvature of the likelihood alone
 def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     """Return draws of the free numbers, and the log-likelihood of each row at each of them, as ArviZ keeps them.
 
-    The draws are normal on the line, about the maximum, with the covariance of the likelihood's curvature there (the
-    Laplace approximation).
+    ArviZ compares and plots Bayesian fits. The draws are normal about the maximum likelihood estimate, with the inverse
+    curvature of the log-likelihood there as covariance (the Laplace approximation). They are drawn in coordinates on
+    the line, where each free number is unbounded (such as logarithms of positive numbers).
 
     Args:
-        solution: the maximum.
-        draws: how many, 2 at least.
-        seed: of the draws.
+        solution: the fit: its maximum `x` (p,), covariance and likelihood.
+        draws: number of draws, 2 at least.
+        seed: seed of the draws.
 
     Returns:
         An `arviz.InferenceData`, or an `xarray.DataTree` from ArviZ 1.0 on, with the groups posterior, log_likelihood
@@ -39,10 +40,12 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     check_count("draws", draws, 2)
     random = np.random.default_rng(check_seed("seed", seed))
     check_installed(["arviz", "xarray"])
+    # A number at an end of its domain, or one that the data say nothing of, has no normal law.
     without_normal_law = [row.name for row in solution.rows(METHOD) if row.boundary or not row.identified]
     if without_normal_law:
         expected = "numbers inside their domains that the data identify"
         raise fail("fit, to_arviz", expected, ", ".join(without_normal_law))
+    # Draw points (draws, p) by the Laplace approximation, and evaluate l for each row in blocks, to limit the memory.
     covariance, _ = solution.covariance(METHOD)
     points = solution.x + random.multivariate_normal(np.zeros(len(solution.x)), covariance, draws, method="cholesky")
     density = np.concatenate(
@@ -53,6 +56,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
         "log_likelihood": _select_arrived_rows(solution, density),
         "sample_stats": _make_total_likelihood_dataset(density),
     }
+    # ArviZ before version 1.0 has a class of its own; later it takes a tree of xarray datasets.
     arviz = import_module("arviz")
     if hasattr(arviz, "InferenceData"):
         return arviz.InferenceData(**groups)

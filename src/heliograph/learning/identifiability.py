@@ -87,8 +87,10 @@ class Identifiability:
 def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int = 400, seed: int = 0) -> Identifiability:
     """Examine what a recording of this network could identify of its free numbers, before there is one.
 
-    Data are drawn as the filter expects them, at three points around the start, and the information that their second
-    half holds is examined: that of the first is helped by what is known of the initial state, and does not grow.
+    Free numbers (marked by `hg.free`) are identifiable if the data's information about them has full rank. Data are
+    drawn as the filter expects them, at three points around the start, and the information that their second half holds
+    is examined: the information of the first half is helped by what is known of the initial state, and does not grow
+    with more data.
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
@@ -103,11 +105,13 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     seed = check_seed("seed", seed)
     description = describe(network)
     description.start.check_sends_each_step("identifiability")
+    # The filter's likelihood as a function of the free numbers.
     objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
     u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
+    # At each point: draw a recording, and find the rank of the information of its second half (`late`).
     points = _draw_points_near(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
@@ -182,14 +186,16 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
 
-    Such as "Of a and b only the product a * b (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a
-    `solution`, the maximum of the likelihood.
+    Confounded numbers are free numbers that the data do not tell apart. An example: "Of a and b only the product a * b
+    (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a `solution`, the maximum of the likelihood.
+    `group` has the numbers' indices, how many must be fixed (`fix`), and the combinations that are identified:
+    `exponents` of products, `weights` of sums (combinations, numbers).
     """
     names = [parameters.coordinates[i] for i in group.places]
     if group.fix == len(names):  # no combination of them is identified
         return f"Nothing in the data tells {_join_names(names)}."
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
-    # Products x^a y^b and sums a x + b y that are identified, each with its interval.
+    # Identified products x^a y^b and sums a x + b y, each with its interval.
     combinations = []
     for row in group.exponents:
         combinations.append(format_product(names, row) + _format_interval(parameters, group, row, solution, log=True))
@@ -199,8 +205,9 @@ def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers,
     unnamed = len(names) - group.fix - len(combinations)
     if not combinations:
         return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
-    kind = "product" if np.all(group.exponents >= 0) else "combination"  # a / b is no product
-    if len(group.weights):  # then there are no products
+    # Choose the words. a / b is no product but a combination; if there are sums, there are no products.
+    kind = "product" if np.all(group.exponents >= 0) else "combination"
+    if len(group.weights):
         kind = "sum"
     kind += "s" if len(combinations) > 1 else ""
     others = f" and {_count_in_words(unnamed, 'other combination')}" if unnamed else ""
@@ -260,7 +267,10 @@ def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed:
 def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before.
 
-    Gains or noise variances that are reported with each message are part of z, and drawn from their own law.
+    Such measurements follow the law that the likelihood assumes, which tests of identifiability need. Each row is drawn
+    given those before, by the filter's own prediction. Gains or noise variances that are reported with each message are
+    part of z, and drawn from their own law. `x`: the free numbers (p,), from which `objective` makes the filter. `u`:
+    inputs (steps, inputs).
     """
     filter = objective.filter(jnp.asarray(x))
     reporting = find_told_filter(filter)
@@ -274,10 +284,12 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
         if reporting is not None:
             numbers = reporting.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
             zeros = reporting.with_numbers(zeros, numbers)
-        # The innovation of z = 0 is -E z, with covariance S; both are NaN for reported numbers.
+        # The innovation of z = 0 is -E z, with covariance S. Both are NaN for reported numbers, which get S = I and are
+        # overwritten below.
         received = filter.correct(prior, zeros, k)[1]
         is_value = ~jnp.isnan(received.value)
         S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
+        # z = E z + L noise, with L L' = S.
         z = cholesky(S) @ noise - received.value
         if reporting is not None:
             z = reporting.with_numbers(z, numbers)

@@ -255,12 +255,16 @@ class Description:
 def describe(network: Build) -> Description:
     """Return what is free in the network that a function returns: its numbers, and how to build it with others.
 
+    A fit changes free numbers and builds the network anew with them. The function is called once here with a collector
+    in place, which records each mark `hg.free(start)` and answers it by its start.
+
     Args:
         network: a function without arguments that returns a Network, with `hg.free(...)` in place of numbers.
 
     Raises:
         ValueError: no function, one that returns no network, or nothing free.
     """
+    # Refuse a network itself, and a function that needs arguments.
     if isinstance(network, Network):
         expected = "a function that returns it with hg.free(...) in it, so that it can be built with other numbers"
         raise fail("network to be learned", expected, "a Network")
@@ -269,11 +273,13 @@ def describe(network: Build) -> Description:
         signature(network).bind()
     except (TypeError, ValueError) as error:
         raise fail("network to be learned", "a function without arguments", str(error)) from None
+    # Call the function, and collect its marks.
     collector = FreeNumberCollector()
     with answer_free_marks_by(collector), jax.enable_x64(True):
         require_network(network())
     if not collector.marks:
         raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
+    # The free numbers, with their starts and domains; and which of them the user named.
     parameters = collector.parameters()
     is_named = tuple(mark.given is not None for mark in collector.marks)
     return Description(build=network, parameters=parameters, named=is_named)

@@ -173,10 +173,12 @@ def _search_from_starts(
 ) -> "_BestPoint":
     """Return the best end of searches from several starts; after Ctrl-C the best point at which the likelihood was.
 
+    The likelihood may have several maxima, so that several searches are made, by the simplex method.
+
     Args:
-        likelihood: the log-likelihood at a point of the line (p,).
-        points: where the searches begin.
-        say: called with a line of text behind each search.
+        likelihood: the log-likelihood at a point (p,), whose coordinates are unbounded.
+        points: starts of the searches, (p,) each.
+        say: called with a line of text after each search.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -233,8 +235,10 @@ def _climb_simplex(
     at_start = likelihood(start)
     if not len(start) or at_start > enough:  # nothing to search, or nothing to improve
         return _BestPoint(start, at_start, converged=True, stopped=False)
+    # First simplex (p + 1, p): the start, and a step of `size` along each coordinate.
     simplex = start + size * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     most = MOST_EVALUATIONS * len(start)
+    # `minimize` takes -l, and stops by size of the simplex, by values, or after too many evaluations.
     options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": most}
     climb: Any = minimize  # its types do not know an initial simplex
 

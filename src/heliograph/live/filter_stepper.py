@@ -206,12 +206,15 @@ def _compile_step(
 ) -> Any:
     """Return a filter's step as native code (see `compile_native_step`); None if XLA has to step the filter.
 
-    It is compiled once for each structure, set of shapes and engine.
+    A live filter makes one step per message, where native code saves the overhead of JAX. None is returned if the
+    native compiler lacks an operation, so that XLA has to step the filter. It is compiled once for each structure, set
+    of shapes and engine.
 
     Args:
-        static: the filter without its arrays.
-        shapes: shape and type of each argument: the filter's numbers, leaves of its state, z, u, k.
-        counts: how many of the arguments are numbers, and how many leaves of the state.
+        static: the filter without its arrays (its structure and settings).
+        shapes: shape and type of each argument, in order: the filter's arrays, leaves of its state, measurement z,
+            input u, step number k.
+        counts: how many arguments are arrays of the filter, and how many are leaves of the state.
         tree: structure of the state.
         engine: the setting of the engine. It is not read here: each setting has a compiled step of its own.
     """

@@ -13,20 +13,23 @@ from heliograph.model.over_time import first
 def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarray) -> Origin:
     """Return where forecasts from a row start, or from several rows: their states, steps, inputs and estimates.
 
-    A row is the state after one measurement of a plant. A slot is its place in the fleet's table, which stays as it is.
+    A row holds the state of a plant's filters after a measurement. A slot is the row's index in the fleet's table,
+    which holds the rows of all live plants and is not changed here.
 
     Args:
-        fleet: the plants, in whose table the rows are.
-        slot: of the row, or of each row.
-        time: of the row, or of each row (rows,), in steps or in the unit of dt.
+        fleet: the live plants, with the table of their rows.
+        slot: slot of the row, or of each row.
+        time: time of the row, or of each row (rows,), in steps or in the unit of dt.
     """
     pool, program = fleet.pool, fleet.program
+    # Numbers of the row (..., columns); `pool` knows which columns are inputs, state, outputs and step number.
     row = pool.table[slot].copy()
     latest_inputs, several = row[..., pool.held], row.ndim > 1
-    # In continuous time the time step is one of the inputs, number `program.dt`; it is not known ahead, so NaN.
+    # In continuous time the time step dt is one of the inputs, number `program.dt`; it is not known ahead, so NaN.
     inputs = latest_inputs if program.dt is None else np.insert(latest_inputs, program.dt, np.nan, axis=-1)
     spacing = float("nan") if program.dt is not None else 1.0
-    step = row[..., pool.at.start].astype(int) + 1  # one after the row's step number
+    # A forecast starts with the step after the row's.
+    step = row[..., pool.at.start].astype(int) + 1
     return Origin(
         model=program.network,
         state=program.step_rows.state.tree(row[..., pool.state]),

@@ -194,19 +194,21 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
             at: int, count: int) -> Float[np.ndarray, " state"] | None:  # fmt: skip
     """Return the state `count` steps after the begin of a probe by the affine map there; None if it fails the probe.
 
-    With s the state before the probe and g the step, g(s + d) = g(s) + A d, so that the distance d from s goes on by
-    d' = A d + c, c = g(s) - s.
+    A filter without messages repeats the same step many times; a long gap is jumped over in one go. With s the state
+    before the probe (some real steps) and g the step, g(s + d) = g(s) + A d nearly, so that the distance d from s goes
+    on by d' = A d + c, c = g(s) - s. The map must predict the result of the probe, else None is returned.
 
     Args:
         step: the silent step g, of states with covariances.
-        probe: the states before and after PROBED real steps.
-        moving: which numbers changed over the probe; the map is of these alone.
+        probe: the state s before, and the state after, PROBED real steps; (state,) each.
+        moving: indices or mask of the numbers that changed over the probe; the map is of these alone.
         at: number of the step before the probe.
         count: how many steps to go on from there.
     """
     state, probed = probe
     if not (np.isfinite(state[moving]) & np.isfinite(probed[moving])).all():
         return None
+    # Measure A and c by differences.
     columns = np.flatnonzero(moving)
     matrix, moved = _measure_affine_map(step, state, probed - state, columns, at)
     if not np.isfinite(matrix).all():
@@ -217,6 +219,7 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
         scale = np.abs(movement) + AGREES * np.abs(state)[columns]
         if not (np.abs(expected - movement) <= AGREES * scale + SETTLED * np.abs(probed)[columns]).all():
             return None
+        # Go on by the map from s: jumped = s + d after `count` steps.
         jumped = state.copy()
         jumped[columns] += _iterate_affine_map(matrix, moved, count)
     return jumped

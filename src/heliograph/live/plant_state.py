@@ -180,22 +180,24 @@ class PlantState:
     def undo_leap(self, leap: ClockLeap, longest_gap: float, names: Sequence[str]) -> bool:
         """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
 
-        Returns False, and changes nothing, if the row before it is not known any more.
+        A leap is a gap in time that one clock alone shows, as by a wrong stamp. Returns False, and changes nothing, if
+        the row before the leap is not known any more.
 
         Args:
-            leap: the leap, or one that it follows.
+            leap: the leap, or an earlier one that it follows.
             longest_gap: longest gap that is no leap: rows from so long before its far side on are of the leap.
-            names: those of the nodes in their order, then that of the inputs.
+            names: names of the nodes in their order, then that of the inputs.
         """
         held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
-        all_after = first_after == 0  # all rows held are of the leap: only the one kept from before it is left
+        # If all rows held are of the leap, only the row kept from before it is left.
+        all_after = first_after == 0
         if all_after and self.kept is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.
         not_final = held[max(first_after, 1) :]
         self._count_withdrawn(not_final, leap, names)
         gone = held[first_after:]
-        # What `undo_changes` needs to take this back.
+        # Remember what `undo_changes` needs to restore this.
         self.aside.append(RowsOfLeap(held=held, kept=self.kept, changes=len(self.changes), gone=gone, rows=not_final))
         if all_after and self.kept is not None:
             self.rows.replace_rows([self.kept.row])  # the base again
@@ -240,9 +242,9 @@ class PlantState:
         """Add an event to the row with its key, or to a new row; record the change for `undo_changes`.
 
         Args:
-            event: the event.
+            event: a node's measurement, or inputs, checked.
             key: key of its row.
-            take_slot: called for the slot of a new row.
+            take_slot: called for the slot of a new row: its index in the table of live states.
             width: how many numbers a row has before its time.
             losses: name of the event's node and the column of the number of messages lost before it, where its running
                 count says this; else None.
@@ -259,6 +261,7 @@ class PlantState:
         if losses is not None:
             self._write_lost(index, row, event, *losses)
         self.changes.append(change)  # last: that of the event itself
+        # Rows from `dirty` on are to be stepped again.
         self.dirty = index if self.dirty is None else min(self.dirty, index)
 
     def _write_lost(self, index: int, row: HeldRow, event: CheckedEvent, node: str, column: int) -> None:
@@ -326,8 +329,7 @@ class PlantState:
     def take_dirty_rows(self) -> list[HeldRow]:
         """Return the row before the first one to step again, and all rows after it; [] if all are up to date.
 
-        `dirty` is the index of the first held row to step again, None if there is none; it becomes None. It is never 0,
-        the base.
+        `dirty`, the index of the first held row to step again (never 0, the base) or None, becomes None.
         """
         chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
         self.dirty = None

@@ -239,10 +239,10 @@ class Stream:
     def _refuse_or_accept(self, z: np.ndarray, u: np.ndarray) -> None:
         """Raise ValueError if the step's inputs u or measurement z are implausible; else accept the flagged step.
 
-        It is accepted where inputs of zero would be implausible too: then only the filter is to blame. The stepper
-        still has the state before the step.
+        A step was flagged as implausible. It is accepted where inputs of zero would be implausible too: then only the
+        filter is to blame. The stepper still has the state before the step.
         """
-        # A step is flagged also for infinite measurements and inputs that are no numbers: these raise here.
+        # A step is also flagged for infinite measurements and inputs that are no numbers: these checks raise.
         self.filter.check_measurement(z)
         self.filter.check_input(u)
         stepper = self._stepper
@@ -263,7 +263,8 @@ class Stream:
         if judgement.reason > 0:
             why = Judgement.describe(float(judgement.reason), float(judgement.distance)) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
-        stepper.step(z, u, self.steps)  # anew, since zeros may have been tried in between
+        # Step anew, since zeros may have been tried in between, and accept.
+        stepper.step(z, u, self.steps)
         stepper.accept()
 
     def _name_faulty_function(self, u: np.ndarray) -> str:

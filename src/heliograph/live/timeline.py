@@ -50,13 +50,11 @@ class Timeline:
     its other inputs are held from their event to the next, 0 before the first. Any other plant's time counts steps,
     from 0, and inputs lead to the step of their time. Where time counts steps, and where nodes share a channel, all
     events of a time form one row, and a second measurement of a node at that time is a conflict; else every event is a
-    row.
-
-    `counts` has the number of each verdict; `refused` that of single values which count as not arrived, by node and
-    reason, and `gated` of those that a filter alone left out; `timeouts` that of silences longer than a node's timeout,
-    which `senders` names while they last; `held` that of runs of equal readings that a node without `stuck=` does not
-    refuse; `reasons` says in words, by node, why the last implausible event was one; `forced` is the number of rows
-    that became final early.
+    row. `counts` has the number of each verdict; `refused` that of single values which count as not arrived, by node
+    and reason, and `gated` of those that a filter alone left out; `timeouts` that of silences longer than a node's
+    timeout, which `senders` names while they last; `held` that of runs of equal readings that a node without `stuck=`
+    does not refuse; `reasons` says in words, by node, why the last implausible event was one; `forced` is the number of
+    rows that became final early.
 
     Args:
         network: the network whose filters run.
@@ -275,8 +273,7 @@ class Timeline:
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
 
-        They are the filtered estimates after the row, in order of time. Without calls, only the last 2 * `capacity` of
-        them stay available.
+        They are filtered estimates after each row, in order of time. Without calls only the last 2 * `capacity` stay.
         """
         time, outputs = self._finals.take_all()
         return Record(time, self.network.states, truth=None, measurements={}, estimates=self._arrange_outputs(outputs))
@@ -327,14 +324,16 @@ class Timeline:
     ) -> dict[str, np.ndarray]:
         """Return the arrays of a snapshot of another network or version as this network would have saved them.
 
-        It warns of each change, and where final rows cannot be carried on. Raises ValueError where nothing can.
+        A snapshot has a plant's live rows, and final rows (which do not change any more) that were not read yet. If the
+        network has changed, states are moved to where it has them now. It warns of each change, and of final rows that
+        cannot be carried over. Raises ValueError where nothing can.
 
         Args:
             network: the network as it is now.
-            head: head of the snapshot.
+            head: head of the snapshot: its options, and the identity of the network that saved it.
             arrays: its arrays: "plant", the plant's bytes; "final.time" and "final", rows not yet read.
         """
-        # The identities of both networks, with a description of where states stand.
+        # Identities of both networks (texts that differ if the networks do), with a description of where states stand.
         window, ahead, capacity = head["options"]
         fleet = Fleet(shared_program(network), Options(window, ahead, capacity=capacity), alone=True)
         mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
@@ -342,6 +341,7 @@ class Timeline:
         if DESCRIPTION not in head:
             check_same_network("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
         other = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
+        # `migration` translates rows of the other network to rows of this one; it warns of each change.
         migration = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
         migration.begin("snapshot", other)
         # The plant, which has no name; and the final rows, whose columns are those of the filters.

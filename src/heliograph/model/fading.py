@@ -132,30 +132,32 @@ def with_flag(
     The flag is never lost with z.
 
     Args:
-        channel: the channel.
+        channel: the channel, whose gain depends on a mode (such as good or bad) that moves by a Markov chain.
         probabilities: P(flag | mode), shape (modes, flags), as of a received strength or a modem's quality class.
             Without it, and without `chain`, the states of all memories are received after z: the number of a mode, the
             value of a drift.
-        chain: the chain on which the flag depends; that of the channel unless given.
+        chain: the chain on which the flag depends; by default the one that the channel holds.
         late: True if each step receives the flag of the step before, and none at the first; False unless given.
 
     Raises:
         ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
     """
-    # The chain, or all memories of the channel. Classes need a single chain, of whose modes they tell.
     late = flag("late", late)
+    # Find the chain. `held`: all memories of the channel (chains, and gains that drift). Classes tell of the modes of a
+    # single chain, so with several memories the chain must be given.
     held = list(memories(channel).values())
     is_undecided = not held or (probabilities is not None and len(held) > 1)
     if chain is None and is_undecided:
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
-    # No classes: the states themselves are received.
+    # Without classes the states themselves are received.
     if probabilities is None:
         outputs = [ModeOutput(m, channel.inputs) for m in (held if chain is None else [chain])]
         return Stack([channel, *(OneStepLate(output) if late else output for output in outputs)])
     memory = held[0] if chain is None else chain
     if not isinstance(memory, MarkovChain):
         raise fail("chain", "a MarkovChain, of whose modes classes tell", type(memory).__name__)
-    # A flag is a map with a gain of zero and a noise: the classes 0, 1, ... are its values, with a law for each mode.
+    # A flag is a received number without signal: gain 0, and a noise whose values are the classes 0, 1, ..., with a law
+    # for each mode.
     laws = array("flags", probabilities, (memory.modes, None))
     no_signal, flags = np.zeros((1, channel.inputs)), np.arange(laws.shape[1])[:, None]
     classes = Modes(memory, [GainAndNoise(Constant(1.0), no_signal, FiniteSupport(flags, law)) for law in laws])

@@ -106,6 +106,9 @@ class RelayNetwork(Module):
     def steps(self, horizon: int) -> "RelaySteps":
         """Return the matrices and moments of steps 0 to horizon - 1, the first leading from x_0 to x_1.
 
+        The links of a step are those of its slot; slots follow one another and repeat. Second moments of the network
+        (of the state and all filters' errors) are computed from these matrices, which stand one step after another.
+
         Raises:
             ValueError: a horizon beyond what varies over time; links with uncertain probabilities.
         """
@@ -116,9 +119,10 @@ class RelayNetwork(Module):
         by_slot = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
         slot_of_step = np.arange(horizon) % period
         moments = _SlotMoments(*(np.stack(parts)[slot_of_step] for parts in zip(*by_slot, strict=True)))
+        # The plant's x+ = A x + w at each step.
         transition = _list_arrays_by_step(self.plant, horizon, lambda p: p.matrix, 2)
         drift = _list_arrays_by_step(self.plant, horizon, lambda p: p.noise.mean, 1)
-        # E x+ = A E x + E w.
+        # E x before each step: E x+ = A E x + E w.
         means = [self.initial()[0]]
         for a, b in zip(transition[:-1], drift[:-1], strict=True):
             means.append(a @ means[-1] + b)

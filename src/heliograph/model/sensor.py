@@ -147,7 +147,11 @@ class Sensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
-        """Check and hold y = h(x) + v, or h(x, u) + v: h, the law of v, names, angles and resolution."""
+        """Check and hold y = h(x) + v, or h(x, u) + v: h, the law of v, names, angles and resolution.
+
+        `measure` is h, `noise` the law of v, `circular` names outputs that are angles, and `inputs` names those of u.
+        `resolution`: step to which outputs are rounded, which adds to the noise.
+        """
         # A function of (x, u), with a noise that may depend on u too.
         self.inputs = read_input_names(inputs)
         if self.inputs:
@@ -188,9 +192,7 @@ class LinearSensor(AbstractSensor):
 
     C and the covariance of v may be functions of some of the plant's inputs, `LinearSensor(lambda u: u[None], .1,
     inputs=["dose"])`: it is linear all the same, and what filters claim stays exact. What is computed before data (a
-    steady state, schedules, designs) needs constants, and refuses.
-
-    Shapes: matrix (m, n).
+    steady state, schedules, designs) needs constants, and refuses. Shapes: matrix (m, n).
 
     Raises:
         ValueError: wrong shapes, a noise that is no covariance, numbers that are not finite, circular outputs that are

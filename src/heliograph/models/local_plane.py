@@ -227,9 +227,11 @@ def _subtract_on_meridian(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return r - r_0 and z - z_0, in metres, of a point on the ellipsoid's meridian relative to the origin.
 
-    r = (N + h) cos lat is the distance from the earth's axis, z = (N (1 - e^2) + h) sin lat the height above the
-    plane of the equator, and N = a / w, w = sqrt(1 - e^2 sin^2 lat), the radius of curvature across the meridian. All
-    differences are written as products, so that no large numbers are subtracted, which would lose digits.
+    They are the point's coordinates in the plane of its meridian: r = (N + h) cos lat is the distance from the earth's
+    axis, z = (N (1 - e^2) + h) sin lat the height above the plane of the equator. N = a / w,
+    w = sqrt(1 - e^2 sin^2 lat), is the radius of curvature across the meridian, with a the semi-major axis and e the
+    eccentricity. All differences are written as products, since subtracting the large numbers themselves would lose
+    digits.
 
     Args:
         origin: latitude lat_0 of the origin in radians.
@@ -237,9 +239,11 @@ def _subtract_on_meridian(
         phi: lat - lat_0 in radians.
         rise: h - h_0 in metres.
     """
+    # Differences of sine and cosine, by the sum-to-product formulas.
     latitude, middle = origin + phi, origin + phi / 2
     sine_change = 2 * np.cos(middle) * np.sin(phi / 2)  # sin lat - sin lat_0
     cosine_change = -2 * np.sin(middle) * np.sin(phi / 2)  # cos lat - cos lat_0
+    # w and N at the origin (index 0) and at the point.
     w_0 = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(origin) ** 2)
     w = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     N_0 = SEMI_MAJOR / w_0

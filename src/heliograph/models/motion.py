@@ -128,6 +128,7 @@ def gauss_markov(
     size, rate = _read_deviation_and_rate(deviation, time)  # rate: 1 / T
     names = name_list("states", states)
     identity = np.eye(len(names))
+    # A = -1/T I. Stationary variance s^2 needs noise of intensity 2 s^2 / T, and s^2 at the start, s the deviation.
     matrix, intensity, initial_covariance = -rate * identity, 2 * size**2 * rate * identity, size**2 * identity
     return continuous_plant(
         matrix, intensity, np.zeros(len(names)), initial_covariance, dt=dt, states=_keep_units(names)
@@ -160,6 +161,7 @@ def known_turn(
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 11.7.1.
     """
     rate, q = scalar("turn rate", turn_rate), scalar("noise intensity", intensity, 0.0)
+    # dx/dt = A x: the derivative of a position is its velocity; velocities turn, vx' = -rate vy and vy' = rate vx.
     motion = library(rate).asarray([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, -rate], [0.0, 0.0, 0.0, 1.0],
                                     [0.0, rate, 0.0, 0.0]])  # fmt: skip
     named = read_two_axes(axes)
@@ -221,19 +223,23 @@ def _repeat_on_axes(
 ) -> LinearPlant:
     """Return the plant of the same motion dx = A x dt + dW on each axis, independently.
 
+    `order` is the number of states of one axis: position, velocity and so on.
+
     Args:
         motion: A (order, order) of one axis.
-        intensity: of W on one axis (order, order).
+        intensity: intensity of the noise W on one axis (order, order): its covariance per unit of time.
         axes: names of the positions.
         dt: length of every step; None where the input "dt" says it.
-        initial_mean: of all states, axis by axis; None for zero.
-        initial_covariance: of all states; None for `start` on each axis.
+        initial_mean: mean of all states before the first step, axis by axis; None for zero.
+        initial_covariance: covariance of all states before the first step; None for `start` on each axis.
         start: variances of one axis before the first step (order,); None for WIDE ones.
     """
+    # At least one axis.
     named = name_list("axes", axes)
     if not named:
         raise fail("axes", "at least one name", "none")
-    # Block-diagonal matrices, one block an axis.
+    # Block-diagonal matrices, one block for each axis. Without a start the variances are WIDE: next to nothing is
+    # known.
     order, count = len(intensity), len(named)
     variances = np.full(order, WIDE) if start is None else start
     xp = library(variances)

@@ -155,7 +155,7 @@ def unicycle(
     Args:
         intensity: S of Q = S dt, the covariance that (x, y, heading) gain in a unit of time, (3, 3).
         initial_mean: mean before the first step (3,).
-        initial_covariance: its covariance, or the law of its deviation.
+        initial_covariance: covariance before the first step, or the law of the deviation from the mean.
         dt: length of every step; by default it is the input "dt".
         axes: names of both positions; "x" and "y" by default.
 

@@ -149,12 +149,13 @@ def worth_of_changes(
 ) -> list[ChangeWorth]:
     """Return what each change of a design's network is worth: a sensor more, one less, or a relay within a hop.
 
-    The design is made again with each sensor doubled, with each left out, and with a relay halfway in each hop.
-    Such a relay makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
-    A change that cannot be designed, such as leaving out the only sensor, is not listed.
+    A design chooses the powers of transmitters for the least error, or the least power for a target error. It is made
+    again with each sensor doubled, with each left out, and with a relay halfway in each hop. Such a relay makes two
+    hops of one, each with 2^exponent times its power gain E g^2, as the distance is halved, and the same kappa and
+    noise. A change that cannot be designed, such as leaving out the only sensor, is not listed.
 
     Args:
-        best: the design of a network.
+        best: the design of the unchanged network.
         exponent: exponent of the path loss; without it no relays are tried.
         advance: called with a word before each design (by default nothing is).
 
@@ -166,6 +167,7 @@ def worth_of_changes(
     """
     instance("design", best, PowerDesign, "a PowerDesign")
     network = instance("network of the design", best.problem.network, Network, "a Network")
+    # Fewer starts of the search, to save time.
     problem = replace(best.problem, starts=min(best.problem.starts, CHANGE_STARTS))
     worths = []
     for name, changed in _list_changes(problem, network, exponent).items():
@@ -178,7 +180,10 @@ def worth_of_changes(
 def _list_changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
     """Return {name of a change: the design problem of the changed network}.
 
-    Changes are each sensor once more, each left out, and if `exponent` (of the path loss) is given a relay in each hop.
+    Comparing their optimal designs says which change of the network would be worth most. Changes are: each sensor once
+    more, each sensor left out, and, if `exponent` (of the path loss: power falls as distance^-exponent) is given, a
+    relay in the middle of each hop. `problem` holds the powers that are free (`free`, names of transmitters or nodes)
+    and the budget or the target error.
     """
     senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     nodes = {name: Node(node.sensor, node.channel, {}) for name, node in senders.items()}  # without filters
@@ -189,7 +194,7 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
 
     problems = {}
     for name, node in nodes.items():
-        # The sensor once more; it is free as the others are.
+        # The sensor once more. If some powers are free by name, the new sensor's are too.
         twin = f"{name} again"
         with_twin = None if free is None else (*free, twin)
         problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)

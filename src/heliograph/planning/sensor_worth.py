@@ -243,11 +243,13 @@ def _compute_squares_at_end(
 ) -> Float[np.ndarray, "runs n"]:
     """Return the squared error of each state after the last step of each run (runs, n), or if `exact` its variance.
 
-    If variances are the same in all runs, only the first run is computed and returned.
+    `filter` runs over simulated measurements `z` with inputs `u`; `truth` has the true states. `exact`: its covariance
+    is true, so that variances are taken in place of squared errors, which scatter. If variances are the same in all
+    runs, only the first run is computed and returned (1, n).
     """
     squares, used = [], filter.angles_used()
-    # Variances depend on which outputs arrive, and on the values of gains or noise variances that are reported with
-    # each message (`numbers`), not on measured values. If both are the same in all runs, so are the variances.
+    # Variances depend on which outputs arrive, and on gains or noise variances that are reported with each message
+    # (`numbers`), not on measured values. If both are the same in all runs, so are the variances.
     reported = find_told_filter(filter)
     is_reported = np.isin(np.arange(z.shape[-1]), () if reported is None else reported.numbers)
     deciding = np.where(is_reported, z, np.isnan(z))
@@ -257,6 +259,7 @@ def _compute_squares_at_end(
         if exact:
             squares.append(np.diagonal(filtered.covariances[-1]))
         else:
+            # Errors of angles are within half a turn.
             squares.append(wrap_angles(filtered.means[-1] - x[-1], used.states if used else ()) ** 2)
         if alike:
             break

@@ -355,9 +355,10 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
 def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Return links in series, of which only the first may have a random delay, as one series behind one delay.
 
-    A constant delay may be moved before links without memory: their gains and noises are independent over time.
+    Links that are delayed become a chain of undelayed links behind the total delay. A constant delay may be moved
+    before links without memory, since their gains and noises are independent over time.
     """
-    # Links each late by itself, if at all.
+    # The delayed links; without any the links are a plain series.
     delays = [link for link in links if isinstance(link, DelayedLink)]
     if not delays:
         return Series(links)
@@ -365,14 +366,14 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
         raise fail("series", "links each delayed by itself", "a combination of delayed links")
     # The first link's own delay, which may be random (None without one), and the constant ones that are added to it.
     first, added = (delays[0], delays[1:]) if isinstance(links[0], DelayedLink) else (None, delays)
-    # A time stamp has to tell the whole delay. One that is written before a later delay does not; nor does that of a
-    # constant delay behind one of the first link's own, which may be random.
+    # A time stamp has to tell the whole delay. A stamp written before a later delay does not. Neither does the stamp of
+    # a constant delay behind a first link with a delay of its own, which may be random.
     timestamped = [link.timestamped for link in delays]
     misses_later_delays = any(timestamped[:-1])
     misses_first_delay = timestamped[-1] and len(delays) > 1 and first is not None
     if misses_later_delays or misses_first_delay:
         raise fail("time stamps", "those of one link", "those of several in series")
-    # All links before the last delay come behind it then, which only those that forget may.
+    # All links before the last delay stand behind the joint delay in the result: allowed only if they have no memory.
     last_delay = max(i for i, link in enumerate(links) if isinstance(link, DelayedLink))
     for link in links[:last_delay]:
         if link.remembers:

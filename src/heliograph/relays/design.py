@@ -130,12 +130,12 @@ def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDe
 def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Schedule]:
     """Return every filter of a design as a schedule of gains, by name, to save, to simulate or to run.
 
-    A filter's estimate moves by s+ = A s + a + K (z - B s - b), where z is what it receives and B s + b its mean if
-    the filter's own estimate were that of every relay. Claim: "exact" for complete data from the network it was
+    A filter's estimate s moves by s+ = A s + a + K (z - B s - b) with its gain K. z is what it receives, and B s + b
+    the mean of z if s were the estimate of every relay. Claim: "exact" for complete data from the network it was
     designed for, "upper" where noise is known by bounds.
 
     Args:
-        network: relays that filter.
+        network: relays that filter what they receive.
         design: of this network, from its start on: of a periodic one take `given_design` with its gains repeated.
 
     Raises:
@@ -147,7 +147,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     _check_start(network, design)
     steps = network.steps(len(design.moments) - 1)
-    # Moments over (x, e_1 ... e_F before the correction, innovations of all filters), of size d and then of the rest.
+    # Predicted moments of (x, e_1 ... e_F, innovations); d is the size of (x, e_1 ... e_F), errors before correction.
     predicted, d = np.asarray(_predict_covariances(steps, design.moments[:-1])), design.moments.shape[-1]
     n, ends = len(network.states), np.cumsum(network.received)
     start_mean, _start_covariance = network.initial()
@@ -284,7 +284,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     smoothing.
 
     Args:
-        network: relays that filter.
+        network: relays that filter what they receive and send their estimates s_r on.
         gains: K by relay, (steps, n, received).
 
     Raises:
@@ -292,11 +292,12 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     gains = table("gains", gains, "arrays (steps, n, received)")
+    # Gains of all relays as one matrix, and the receiver's view of each step: side.transition A, side.output C.
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
     side = _list_receiver_views(steps, initial_error_covariance(network), joined)
     count, r, d = side.output.shape
-    # Means: x+ has drift a, z the constant b, the last r of what is received in the network.
+    # Means: x+ has the drift a. z has the constant b: the last r of all numbers that are received in the network.
     _rows, constants = steps.predict_maps()
     drift = np.zeros((count, d + r))
     drift[:, :n], drift[:, d:] = steps.drift, constants[:, -r:]

@@ -293,7 +293,9 @@ def periodic_relays_for_best_receiver(
 ) -> dict[str, Float[np.ndarray, "slots n _"]]:
     """Design relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
 
-    P: that receiver's error covariance.
+    P is the error covariance of the best linear receiver. Relays that filter well for themselves need not be the best
+    for the receiver: these gains are tuned for it, by a search that begins at `start`. A slot is one step of the period
+    in which links repeat.
 
     Args:
         network: the network, which varies with its slots only.
@@ -307,8 +309,10 @@ def periodic_relays_for_best_receiver(
         ValueError: as for `periodic_receiver_error_design`; no relays.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    # Relay gains at the start as one matrix for each slot.
     gains = relay_gains(network, periodic_local_error_design(network).gains if start is None else start)
-    # The receiver, whose received numbers are the last, is the best one whatever the relays do: its gains are not free.
+    # Columns of the matrix are received numbers, those of the receiver last. Its gains are not free: it is the best
+    # receiver whatever the relays do.
     received = gains.shape[-1]
     is_free = np.arange(received) < received - network.received[-1]
     tuned = _tune_gains(network, gains, is_free, _best_receiver_cost, power_limit)

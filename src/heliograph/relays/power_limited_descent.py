@@ -136,8 +136,10 @@ def _penalise_power(
 def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
     """Return a compiled function that gives a period's gains their cost, its gradient, and the power of each slot.
 
-    The cost is log sum_s tr P_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, the augmented Lagrangian of power limits
-    g_s = power_s / limit_s - 1 <= 0 over the slots s of a period; infinite where the moments do not converge.
+    Relay gains are designed for a small error under power limits, by a descent of this cost. P_s is the error
+    covariance in slot s of a period, and g_s = power_s / limit_s - 1 <= 0 its power limit. The cost is
+    log sum_s tr P_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, the augmented Lagrangian with multipliers lambda_s and a
+    constant c; infinite where the moments do not converge.
 
     Args:
         traces: `traces(steps, gains)` returns tr P_s of each slot (slots,), whether the moments converge, and the power

@@ -79,10 +79,11 @@ def _name_components(health: Health) -> dict[str, list[str]]:
 def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
     """Return the section of a run's page with tests and pictures of innovations, and what they say of each output.
 
-    `drawings`: each figure as SVG, by its name; those that are missing are named in a text.
+    A page without a true state can judge filters only by their innovations. `health`: the diagnosis of the run, with
+    the innovations of each filter. `drawings`: each figure as SVG, by its name; missing figures are named in a text.
     """
     intro = "An innovation is what arrived less what the filter expected. The tests need no true state."
-    # Fusions of estimates are in no row of the table.
+    # Fusions of estimates are not in the table: say where they are tested.
     in_table = {(filter.node, filter.filter) for filter in health.filters}
     fusions = [name for name in health.record.estimates.get(Network.FUSED, {}) if (Network.FUSED, name) not in in_table]
     if fusions:
@@ -100,6 +101,7 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
         filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations", text)
         for name, filters in figures.items()
     }
+    # Filters that were tested but have no figure.
     drawn_nodes = {filter.node for filters in figures.values() for filter in filters}
     not_drawn = [
         f"{filter.node}/{filter.filter}"

@@ -80,11 +80,13 @@ class ForecastPublisher:
     def make_forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
         """Return the forecasts from each row, by horizon: its time, how far ahead it is, and what each filter says.
 
-        A row holds a plant's state after its newest measurement. The rows of all plants are predicted in one call. A
-        row has no forecasts if its longest horizon is after the last step for which the network is defined. How far
-        ahead is in seconds where the messages have dates, else in the unit of their time.
+        The service publishes forecasts beside estimates. A row holds a plant's state after its newest measurement, in a
+        slot (row of the table of live states); the rows of all plants are predicted in one call. A row has no forecasts
+        if its longest horizon is after the last step for which the network is defined. How far ahead a forecast is, is
+        given in seconds if messages have dates, else in the unit of their time.
         """
         results: list[list[Ahead]] = [[] for _ in rows]
+        # A network with varying models ends at `end_step`: no forecast may go beyond it.
         latest_time = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
         times = [float(row.key[0]) for row in rows]  # a row's key begins with its time
         covered = [i for i, time in enumerate(times) if time <= latest_time]  # numbers of the rows that have forecasts
@@ -93,13 +95,15 @@ class ForecastPublisher:
         # Forecasts by node and filter, each of all covered rows; then what is published of them.
         slots = [rows[i].slot for i in covered]
         start = ForecastStart(make_forecast_origin(self._fleet, slots, np.array([times[i] for i in covered])))
+        # The inputs of the plants keep their last values ("held") over the horizon.
         forecasts = heliograph.forecast(start, self.horizons, inputs="held")
         assert isinstance(forecasts, dict)  # of a network
         bodies = {
             node: {name: _write_forecasts(forecast) for name, forecast in filters.items()}
             for node, filters in forecasts.items()
         }
-        # Each covered row: `i` is its number among `rows`, `place` that among the forecasts.
+        # For each covered row (`i` its index in `rows`, `place` its index in the forecasts) add the probabilities of
+        # crossing thresholds, and sort by horizon.
         for place, i in enumerate(covered):
             if self._thresholds:
                 self._add_crossings(rows[i], forecasts, bodies, place)

@@ -269,19 +269,19 @@ class Service:
     ) -> tuple[list[Entry], int, int]:
         """Return refusals of messages that were not used, or not wholly; how many were malformed, and how many known.
 
-        Known are duplicates and late messages: they may have been used before a restart. `outcomes`: what became of
-        each message. `payloads`: what each was read from.
+        The entries tell why a message did not change an estimate. Known messages are duplicates and late ones: they may
+        have been used before a restart. `payloads`: the raw content of each. `outcomes`: its verdict, and the reason.
         """
         entries, malformed, known = list[Entry](), 0, 0
         for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):
             if outcome.verdict == "used" and not outcome.notes:  # as most are
                 continue
-            # Its plant is damaged in the store. A message that could not be read is a text, and its plant unknown.
+            # Its plant's stored state is damaged. A message that could not be read is a text, and its plant unknown.
             damage = self._damage.get(find_plant_name(message) or "")
             if damage and not isinstance(message, str):
                 entries.append(make_refusal_of_message(message, "damaged", damage))
                 continue
-            # Not read, or of another kind than its plant expects.
+            # Not read, or of another kind than its plant expects. The content is shown, unless its reader explained it.
             if isinstance(message, str | UnreadMessage) or outcome.verdict is None:
                 malformed += 1
                 is_explained = isinstance(payload, str | UnreadMessage)  # by who read it: then it need not be shown

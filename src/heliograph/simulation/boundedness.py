@@ -103,17 +103,20 @@ def _judge_links(network: Network, a: np.ndarray, q: np.ndarray, links: JointLin
     """Return the verdict on the filter's mean error covariance for a plant x+ = A x + N(0, Q) behind these links.
 
     Received numbers z = G x + noise have random gains G, which the filter does not know. It can use sums D z whose gain
-    D G on x is the same in all outcomes of the losses that look alike. The errors stay bounded if some gains on such
-    sums give them a spectral radius below 1. They grow if the losses hide a growing mode of A for too long.
+    D G on x is the same in all outcomes of the losses that look alike. Errors stay bounded if some filter gains on such
+    sums give them a spectral radius below 1 ("certified"). They grow if the losses hide a growing mode of A for too
+    long ("impossible"). Else the verdict is "undecided". `a` and `q` are A and Q; `links`: joint model of all links'
+    losses.
     """
-    # First sums whose gain is known on all of x. If these certify nothing: sums whose gain is known on the modes that
-    # do not decay, of which there are more.
+    # First sums whose gain is known on all of x. If these certify nothing, use sums whose gain is known only on the
+    # modes of A that do not decay: there are more of them.
     unstable_modes = _find_unstable_modes(a)
     for basis in (np.eye(len(a)), unstable_modes):
         usable = _find_usable_measurements(a, q, links, basis)
         gains = find_gains(usable.system)
         radius = certify_radius(usable.system, gains)
         if radius < BELOW_ONE:
+            # The steady covariance with these gains bounds the mean error covariance E P in the long run.
             bound = usable.system.solve_steady_covariances(gains).sum(axis=0) if usable.exact else None
             return Boundedness(
                 verdict="certified",
@@ -123,7 +126,7 @@ def _judge_links(network: Network, a: np.ndarray, q: np.ndarray, links: JointLin
                 gains=usable.map_gains(gains),
                 bound=bound,
             )
-    # Not certified. Of what is usable on the modes that do not decay: do losses hide one of them?
+    # Not certified. By what is usable on the modes that do not decay: do losses hide one of them?
     system = usable.system
     unseen = find_fastest_unobserved_mode(a, system.chain, [system.outputs[state] for state in system.known])
     verdict, reason = _judge_unobserved_modes(network, links, unstable_modes, usable, unseen, radius)
@@ -266,6 +269,7 @@ def _find_known_sums(
     is_known = values <= CERTAIN
     combine = np.zeros((int(np.sum(is_known)), len(mean)))
     combine[:, arrived] = vectors[:, is_known].T / scale
+    # Whether the sums are exact: gain known on all states, and the same offset in all outcomes.
     offset_is_known = all(np.array_equal(mean_of_outcome[:, -1], mean[:, -1]) for mean_of_outcome, _ in moments)
     spans_all_states = basis.shape[1] == len(basis)
     return KnownGainSums(
@@ -343,19 +347,22 @@ def _is_mode_excited(
 ) -> bool:
     """Return whether noise keeps exciting the unseen mode v: whether P >= eps v v', eps > 0, for every filter.
 
-    x+ = A x + w, Cov w = Q. If v is excited, its part of the error covariance P grows while nothing received shows it.
-    Random gains of the links make noise in proportion to the state: that noise grows, and hides v, only if the state
-    does, so then all unstable modes must be excited too.
+    An unseen mode v is an eigenvector of A that losses hide from the filter. x+ = A x + w, Cov w = Q. If v is excited,
+    its part of the error covariance P grows while nothing received shows it. Random gains of the links make noise in
+    proportion to the state: that noise grows, and hides v, only if the state does, so then all unstable modes must be
+    excited too.
 
     Args:
-        network: its plant has the covariance of x_0.
+        network: the network, whose plant has the covariance of x_0.
         unstable_modes: basis of the modes of A that do not decay.
-        usable: sums of received numbers of known gain; `random` if random gains make others unusable.
-        unseen: the mode, by a basis of its eigenvectors.
+        usable: sums of received numbers of known gain, with the system that they measure; `random` if random gains make
+            other sums unusable.
+        unseen: the mode v: `vectors`, a basis of its eigenvectors, and `growth` per step.
     """
     a, q = usable.system.transition, usable.system.process
+    # The directions that must be excited.
     directions = np.concatenate([unseen.vectors, unstable_modes], axis=1) if usable.random else unseen.vectors
-    # Q itself excites them in each step, whatever is measured.
+    # Q itself excites them in each step, whatever is measured (A = 0 in the test).
     if is_excited_by_noise(directions, np.zeros_like(a), q):
         return True
     # Q excites them over several steps, through A. Measurements without noise could remove the error on the way.

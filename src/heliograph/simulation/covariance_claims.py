@@ -176,14 +176,16 @@ def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]
 def find_premise(network: HasNodes, name: str) -> Premise:
     """Return the models at a node, for which a filter there has to be made if its claim is to hold.
 
-    They are the plant, and the node's sensor, channel and trigger, with its limits if they refuse values. In a network
-    of relays they are the plant, the relays, and the relays' gains.
+    A claim (that a filter's covariance is exact or a bound) is about one world, its premise. It is the plant, and the
+    node's sensor, channel and trigger (rule of when to send), with its limits if they refuse values. In a network of
+    relays it is the plant, the relays, and the relays' gains.
     """
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
         # Limits without bounds refuse only error codes of the sensor, and these depend on the state in no way.
         limits = node.limits if node.limits is not None and node.limits.bounded else None
         return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
+    # Nodes that share one channel receive certain rows of it.
     if network.common is not None:
         return restrict_premise_to_rows(
             Premise(plant, network.common.sensor, network.common.channel), network.rows[name]

@@ -23,13 +23,13 @@ def log_likelihood(
     """Return log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
 
     It is exact for the Kalman filter of a linear Gaussian system. For other filters it is nominal, but a fit can still
-    maximise it.
+    maximise it. Many rows are taken in chunks side by side, as by `filter.run`.
+
     `jax.grad` passes through it, in any number that the filter is made of, in the precision of the trace
-    (`jax.enable_x64`). Derivatives are those of covariances, right also where these are zero or singular, in double
-    precision: there one-sided, as no variance is negative. Where components of z are determined by others, they are
-    those of the density of the free ones. They are NaN, not wrong, where a state is known by `side_information_filter`,
-    or by a transform of one's own that has `apply` alone.
-    Many rows are taken in chunks side by side, as by `filter.run`.
+    (`jax.enable_x64`). In double precision the derivatives by covariances are right also where these are zero or
+    singular: there they are one-sided, as no variance is negative. Where some components of z are determined by others,
+    the derivatives are those of the density of the free components. Derivatives are NaN, not wrong, where a state is
+    known by `side_information_filter`, or by a transform of one's own that has `apply` alone.
 
     Args:
         filter: the filter.
@@ -45,9 +45,11 @@ def log_likelihood(
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter")
+    # Traced by JAX, as in a gradient: by a scan that can be differentiated.
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return filter.trace_log_likelihood(_sum_log_likelihoods, *arguments[1:])
+    # Numbers: in chunks side by side if the filter can; else row by row.
     total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if total is not None:  # None: the filter cannot be run in chunks
         return float(total)

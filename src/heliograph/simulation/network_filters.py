@@ -376,11 +376,12 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
     Each node's filter sends its estimate as a report. The measurement joins the reports of this step, node after node
     in the network's order; if links may be late, those of the step before follow, and so on. Numbers that did not
-    arrive are NaN. A quantizer enters by the bound on its error. The filter's claim is that of the fusion.
+    arrive are NaN. A quantizer enters by the bound on its error. The claim (what the covariance is said to be) is the
+    fusion's.
 
     Args:
         network: the network.
-        name: of its fusion.
+        name: name of its fusion.
 
     Raises:
         ValueError: no fusion of this name, or one by another rule; nodes that lose measurements, since their reports

@@ -39,19 +39,22 @@ def check_trigger(
 ) -> None:
     """Raise ValueError unless a trigger fits the sensor, the channel and the filters of a node.
 
+    With a trigger a sender transmits only if its signal differs enough from a reference, so that silence also tells of
+    the state; filters rely on this.
+
     Args:
-        trigger: when the sender transmits.
-        sensor: of the node.
-        channel: of the node.
-        filters: of the node, by name.
+        trigger: rule that says when the sender transmits.
+        sensor: the node's sensor.
+        channel: the node's channel.
+        filters: the node's filters by name.
 
     Raises:
         ValueError: numbers for another count of components; a channel that is late, or that does not carry each
             component for itself where each is sent alone; no filter whose prediction the sender could know.
     """
     check_type("trigger", trigger, AbstractTrigger)
-    # Numbers for as many components as the sensor has, none of them an angle; a channel that delivers at once, each
-    # component for itself where each is sent alone.
+    # The trigger's numbers must be for as many components as the sensor has, none of them an angle. The channel must
+    # deliver at once, and each component for itself where each is sent alone.
     trigger.check_outputs(len(sensor.outputs))
     if sensor.circular:
         raise fail("trigger", "a sensor without angles", list(sensor.circular))
@@ -61,7 +64,8 @@ def check_trigger(
         )
     if trigger.region == "each" and channel.outputs != len(sensor.outputs):
         raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
-    # The sender runs one filter at most itself, to know its prediction; never one that is fed back.
+    # No filter whose estimate is fed back to the sensor. If the reference is a prediction, a filter must exist whose
+    # prediction the sender can compute too.
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("trigger", "no filter that is fed back", "one")
     if trigger.reference == "prediction" and not any(

@@ -71,18 +71,22 @@ def split_shared_from_differing(
 ) -> ProgramParts:
     """Decide which items of a program differ between runs: one function computes these, and another one the others.
 
+    Native code computes many runs of one program. What is the same in all runs is computed once by a function of its
+    own; what differs is computed for each block of runs. An item is an operation, a statement or a buffer.
+
     Args:
         program: the program of one run.
-        items: all that the outputs need, in order.
+        items: items that the outputs need, in order.
         outputs: a buffer for each result.
         differing: for each input whether it differs between runs.
-        width: the most runs of a vector; as many as suit the program if None.
+        width: the most runs of a vector (its SIMD lanes); None for as many as suit the program.
         alone: whether there is one run, whose arrays are used in place.
-        summed: outputs that are summed over runs.
+        summed: outputs that are summed over runs; None if there are none.
     """
+    # Inputs that differ between runs.
     lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
-    # One run alone computes everything in the block function, so that everything counts as differing between runs. Only
-    # tables do not: they are constants.
+    # Items that differ. With one run alone everything counts as differing, so that one function computes all. Tables
+    # never differ: they are constants.
     per_run = {*items, *program.inputs} if alone else find_differing_items(items, lanes)
     per_run = {x for x in per_run if not (isinstance(x, Buffer) and x.kind == "table")}
     return ProgramParts(

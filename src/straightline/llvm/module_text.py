@@ -208,9 +208,9 @@ HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource:
     """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
 
-    Callers' arrays have the numbers of a run one after another; a thread's scratch memory has each number of a block's
-    runs side by side, as lanes of a vector. W, the runs of a vector, is a type's size in the text: it is chosen when
-    code is generated. Where there is one run (`parts.alone`), nothing is transposed.
+    A vector holds one number of W runs, one in each SIMD lane: scratch memory has each number of a block's runs side by
+    side. Callers' arrays have a run's numbers one after another, so they are transposed, unless there is one run
+    (`parts.alone`). W is a type's size in the text, chosen when code is generated.
     """
     names = _write_pointers(writer, parts.passed_buffers, layout.in_shared)
     for buffer, offset in layout.in_scratch.items():

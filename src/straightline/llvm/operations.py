@@ -51,9 +51,11 @@ def write_splat(value: float | int | bool, type: Type) -> str:
 def write_operation(node: Node, names: list[str], emit: Emit) -> str:
     """Write a node's operation in LLVM IR for all lanes; return the name of the result.
 
+    A node is one operation on numbers, such as a sum; in the text it acts on vectors with one run in each SIMD lane.
+
     Args:
-        node: the operation.
-        names: of its arguments, in the text.
+        node: the operation, with its arguments and types.
+        names: names of its arguments in the text.
         emit: appends an instruction and returns the name of its result.
 
     Raises:
@@ -62,6 +64,7 @@ def write_operation(node: Node, names: list[str], emit: Emit) -> str:
     source: Type = node.args[0].type if node.args else node.type
     operand_type = vector_type(source)
     op, result_type = node.op, vector_type(node.type)
+    # Sums, products and such of real numbers, and the choice between two.
     if source in REAL and op in FLOAT:
         return emit(f"{FLOAT[op]} {operand_type} {names[0]}, {names[1]}")
     if op == "select":
@@ -76,7 +79,7 @@ def write_operation(node: Node, names: list[str], emit: Emit) -> str:
     if op == "not":
         all_bits = write_splat(True, "bool") if source == "bool" else write_splat(-1, source)
         return emit(f"xor {operand_type} {names[0]}, {all_bits}")
-    # Functions of their own, then arithmetic by type.
+    # Functions that are written as LLVM functions of their own, then arithmetic by type.
     if op in CALLED:
         typed = ", ".join(f"{vector_type(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result_type} @hg_{name_called_function(node)}({typed})")

@@ -65,21 +65,26 @@ class MoverOptions(NamedTuple):
 def write_mover(move: MoverOptions, width: int) -> str:
     """Return the LLVM text of a function that transposes an array of a block of runs, from rows to lanes or back.
 
-    For numbers of 64 bits it is `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`. `take`
-    moves the array [run][entry], of `size` entries a run, to [entry][lane]; `give` moves it back. Lane l is run
-    first + l, or the last run if there are fewer: it then repeats the computation of that run.
+    Runs of a compiled function are computed side by side, one in each SIMD lane. Their arrays are stored run by run,
+    but the lanes need entry by entry, so arrays are transposed before and after a block of runs. `@take64` (for numbers
+    of 64 bits) moves the array [run][entry], of `size` entries a run, to [entry][lane]; `@give64` moves it back. Its
+    parameters are (ptr runs, ptr lanes, i64 size, i64 first, i64 last). Lane l is run first + l, or the last run if
+    there are fewer: it then repeats the computation of that run.
 
     Args:
-        move: the size of a number, the direction, and in which way numbers are moved.
+        move: bits of a number, the direction (`to_lanes`), and how numbers are moved: one by one, in squares of g x g
+            numbers (`in_squares`), or by whole registers if a run has a small fixed number of entries (`few_entries`).
         width: number of lanes.
     """
     text, bits = TextLines(), move.bits
-    # Runs are moved in groups: of as many as a register has lanes, if registers are used.
+    # Runs are moved in groups: as many runs as a register has lanes if registers are used, else FEW.
     uses_registers = move.in_squares or bool(move.few_entries)
     group_size = min(REGISTER // bits if uses_registers else FEW, width)
+    # If each lane has a run of its own, this code moves all entries and returns. Else the loops below move them.
     if move.few_entries and width > 1:
         _write_register_mover(text, move, group_size, width)
     for first_lane in range(0, width, group_size):
+        # Addresses of the group's runs in memory.
         rows = _write_row_addresses(text, bits, range(first_lane, first_lane + group_size))
         group = _RunsInLanes(text, rows, width, first_lane, bits, move.to_lanes)
         first_entry = "0"
@@ -111,15 +116,18 @@ def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
 def _write_register_mover(text: TextLines, move: MoverOptions, group_size: int, width: int) -> None:
     """Write the transposition of n = `few_entries` entries of each run by whole registers, and the return after it.
 
-    A group of g = `group_size` runs has n g numbers, one after another in memory, which fill n registers of g lanes. In
-    lanes memory they are also n registers, one for each entry. Each register of the result takes its numbers from the
-    loaded ones. This is done if each lane has a run of its own. If some lanes repeat the last run, the text goes on at
-    the label "singles", behind which entries are moved one by one.
+    Runs are computed side by side in SIMD lanes; memory has them as [run][entry], the lanes need [entry][lane]. A group
+    of g = `group_size` runs has n g numbers, one after another in memory, which fill n registers of g lanes. In the
+    lanes' memory they also are n registers, one for each entry. So each register of the result picks its numbers from
+    loaded ones. This works if each lane has a run of its own. If some lanes repeat the last run, the program jumps to
+    the label "singles", behind which entries are moved one by one. `text`: the lines of LLVM written so far.
     """
     n, g = move.few_entries, group_size
+    # Branch: does the last lane, run first + width - 1, still have a run?
     text.lines.append(f"  %end = add i64 %first, {width - 1}")
     text.lines.append("  %whole = icmp sle i64 %end, %last")
     text.lines += ["  br i1 %whole, label %registers, label %singles", "registers:"]
+    # Address of the first run, which is number first n of the array.
     start = text.add(f"mul i64 %first, {n}")
     start = text.add(f"getelementptr i{move.bits}, ptr %runs, i64 {start}")
     for first_lane in range(0, width, g):
@@ -130,6 +138,7 @@ def _write_register_mover(text: TextLines, move: MoverOptions, group_size: int, 
         # Number k of the targets is number positions[k] of the sources: a transposed table (g, n) or (n, g).
         shape = (g, n) if move.to_lanes else (n, g)
         positions = np.arange(n * g).reshape(shape).T
+        # Load all registers. Position p is lane p mod g of register p div g.
         vector = f"<{g} x i{move.bits}>"
         loaded = [text.add(f"load {vector}, ptr {address}, align {move.bits // 8}") for address in sources]
         for target, positions_of_target in zip(targets, positions.reshape(n, g).tolist(), strict=True):

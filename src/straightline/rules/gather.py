@@ -117,27 +117,32 @@ def _gather_from_memory(
 ) -> np.ndarray:
     """Gather from an array put in memory, where one index of each window depends on data and has many places.
 
+    JAX's gather copies windows of an array, each from its own start. The compiler works with single numbers (nodes). If
+    an index depends on data, comparing it with all possible places would be long; a load from memory is short.
+
     Args:
-        lowering: the program.
-        equation: the gather.
-        x: nodes of the array.
-        indices: nodes of the windows' first places, (..., column).
-        column: the last axis of `indices` at which they depend on data; all other columns are known.
+        lowering: the program that is being compiled.
+        equation: the gather, with its dimension numbers and window sizes.
+        x: nodes of the array's entries.
+        indices: nodes of the windows' starts, (..., indexed axes).
+        column: the one entry of `indices`' last axis that depends on data; all others are known.
 
     Returns:
         The gathered nodes.
     """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    # The array's axis of that index, and the last start at which the window is still inside.
     axis = numbers.start_index_map[column]
     last_start = x.shape[axis] - sizes[axis]
-    # Where each gathered number would lie in the flat array if the index that depends on data were 0: what the same
-    # gather takes from an array of the places 0, 1, 2, ...
+    # Where each gathered number would lie in the flat array if the index that depends on data were 0: take the same
+    # gather from an array of the places 0, 1, 2, ...
     with_zero = _replace_indices(lowering, indices, column, 0)
     if known_integers(with_zero) is None:
         raise Unsupported("gather at two places that data decide")
     places = np.arange(x.size, dtype=object).reshape(x.shape)
     offsets = _gather_clipped(equation, lowering, places, with_zero)
-    # It lies behind that place by the index, clamped so that the window stays inside, times the stride of its axis.
+    # The number lies behind that place by index times stride of the axis; the index is clamped so that the window stays
+    # inside.
     buffer, stride = put_in_memory(lowering, x).buffer, contiguous_strides(x.shape)[axis]
     loaded = np.empty(offsets.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):

@@ -241,12 +241,14 @@ def _type_of(matrix: np.ndarray) -> Type:
 def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
     """Return the lower triangular L of A = L L', column by column; all NaN if A is not positive definite.
 
-    a: nodes (n, n), of which the lower triangle is read; params: of JAX's operation, not used. Each column takes one
-    reciprocal instead of a division for each entry.
+    The compiler unrolls it to operations on single numbers (nodes of the graph). `a`: nodes (n, n), of which only the
+    lower triangle is read. `params`: parameters of JAX's operation, not used. Each column takes one reciprocal, which
+    costs less than a division for each entry.
     """
     n, real = len(a), _type_of(a)
     zero, nan = graph.constant(0.0, real), graph.constant(float("nan"), real)
     definite = graph.constant(True, "bool")
+    # L, zero above the diagonal.
     lower = np.full((n, n), zero, dtype=object)
     for j in range(n):
         # r_i = a_ij - sum_k<j l_ik l_jk for the rows i >= j.
@@ -265,6 +267,7 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
         lower[j, j] = root
         for i in range(j + 1, n):
             lower[i, j] = graph.node("mul", real, remainders[i - j], scale)
+    # All NaN if a pivot was bad.
     numbers = [graph.node("select", real, definite, x, nan) for x in lower.ravel().tolist()]
     return arrange_nodes(numbers, lower.shape)
 

@@ -183,8 +183,9 @@ def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
 def write_hash_function() -> str:
     """Return the LLVM text of `%i64 @hg_threefry(%i32 a, b, x, y)`: the hash Threefry-2x32 of a counter under a key.
 
-    (a, b) are the key's two words, (x, y) the counter's, in each lane of a vector; the result has the hash's first word
-    in its upper 32 bits and the second in its lower ones.
+    It is how JAX makes random bits. (a, b) are the key's two words of 32 bits, (x, y) the counter's, in each SIMD lane
+    of a vector; the result has the hash's first word in its upper 32 bits and the second in its lower ones. `%i32` and
+    `%i64` are names of vector types in the text.
     """
     vector, wide = "%i32", "%i64"
     lines: list[str] = []
@@ -194,7 +195,7 @@ def write_hash_function() -> str:
         lines.append(f"  %t{len(lines)} = {text}")
         return f"%t{len(lines) - 1}"
 
-    # Key schedule: k_2 = k_0 ^ k_1 ^ parity.
+    # Key schedule: k_0 = a, k_1 = b, k_2 = k_0 ^ k_1 ^ parity. First the key's words are added to the counter's.
     both = op(f"xor {vector} %a, %b")
     keys = ("%a", "%b", op(f"xor {vector} {both}, splat (i32 {PARITY})"))
     x, y = op(f"add {vector} %x, %a"), op(f"add {vector} %y, %b")

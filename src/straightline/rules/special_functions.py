@@ -42,16 +42,17 @@ class ContinuedFraction(NamedTuple):
 def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P, each to its digits.
 
-    With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is a series, above it Q is a continued fraction
-    (`_sum_lower_series`, `_evaluate_upper_fraction`); for a > LARGE both are expanded in 1 / a. NaN where a or x is
-    below zero.
+    With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is computed by a series, above it Q by a continued
+    fraction (`_sum_lower_series`, `_evaluate_upper_fraction`), as each is accurate there. For a > LARGE both are
+    expanded in 1 / a. NaN where a or x is below zero.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31.
     """
     is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
-    # Where neither series nor fraction serves, 1 stands for a and x, so that no NaN comes into the loops.
+    # Where neither series nor fraction is used, compute with 1 for a and x, so that no NaN comes into the loops.
     serves_none = is_large | ~is_valid
     shape, place = jnp.where(serves_none, 1.0, a), jnp.where(serves_none, 1.0, x)
+    # x > a + 1: the fraction is used; else the series.
     above = place > shape + 1
     density = jnp.exp(shape * jnp.log(place) - place - jax.lax.lgamma(shape))
     lower = density * _sum_lower_series(shape, place, skipped=above)
@@ -59,11 +60,13 @@ def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array
     # The smaller mass as computed, to all its digits; the other one is 1 minus it.
     p = jnp.where(place == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
     q = jnp.where(above & (place < jnp.inf), upper, 1 - p)
+    # Large a: take the expansion.
     expanded_p, expanded_q = regularised_incomplete_gammas_of_large_shape(a, x)
     use_expansion = is_large & (x < jnp.inf)
     p, q = jnp.where(use_expansion, expanded_p, p), jnp.where(use_expansion, expanded_q, q)
+    # Limits: all mass is below x = inf, and a law of shape 0 is all at 0.
     p, q = jnp.where(x == jnp.inf, 1.0, p), jnp.where(x == jnp.inf, 0.0, q)
-    at_zero = (a == 0) & (x > 0)  # a law of shape 0 is all at 0
+    at_zero = (a == 0) & (x > 0)
     p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
     return jnp.where(is_valid | at_zero, p, jnp.nan), jnp.where(is_valid | at_zero, q, jnp.nan)
 
@@ -185,9 +188,10 @@ def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
 def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     """Compute e^-|x| I_v(x), the scaled modified Bessel function of order v = 0 or 1.
 
-    Up to |x| = FAR by the power series I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond by the
-    asymptotic series I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1,
-    whose terms fall to 1e-26. Both are summed by one loop, whose ratio of terms is that of the series that serves.
+    The factor e^-|x| keeps it finite for large x. Up to |x| = FAR it is summed by the power series
+    I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond it is summed by the asymptotic series
+    I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1, whose terms fall to
+    1e-26. One loop sums both, so that each lane takes the ratio of terms of its own series.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
     """
@@ -210,9 +214,10 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
         """Return whether the last term is above rounding."""
         return jnp.abs(state.term) > EPSILON / 8 * state.total
 
-    # The term of k = 0 is 1, or (x / 2) of I_1's power series.
+    # Term of k = 0: 1, or x / 2 in the power series of I_1.
     first = jnp.where(is_far | (order == 0), 1.0, size / 2)
     total = jax.lax.while_loop(has_more_terms, add_term, SeriesState(jnp.ones_like(x), first, first)).total
+    # Factor before the sum: 1 / root(2 pi x) far out (e^x e^-x cancel), else e^-|x|.
     scale = jnp.where(is_far, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(is_far, size, 1.0))), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
     if order == 0:

@@ -99,31 +99,39 @@ class MessageLayout:
     def _locate_field_numbers(self, begin: int, node: str, of: Any, path: str) -> int:
         """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins.
 
-        The bytes are those of CDR, the encoding of ROS 2: each number is aligned to its size.
+        A bag has many messages of the same layout. Once the byte of each wanted number is known, all of them are read
+        at once, without decoding one by one. The bytes are those of CDR, the encoding of ROS 2: each number is aligned
+        to its size. `self._paths`: dotted paths of the wanted numbers.
 
         Args:
-            begin: the byte behind the field before it.
+            begin: the first byte behind the previous field.
             node: what the field is, as rosbags names it: "NAME" of a message, "BASE" of a number or text, "ARRAY" or
                 "SEQUENCE" of a list of fixed or of any length.
             of: of "NAME" the message's type; of "BASE" the basic type, first in a tuple; of a list what each of its
                 items is, as a pair like `node` and `of`, and how many there are ("SEQUENCE": at most).
             path: dotted path of the field in the whole message.
         """
+        # A message within the message: locate its fields in turn.
         if node == "NAME":
             return self._locate_message_numbers(begin, of, f"{path}.")
-        if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
+        # A text: four bytes with its length, then its characters. The length is part of the layout.
+        if node == "BASE" and of[0] == "string":
             begin = _align_to_size(begin, 4)
             return begin + 4 + self._note_length(begin)
+        # A single number.
         if node == "BASE":
             return self._locate_numbers_in_row(begin, of[0], 1, [path])
+        # A list. If it may have any length, its length stands in four bytes before its items.
         (item_node, item_of), count = of
-        if node == "SEQUENCE":  # the length that it has in this message stands before its items
+        if node == "SEQUENCE":
             begin = _align_to_size(begin, 4)
             count, begin = self._note_length(begin), begin + 4
-        if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
+        # A list of numbers is located at once, since it may have millions; names are made only if some are wanted.
+        if item_node.name == "BASE" and item_of[0] in NUMBERS:
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
             names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
             return self._locate_numbers_in_row(begin, item_of[0], count, names)
+        # Other items one after the other.
         for i in range(count):
             begin = self._locate_field_numbers(begin, item_node.name, item_of, f"{path}.{i}")
         return begin
@@ -292,21 +300,26 @@ def _make_node_readings(
 ) -> NodeReadings:
     """Return the readings of one source from the fields of many messages.
 
+    A source says which fields of a topic's messages are which values of a node, with scale and offset; here all
+    messages are read at once, column by column.
+
     Args:
-        rows: numbers of the messages, (messages,).
-        columns: their fields by path, (messages,) each.
-        source: the source.
-        places: index of each of its values among those that its node receives.
+        rows: numbers of the messages in the bag (messages,).
+        columns: {path of a field: its values (messages,)}.
+        source: paths, scales and offsets of the values, the time stamp, and the running count, if there is one.
+        places: for each of its values the index among the values that its node receives.
         size: how many values the node receives.
 
     Raises:
         LayoutNotFixedError: a stamp, a count or part of a value that is none; reading message by message then names it.
     """
+    # Values (messages, size), NaN where a field is not finite or not in the message.
     values = np.full((len(rows), size), np.nan)
     for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         value = _compute_value_column(columns, path)
         values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
-    # A stamp has to be set, so not 0, and of 32 bits, so that the nanoseconds fit into 64.
+    # A time stamp of seconds and nanoseconds. It has to be set, so not 0, and of 32 bits, so that the nanoseconds fit
+    # into 64.
     time = np.full(len(rows), NONE)
     if source.time is not None:
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)

@@ -201,11 +201,14 @@ class _FilterEstimates(NamedTuple):
 def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
     """Yield time, topic and message of each sound estimate, in order of time.
 
+    Estimates are written as ROS messages: pose and twist together as odometry, and each state as numbers under topics
+    of their own. A sound estimate has a finite mean and a valid covariance.
+
     Args:
-        record: the estimates.
-        times: of its rows, in nanoseconds since 1970.
-        pose: states that are pose and twist.
-        types: classes of messages by the names of their types.
+        record: the estimates of all nodes and filters.
+        times: times of the record's rows, in nanoseconds since 1970.
+        pose: says which states are positions, angles and velocities of a pose and a twist.
+        types: {name of a message type: its class}.
     """
     # Estimates as arrays, once for all rows.
     all_estimates = [
@@ -220,12 +223,14 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
         for name, estimate in filters.items()
     ]
     places = pose.places(record.states)
+    # Without any state of a pose no odometry is written.
     is_on_some_axis = any(state is not None for axes in places for state in axes)
     for k, stamp in enumerate(times):
         for estimates in all_estimates:
             if not estimates.sound[k]:
                 continue
             if is_on_some_axis:
+                # A filter without a claim has no covariance to write.
                 claimed = None if estimates.claims[k] == "none" else estimates.covariance[k]
                 odometry = _make_odometry(stamp, estimates.mean[k], claimed, places, pose, types)
                 yield stamp, f"{estimates.prefix}/odometry", odometry

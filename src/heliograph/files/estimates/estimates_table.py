@@ -26,7 +26,8 @@ Predicted = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by 
 def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict[str, np.ndarray]:
     """Return the estimates of a recording as columns, with what was predicted of each row where it is given.
 
-    Angles are between -pi and pi, also where the record has them beside a known truth.
+    `predicted`: by node and filter the prediction of each row from the rows before it; None for no such columns. Angles
+    are between -pi and pi, also where the record has them beside a known truth.
     """
     columns, angles = [(TIME, record.time)], _find_angles(record)
     # Node and filter are part of a name where there are several of them.
@@ -35,10 +36,12 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             prefix = (f"{node}." if has_several_nodes else "") + (f"{name}." if has_several_filters else "")
+            # Columns of the filtered, smoothed and predicted states of one filter. Smoothed ones may cover the last
+            # rows alone.
             parts = _make_columns(record.states, record.units, estimate, angles)
             columns += [(prefix + key, values) for key, values in parts]
             smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
-            if name in smoothed:  # which may cover the last rows alone
+            if name in smoothed:
                 parts = _make_columns(record.states, record.units, smoothed[name], angles)
                 columns += [
                     (f"{prefix}smoothed.{key}", _pad_rows_before(values, len(record.time))) for key, values in parts
@@ -46,6 +49,7 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
             if predicted is not None and name in predicted.get(node, {}):
                 parts = _make_predicted_columns(predicted[node][name], record)
                 columns += [(f"{prefix}predicted.{key}", values) for key, values in parts]
+    # Names of nodes and states may combine to the same text.
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
         raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")

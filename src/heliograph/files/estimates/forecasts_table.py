@@ -26,18 +26,20 @@ def make_forecast_columns(
 ) -> dict[str, np.ndarray]:
     """Return the columns of the estimates, with rows of forecasts below the rows of data.
 
-    The column `forecast` is true in the rows of forecasts. What each sensor would measure then stands in the columns
-    forecast.OUTPUT and forecast.OUTPUT.sd, with node and filter in their names where the states have them there; these
-    are NaN in rows of data. What was `predicted` of rows of data is NaN in rows of forecasts.
+    The column `forecast` is true in rows of forecasts. What each sensor would measure then stands in the columns
+    forecast.OUTPUT and forecast.OUTPUT.sd (standard deviation), NaN in rows of data; the names begin with node and
+    filter if there are several. `record`: a run over data. `forecasts`: by node and filter, after the last row of data.
+    `predicted`: optional one-step predictions of rows of data, NaN in rows of forecasts.
     """
     # All forecasts have the same times.
     times = next(forecast for filters in forecasts.values() for forecast in filters.values()).time
     rows = len(record.time)
-    # The states that are forecast, as if they were estimates of a record of their own.
+    # Take the forecast states as estimates of a record of their own, so that their columns are made in the same way.
     estimates = {
         node: {name: Estimate(f.states.mean, f.states.covariance, f.states.claim) for name, f in filters.items()}
         for node, filters in forecasts.items()
     }
+    # Columns of data above, columns of forecasts below; a column that forecasts lack is filled up.
     above = estimate_columns(record, predicted)
     below = estimate_columns(replace(record, time=times, truth=None, estimates=estimates, smoothed=None))
     columns = {name: _append_rows(values, below.get(name), len(times)) for name, values in above.items()}

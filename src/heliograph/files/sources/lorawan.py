@@ -26,6 +26,9 @@ class _UplinkLayout(NamedTuple):
     ) -> "dict[str, Source]":
         """Return {the server's topic: the source of its uplinks}.
 
+        LoRaWAN devices send uplinks to a network server, which publishes each as a JSON message. A source says which
+        fields are which values of a node; `radio` adds how the message was received.
+
         Args:
             path: dotted path within the decoded payload, or several.
             node: name of a node of the network; or the `Field` that names it.
@@ -37,14 +40,16 @@ class _UplinkLayout(NamedTuple):
         Raises:
             ValueError: what `json_field` refuses.
         """
+        # Check the names of radio values.
         radio_names = () if radio is None else read_texts("radio", radio)
         unknown = [name for name in radio_names if name not in RADIO]
         if unknown:
             raise fail("radio of an uplink", f"some of {', '.join(RADIO)}", show_value(unknown[0]))
-        # Values, then how they were received; a number of the reception that is absent is 0.
+        # Paths of the values, then of the reception; a number of the reception that is absent is 0.
         values = _prefix_paths(self.values, path)
         reception = [ZeroIfAbsent(f"{self.reception}.{name}") for name in radio_names]
         outputs = None if output is None else [*read_texts("output", output), *radio_names]
+        # The frame counter is the running count, the device the plant.
         source = json_field(
             [*values, *reception],
             node,

@@ -69,7 +69,8 @@ def fail_of_doubled(name: str, field: str) -> InputError:
 def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
     """Return the content of JSON, and each object in it that has a field twice, with the field's name.
 
-    `name`: of the text, for errors. Words such as nan or inf, which are no JSON, are null.
+    Decoders keep the last of two fields of one name without a word, so the caller refuses such an object. `name`: of
+    the text, for errors. Words such as nan or inf, which are no JSON, are read as null.
     """
     doubled: list[tuple[dict[str, Any], str]] = []
 
@@ -81,7 +82,7 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
             doubled.append((fields, next(name for name in names if names.count(name) > 1)))
         return fields
 
-    # First as it is, which is fast; then once more with null for words such as nan outside of texts.
+    # First as it is, which is fast; then once more with null for words such as nan outside of quoted texts.
     try:
         return json.loads(text, object_pairs_hook=collect), doubled
     except ValueError:

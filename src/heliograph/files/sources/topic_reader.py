@@ -32,10 +32,7 @@ COPY = 10 * SECOND  # a message that comes again so soon, with its count and val
 
 
 class MappedSource(NamedTuple):
-    """A source, the pattern of its topics, and by node the places of its values in the node's measurement.
-
-    The nodes are those that its messages may be of.
-    """
+    """A source, the pattern of its topics, and by node (that its messages may be of) the places of its values."""
 
     source: Source
     pattern: str
@@ -211,6 +208,8 @@ class TopicReader:
     def _read_by_source(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
+        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices (`places`).
+
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
         """
@@ -224,9 +223,10 @@ class TopicReader:
             raise fail(f"{where}, node", f"one of {', '.join(mapped.places)}", _suggest_name(node, mapped.places))
         source.check_valid(message, where)
         sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
-        # A message that has its count may lack values: it measured nothing.
+        # A message with a count may lack values: it measured nothing.
         has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
+        # Each value in the output's unit: scale value + offset.
         parts = zip(mapped.places[node], source.paths, source.scale, source.offset, strict=True)
         for place, path, scale, offset in parts:
             try:

@@ -83,9 +83,12 @@ def parse_flux_response(address: StoreAddress, answer: bytes) -> Answer:
 def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tuple[str, list[dict[str, Any]]]:
     """Return the name of the first measurement among rows of Flux, and the rows, values of one time and tags joined.
 
+    Flux is the query language of InfluxDB. It answers with a row for each number: `_time`, `_field` (name), `_value`,
+    `_measurement` and tags. A row of the result has all fields of one time, measurement and tags.
+
     Args:
-        address: where they came from, for errors.
-        rows: by name of the column; they are changed.
+        address: address of the store, for errors.
+        rows: rows as {column: value}; they are changed.
 
     Raises:
         ValueError: an error in the place of a row; a tag of a field's name; two values of a field at one time.
@@ -93,8 +96,10 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
     joined: dict[tuple[object, ...], dict[str, Any]] = {}
     first_measurement = ""
     for number, row in enumerate(rows):
+        # A row may report an error of the query.
         if "error" in row:
             raise fail(str(address), "a query that it answers", shorten_answer(str(row["error"])))
+        # Take out the columns that only Flux needs, and name the time "time".
         measurement = str(row.pop("_measurement", ""))
         first_measurement = first_measurement or measurement
         for name in ("result", "table", "_start", "_stop"):
@@ -104,8 +109,8 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
         if "_field" not in row or "_value" not in row:  # pivoted, or columns of a query's own: a row by itself
             joined[(number,)] = row
             continue
+        # The remaining columns are the time and the tags, which all fields of one row share: they are the key.
         name, value = str(row.pop("_field")), row.pop("_value")
-        # What is left are the time and the tags, which all fields of one row share.
         fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
         if name in fields and name not in row and fields[name] != value:
             remedy = "a query that yields several results, such as a mean and a maximum, sets _field of each"

@@ -262,8 +262,8 @@ class EventFilter(AbstractSizedFilter):
         """Return the sum over (x, r) given silence of sender s, where its reference r is known.
 
         The sender sends y if |y - r| > delta. So each Gaussian of (x, r, y) is cut to the pieces of |y - r| <= delta
-        and, if values may be lost, to those of |y - r| > delta. The Gaussians in one piece are merged. `by_cause`:
-        probabilities of each Gaussian's sender status, jointly with each cause of silence.
+        and, if values may be lost, to those of |y - r| > delta. Gaussians in one piece are merged. `by_cause`:
+        probabilities of each Gaussian's sender status with each cause of silence.
         """
         sender, x_and_r = self.senders[s], np.arange(len(self.states) + self.outputs)
         # |y - r| <= delta: it was not sent, or it had to be sent nevertheless and was lost.
@@ -280,9 +280,9 @@ class EventFilter(AbstractSizedFilter):
     def _truncate_with_lost_references(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, if a value y that was lost is its next reference r.
 
-        `xry`: Gaussians of (x, r, y), the first `known` with a reference that the filter knows. `by_cause`:
-        probabilities of each Gaussian's sender status, jointly with each cause of silence. Returned are `known`
-        Gaussians with a known reference, one for each piece of |y - r| <= delta, then `lost` with a lost one.
+        A sender sends its signal y if |y - r| > delta; r, the value sent last, may be lost. `xry`: Gaussians of (x, r,
+        y), x the plant's state, r known in the first `known`. `by_cause`: probabilities of sender status and cause of
+        silence. Returned are `known` with a known r, one for each piece of |y - r| <= delta, then `lost` ones.
         """
         n, sender = len(self.states), self.senders[s]
         x_and_r = np.arange(n + self.outputs)

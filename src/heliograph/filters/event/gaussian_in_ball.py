@@ -52,7 +52,9 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
 def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
     """Return the moments of e ~ N(centre, diag(variance)), inside or outside the ball |e| <= radius, at nodes of e_1.
 
-    With e_1 = radius sin(t) and density p of e_1, the mass where |e_1| <= radius is the integral over t of
+    Slices of the ball at fixed e_1 are balls of one dimension less, so moments in m dimensions follow from those in
+    m - 1 by quadrature over e_1. With e_1 = radius sin(t) and density p of e_1, the mass where |e_1| <= radius is the
+    integral over t of
 
         p(e_1) (de_1 / dt) P(the other components lie inside, or outside, the ball of radius sqrt(radius^2 - e_1^2))
 
@@ -60,7 +62,7 @@ def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: ja
     covariance (32, m, m).
     """
     # Integrate where e_1 has its probability: within REACH deviations of the point of [-radius, radius] that is nearest
-    # to its mean.
+    # to its mean. The nodes t and weights are those of a quadrature on [0, 1].
     mean_1, deviation = centre[0], jnp.sqrt(variance[0])
     nearest = jnp.clip(mean_1, -radius, radius)
     low, high = (jnp.arcsin(jnp.clip((nearest + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
@@ -71,6 +73,7 @@ def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: ja
     # log of (quadrature weight) (de_1 / dt) p(e_1), with de_1 / dt = radius cos(t).
     weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(t) / deviation) - np.log(2 * np.pi) / 2
     weight = weight - ((e_1 - mean_1) / deviation) ** 2 / 2
+    # Moments of e at each node: e_1 is known, the others have theirs.
     mean = jnp.concatenate([e_1[:, None], others.mean], axis=1)
     m = len(variance)
     covariance = jnp.zeros((len(t), m, m)).at[:, 1:, 1:].set(others.covariance)
@@ -103,8 +106,8 @@ def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Ar
     Args:
         mixture: the sum of K Gaussians.
         directions: D (m, N).
-        radius: of the ball, ().
-        inside: |D x| <= radius; else |D x| > radius.
+        radius: radius of the ball, a number.
+        inside: True for |D x| <= radius, else |D x| > radius.
     """
 
     def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
@@ -116,6 +119,7 @@ def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Ar
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
         slopes, centre = eigenvectors.T @ slopes, eigenvectors.T @ centre
         variance_or_least = jnp.maximum(variance, least)
+        # Log probability of the region, E e and Cov e in it. `varies`: components to be changed, of a possible region.
         moments = ball_moments(centre, variance_or_least, radius, inside)
         varies = (variance > least) & jnp.isfinite(moments.log_mass)
         # K = Cov(x, e) diag(s)^-1

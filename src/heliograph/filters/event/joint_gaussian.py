@@ -113,11 +113,14 @@ def condition_parts_on_received(
 ) -> GaussianSum:
     """Return each Gaussian of (x, r, y) given z = G y + n, its weight multiplied by the density of z.
 
+    An event-triggered sender sends y if it differs enough from its reference r, the value sent last; x is the plant's
+    state. The law of (x, r, y) is a sum of weighted Gaussians.
+
     Args:
-        mixture: the sum over state x, reference r and signal y of the sender.
-        z: what was received from the sender.
-        arrived: which components of z arrived.
-        link: moments of G and n.
+        mixture: sum of Gaussians over (x, r, y).
+        z: what was received from the sender (received,).
+        arrived: which components of z arrived (received,).
+        link: mean and covariance of gain G and noise n.
         sender: components of y that the sender sends.
         m: length of y.
         delivers: what arrives is y itself, all of it or nothing, so that y is known afterwards.
@@ -127,6 +130,7 @@ def condition_parts_on_received(
         """Return one Gaussian of (x, r, y) given z, and log of the density of z."""
         return _condition_on_received(x, z, arrived, link, sender, m, delivers)
 
+    # Update all Gaussians at once; by Bayes' rule each weight is multiplied by the density of z under its Gaussian.
     updated, log_density = jax.vmap(update_one)(mixture.gaussian)
     return GaussianSum(mixture.log_weight + log_density, updated, mixture.label)
 

@@ -53,6 +53,11 @@ class SilentRegion(NamedTuple):
     ) -> tuple[GaussianSum, GaussianSum]:
         """Truncate Gaussians of (x, r, y) to |y - r| <= delta, in the components that a sender sends.
 
+        A sender is silent while its signal y is near the value sent last, its reference r; x is the plant's state.
+        Silence thus truncates the law of (x, r, y) to the region, and each truncated law is replaced by a Gaussian of
+        the same moments. Pieces of the interval keep its shape better than one Gaussian. The region is a ball, or an
+        interval in each component.
+
         Args:
             known: Gaussians with a known reference r. Each is cut to every piece of the interval of the sender's first
                 component, and those of the same piece are merged.
@@ -63,21 +68,24 @@ class SilentRegion(NamedTuple):
             The Gaussians of known reference, one for each piece, and those of unknown reference.
         """
         (direction, delta), *rest = self._error_directions(sender)
-        # Each known Gaussian once for each piece [low, high], piece after piece, in units of delta.
+        # Each known Gaussian once for each piece [low, high] of the interval [-1, 1], piece after piece, in units of
+        # delta.
         size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
         cut = concatenate_sums([known] * self.known)
+        # A ball: cut to the piece of the first component, then all to the ball.
         if self.is_ball:
             if self.known > 1:  # a single piece is the whole ball
                 cut = truncate_between(cut, direction, low * delta, high * delta)
             cut = self._truncate_to_ball(concatenate_sums([cut, unknown]), sender, 1.0, inside=True)
         else:
-            # The unknown ones from -delta to delta; then all by the interval of each other component.
+            # Intervals: the unknown ones from -delta to delta; then all by the interval of each other component.
             ones = np.ones(len(unknown.log_weight))
             low, high = np.append(low, -ones), np.append(high, ones)
             cut = truncate_between(concatenate_sums([cut, unknown]), direction, low * delta, high * delta)
             for direction, delta in rest:
                 cut = truncate_between(cut, direction, -delta, delta)
+        # The first size * pieces are the known ones; merge those of the same piece.
         count = size * self.known
         return merge_groups(cut.select_range(0, count), self.known), cut.select_range(count)
 

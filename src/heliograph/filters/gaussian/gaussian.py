@@ -76,11 +76,13 @@ class GaussianFilter(AbstractGaussianStateFilter):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z.
 
-        Full turns are added to angles in z, so that they are within half a turn of their expected values.
+        The signal y is what the sensor measures, before the channel; p is its length. `z` is returned with full turns
+        added to its angles, so that they are within half a turn of their expected values and differences make sense.
+        With several runs all results have a leading axis of runs.
 
         Args:
-            z: measurements of a run, or of several.
-            u: inputs, the same of all runs.
+            z: measurements of a run (steps, m), or of several (runs, steps, m).
+            u: inputs (steps, inputs), the same of all runs.
         """
 
         def step(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
@@ -92,6 +94,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
             channel, y = at(self.channel, k), self.predict_signal(prior, k)
+            # E z = mean_gain E y + offset of the channel z = G y + n.
             near = wrap_near(z_k, channel.mean_gain @ y.mean + channel.offset, self.observed_angles)
             return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 

@@ -85,24 +85,27 @@ def find_signal_moments(
     """Return the moments of the sensor's signal y = h(x) + v under the prior of x.
 
     Args:
-        plant: whose states may be angles or attitudes.
-        sensor: h and the law of v.
-        transform: finds the moments of an h that is not linear.
-        prior: the law of x = m + L xi.
+        plant: the plant, whose states may be angles or attitudes.
+        sensor: the sensor, with h and the law of v.
+        transform: rule that finds moments of a nonlinear h, such as cubature.
+        prior: the law of x = m + L xi, a Gaussian.
         initial_power: E[x_i^2] before any data (n,): the size of the numbers that are rounded.
         noise: columns of Cov v, in place of the sensor's; the mean of v is the sensor's.
     """
     law = sensor.noise
-    # h(x) = image.mean + slopes xi + c: `image.explained` is the covariance of slopes xi, and `image.curvature` Cov c.
+    # h(x) = image.mean + slopes xi + c, c the part that is not linear: `image.explained` is the covariance of slopes
+    # xi, and `image.curvature` Cov c, zero for a linear sensor. Angles are continued, so that they do not jump at half
+    # a turn.
     if isinstance(sensor, LinearSensor):
         image = linear_image(sensor.matrix, sensor.measure(prior.mean), prior)
     else:
         measure = continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles)
         image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
+    # E y, and the columns of the covariance of c + v, which acts as the noise of the signal.
     mean = image.mean + law.mean
-    # The noise of the signal is c + v.
     signal_noise = join_columns(law.columns if noise is None else noise, image.curvature)
-    second = join_columns(image.explained, signal_noise).covariance + jnp.outer(mean, mean)  # Cov y + E y E y'
+    # E[y y'] = Cov y + E y E y'. The size of the numbers bounds their rounding.
+    second = join_columns(image.explained, signal_noise).covariance + jnp.outer(mean, mean)
     size = bound_signal_power_at_start(sensor, initial_power) if isinstance(sensor, LinearSensor) else diagonal(second)
     return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=signal_noise, second=second, size=size)
 

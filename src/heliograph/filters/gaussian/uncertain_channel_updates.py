@@ -60,15 +60,18 @@ class AbstractUpdate(Module):
     ) -> tuple[jax.Array, jax.Array]:
         """Return the gain K (n, m), and the bound (n, n) of the error covariance after the update.
 
-        A rule of your own defines this or `condition`; each follows from the other. The library's rules define
-        `condition`. Columns of K are zero for components that did not arrive.
+        The update is linear in the innovation z - E z of what was received, z = G y + n, where the law of the channel
+        (G, n) is known only within bounds. A rule of your own defines this or `condition` (which returns the
+        posterior); each follows from the other. The library's rules define `condition`. Columns of K are zero for
+        components that did not arrive.
 
         Args:
             prior: covariance (n, n) of the state before the update, `signal.prior`.
             signal: moments of the sensor's signal y: `mean`, `covariance`, `cross` = Cov(x, y), `second` = E[y y'].
-            channel: what `describe` returned.
+            channel: moments of the channel, which `describe` returned: nominal mean, and bounds of second moments.
             present: which components of z arrived (m,).
         """
+        # Neither is defined.
         if type(self).condition is AbstractUpdate.condition:
             raise unwritten(self, "correct")
 

@@ -134,25 +134,28 @@ def zero_mean_fixed_point_map(
 ) -> tuple[jax.Array, Slopes]:
     """Return the next t = log beta, and its slope, in the search of the beta that minimises the bound's trace.
 
-    beta is the free scalar of Young's inequality, in a bound of the covariance P after an update. The bound's trace is
-    tr P - tr(Omega^-1 C' C) + beta e, with Omega = base + S / beta, S = shift and e = trace_explained. It is stationary
-    where beta^2 e = tr(W S) with W = Omega^-1 C' C Omega^-1. So the next beta is sqrt(tr(W S) / e).
+    beta > 0 is the free scalar of Young's inequality a b' + b a' <= beta a a' + b b' / beta, by which the filter bounds
+    the covariance P after an update if correlations are unknown. The bound's trace is
+    tr P - tr(Omega^-1 C' C) + beta e, with Omega = base + S / beta. It is stationary where beta^2 e = tr(W S) with W =
+    Omega^-1 C' C Omega^-1. So the next beta is sqrt(tr(W S) / e), and a fixed point of this map is the minimum.
 
     Args:
         t: log beta (1,).
-        base: what Omega has beside S / beta (m, m).
+        base: the part of Omega that does not depend on beta (m, m).
         shift: S (m, m).
         cross_square: C' C of the cross-covariance C of state and measurement (m, m).
-        trace_explained: trace of what the received components explain of the state.
+        trace_explained: e, the trace of the state's covariance that the received components explain.
 
     Returns:
         The next log beta, and its derivatives by t.
     """
     beta = jnp.exp(t[0])
+    # W, and Omega^-1 S.
     weight, (inverse_times_shift,) = _trace_weight(base + shift / beta, cross_square, (shift,))
     # d Omega / dt = -S / beta, so that d tr(W S) / dt = (2 / beta) tr(Omega^-1 S W S).
     weighted_shift = weight @ shift
     trace, trace_slope = jnp.trace(weighted_shift), 2 / beta * jnp.vdot(inverse_times_shift.T, weighted_shift)
+    # log sqrt(tr(W S) / e) = (log tr(W S) - log e) / 2; e does not depend on t.
     next_t, slopes = _half_log_ratio(trace, [trace_slope], trace_explained, [None])
     return next_t[None], [slopes]
 

@@ -52,10 +52,12 @@ class DifferentiatedInnovation(NamedTuple):
 def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool) -> EstimateWithDerivatives:
     """Return the estimate before the first step, with its derivatives in each free number.
 
-    A filter behind a random gain also carries the moments of the state before any data, with their derivatives.
+    It starts the recursion that differentiates the log-likelihood along with the filter. Behind a random gain the
+    covariance of the innovation depends on E[x x'] before any data, so these moments are carried with their
+    derivatives, too.
 
     Args:
-        make: the filter by the free numbers, a `LinearFilter` with `has_score_recursion`.
+        make: function from the free numbers to the filter, a `LinearFilter` with `has_score_recursion`.
         x: the free numbers (p,).
         known_gain: whether the gain is known, so that no moment before data matters.
     """
@@ -64,8 +66,10 @@ def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool
         """Return the initial moments of the filter with the free numbers x."""
         return find_moments_at_start(make(x))
 
+    # Derivative of (mean, covariance) in each free number: a Jacobian-vector product along each axis.
     slopes = tuple(MomentSlopes(*jax.jvp(find_moments, (x,), (axis,))[1]) for axis in np.eye(len(x)))
     start = jax.tree.map(jnp.asarray, make(x).init())
+    # At the start no data have come: the moments before data are those of the estimate, and so are their slopes.
     if known_gain:
         return EstimateWithDerivatives(start.gaussian, slopes)
     return EstimateWithDerivatives(

@@ -119,26 +119,28 @@ def _predict_joint_moments(
 ) -> np.ndarray:
     """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after the prediction of a step.
 
-    x+ = A x + b + w of the plant, s- = F s + f of the filter's mean s, and the modes move by their chain. 1{mode} is
-    1 in a mode of the channel, else 0.
+    They follow plant and filter together, to find the true error of a filter that was designed for another model.
+    x+ = A x + b + w (Cov w = Q) is the true state, s- = F s + f the filter's predicted mean s, and the modes of the
+    channel move by their Markov chain. 1{mode} is 1 in a mode of the channel, else 0.
 
     Args:
-        moments: E[r r' 1{mode}] before the step.
+        moments: E[r r' 1{mode}] before the step (M, size, size), one for each of M modes.
         plant: the true plant.
-        step: the filter's F and f.
+        step: the filter's step: `transition` F and `drift` f.
         u: input of the step.
         transition: transition matrix of the modes (M, M).
     """
     n, size = len(plant.states), moments.shape[-1]
     inputs = jnp.asarray(u)
-    # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0).
+    # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0), with the matrix T and the noise N = diag(Q, 0, 0).
     matrix, noise = np.zeros((2, size, size))
     matrix[:n, :n], matrix[n, n] = plant.transition_matrix(inputs), 1.0
     matrix[:n, n] = plant.shift(inputs)
     matrix[n + 1 :, n + 1 :], matrix[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(inputs)
+    # Modes move first: moments after the move of the chain.
     before = mix_moments_of_modes(transition, moments)
-    # `before[:, n, n]`: E[1 1{mode}], the probability of each mode.
+    # T E[r r' 1{mode}] T' + P(mode) N. Here `before[:, n, n]` = E[1 1{mode}] is the probability of each mode.
     return np.asarray(propagate_by_mode(matrix, before, before[:, n, n, None, None] * noise))
 
 

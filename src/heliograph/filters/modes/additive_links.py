@@ -210,35 +210,41 @@ class AdditiveModalFilter(AbstractModalFilter):
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, with columns of Cov v, for the products zeta = (x~, x~ phi_1, ...).
 
-        z = (G, n) y~ for the links' random gain and noise, and y~ = (y, 1) = C~ x~ + noise that is sent. Given the
-        modes (G, n) has the mean sum_a D_a phi_a, for the functions phi = (1, phi_1, ...) of the modes.
+        The filter estimates zeta, since links with memory make the gain depend on a hidden mode: x~ = (x - c, 1),
+        c = E[x] before data, and phi_a = 1{a link is in mode j} - P(j). Received is z = G y~ + n, the sum of several
+        links, of y~ = (y, 1) = C~ x~ + noise of the sensor with covariance R~. Given the modes the mean of (G, n) is
+        sum_a D_a phi_a, with phi_0 = 1. `state` holds `second` = E[x~ x~'], `laws` = P(j) of each link's modes, and
+        `centre` = c.
         """
         terms: tuple[ChannelByMode, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)
-        # E[z | zeta] = sum_a D_a C~ (x~ phi_a), without its constant.
+        # Mean: E[z | zeta] = sum_a D_a C~ (x~ phi_a). The product of `1` in x~ with phi_0 is a constant, and goes to
+        # `common`.
         C, R = centred_measurement(sensor, state.centre)  # C~ and R~
         gains = _gains_by_function(terms, state.laws)  # D_a
         output = gains @ C
         common = output[0, :, -1]
-        # E[y~ y~'] = C~ E[x~ x~'] C~' + R~ (p + 1, p + 1), and Gamma = E[phi phi'] as weighted columns g_c.
+        # E[y~ y~'] = C~ E[x~ x~'] C~' + R~ (p + 1, p + 1); Gamma = E[phi phi'] = sum_c weight_c g_c g_c', g_c its
+        # columns.
         signal_moment, gamma = C @ state.second @ C.T + R, _second_moment_of_functions(state.laws)
-        # The sensor's noise: sum_ab Gamma_ab D_a R D_b' = sum_c weight_c D_c R D_c' for D_c = sum_a g_ac D_a.
+        # Noise of the sensor, sum_ab Gamma_ab D_a R D_b' = sum_c weight_c D_c R D_c' with D_c = sum_a g_ac D_a.
         gain_by_column = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
         sensor_columns = jnp.asarray(gain_by_column[:, :, :-1] @ sensor.noise.columns.matrix)
         weights = jnp.broadcast_to(sensor.noise.columns.weights, (len(sensor_columns), sensor_columns.shape[-1]))
         known_noise = [side_by_side(WeightedColumns(sensor_columns, weights), gamma.weights)]
-        # Noise of each link, sum_j P(j) Cov(n | j).
+        # Noise of each link, averaged over its modes j: sum_j P(j) Cov(n | j).
         known_noise += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
-        # Gains of each link about their mean given the mode: sum_j P(j) E[(G - E G) E[y~ y~'] (G - E G)' | j].
+        # Random gain about its mean in mode j: sum_j P(j) E[(G - E G) E[y~ y~'] (G - E G)' | j].
         gain_noise = sum(
             jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_spread), signal_moment)
             for term, law in zip(terms, state.laws, strict=True)
         )
-        # Rounding of z, whose components have second moments (m,) sum_c weight_c (D_c E[y~ y~'] D_c')_mm.
+        # Rounding errors of z, in proportion to its second moments (m,) sum_c weight_c (D_c E[y~ y~'] D_c')_mm.
         rounding = rounding_of(
             jnp.einsum("c,cmp,pq,cmq->m", gamma.weights, gain_by_column, signal_moment, gain_by_column)
         )
         noise = join_columns(*known_noise, rounding, factor_spread(jnp.asarray(gain_noise)))
+        # H is `output` by function without its constant, which is in `common`.
         return MeasurementModel(concatenate_modes(output.at[0, :, -1].set(0.0)), common, noise)
 
 

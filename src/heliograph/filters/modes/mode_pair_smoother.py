@@ -182,10 +182,13 @@ class ModalSmootherStep(SmootherStep):
     def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
         """Return mode probabilities and Gaussians before the step, given all data, from those after it given all data.
 
-        `pairs` (Gaussians moved by a mode), `ways` (smoother gains back) and `weights` (probabilities) are by [i, j]:
-        mode i before the step, mode j after it. What later data say of the state in mode j is the ratio of `later` to
-        `known`, an observation of each pair (i, j).
+        A filter of modes has a Gaussian of the state in each mode of a Markov chain. Smoothing goes back step by step.
+        Indices [i, j] are mode i before the step and mode j after it: `pairs` are the Gaussians of mode i moved by mode
+        j, `ways` their smoother gains back, `weights` their probabilities P(i, j). What later data say of the state in
+        mode j is the ratio of its smoothed Gaussian `later` to the filter's one, `known`. This ratio acts as an
+        observation of each pair (i, j).
         """
+        # The ratio of the Gaussians as an observation, with angles of `later` within half a turn of those of `known`.
         near = wrap_near(later.gaussian.mean, self.known.mean, self.angles)
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
@@ -204,6 +207,7 @@ class ModalSmootherStep(SmootherStep):
         # times the likelihood of the observation.
         possible = self.weights > 0
         log_weight = jnp.where(possible, jnp.log(jnp.where(possible, self.weights, 1.0)) + log_likelihood, -jnp.inf)
+        # Subtract the largest logarithm of each j before exp, so that not all weights of j underflow to 0.
         largest = jnp.max(log_weight, axis=0)
         weight = jnp.where(possible, jnp.exp(log_weight - jnp.where(jnp.isfinite(largest), largest, 0.0)), 0.0)
         total = jnp.sum(weight, axis=0)

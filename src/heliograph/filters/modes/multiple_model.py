@@ -314,9 +314,10 @@ def imm_filter(
 ) -> MultipleModelFilter:
     """Return the interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
 
-    Before a step the Gaussians are mixed for each next mode j by the shares mu_(i|j) = Pi_ij mu_i / c_j. After it the
-    modes are weighted by the likelihood of z. A gain that is random within a mode enters by its second moments, and
-    erasures inside the channel are information on the mode.
+    A link with memory has modes, a Markov chain with transition probabilities Pi_ij; mu_i are their probabilities given
+    the data. Before a step the Gaussians are mixed for each next mode j by the shares mu_(i|j) = Pi_ij mu_i / c_j, of
+    sum 1. After it the modes are weighted by the likelihood of z. A gain that is random within a mode enters by its
+    second moments, and erasures inside the channel are information on the mode.
 
     Args:
         plant: the plant, n states.
@@ -386,8 +387,7 @@ def gpb2_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small, as for the others. With almost no noise in plant and link squared errors were 17 times
-    the claim.
+    many modes it is too small, too. With almost no noise in plant and link squared errors were 17 times the claim.
 
     Raises:
         ValueError: as for `imm_filter`.

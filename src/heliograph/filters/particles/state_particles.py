@@ -145,6 +145,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
     ) -> tuple[jax.Array, MoveLaw | None]:
         """Return f(x, u) + w for B particles x, and the law of this move if the optimal proposal is to draw from it.
 
+        A particle filter moves each particle x by the plant's law. The optimal proposal draws given the next
+        measurement, and needs the law of the move for it.
+
         Args:
             x: particles (B, n).
             numbers: their indices (B,), on which their noise depends; None for all particles.
@@ -157,14 +160,19 @@ class StateParticleFilter(AbstractStateParticleFilter):
             Positions, and the law m + G e with e ~ N(0, I): centers m, the root G of the noise's covariance, and e.
         """
         plant = at(self.plant, k)
+        # f(x, u) of each particle.
         center = jax.vmap(lambda one: plant.transition(one, u))(x)
+        # Noise that is not Gaussian is drawn from its law, by a key of each particle's index; there is no optimal
+        # proposal.
         if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
             all_numbers = jnp.arange(self.particles) if numbers is None else numbers
             noise = jax.vmap(lambda number: plant.sample_noise(jax.random.fold_in(key, number), u))(all_numbers)
             return wrap_angles(center + noise, plant.angles), None
+        # Gaussian noise: m + G e, with m = f(x, u) + E w and G G' = Cov w.
         draws = draw_normals(key, numbers, x.shape[1], self.particles)
         center, root = center + plant.noise_mean(), _find_square_root(factor_noise_covariance(plant, u))
         position = wrap_angles(center + draws @ root.T, plant.angles)
+        # The optimal proposal draws x+ given the measurement: it starts from this law, m + G e.
         if not self.optimal:
             return position, None
         return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u)

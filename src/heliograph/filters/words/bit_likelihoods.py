@@ -61,8 +61,10 @@ class LinkOfBits(Module):
 def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
     """Return a channel of codewords as a mixture of channels with known bit error rates, and their probabilities.
 
-    An error rate of finite support, or a choice of one of several links, is replaced by each of its values. If links
-    have modes, the mode must be reported with each message, so that its probabilities can be used.
+    A codeword is a quantised number sent as bits, each flipped with the bit error rate. A filter of codewords needs the
+    probability of the received bits, which is simple if the rates are known. So an error rate of finite support, or a
+    choice of one of several links, is replaced by each of its values. If links have modes, the mode must be reported
+    with each message, so that its probabilities can be used.
 
     Raises:
         ValueError: a channel with a delay, modes that are not reported, more than 64 combinations of error rates.
@@ -70,16 +72,17 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
     if channel.past:
         expected = "a link that is not late (linear_filter takes delays)"
         raise fail("channel of a word filter", expected, f"one late by up to {channel.past} steps")
+    # A channel without memory: one row of probabilities.
     if not channel.remembers:
         mixture = _list_known_rates(channel)  # pairs (probability, channel with these error rates)
         weights = np.array([[probability for probability, _ in mixture]], dtype=float)
         return LinkOfBits(links=tuple(link for _, link in mixture), weights=weights, flag=None)
-    # The channel in each mode, whose number is received with the codewords.
+    # A channel with modes, whose number is received with the codewords: the channel in each mode.
     link_by_mode = list_told_modes(channel)
     if not link_by_mode:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
-    # All channels with known error rates, mode after mode. In each mode only its own have a probability above 0.
+    # Join all channels with known error rates, mode after mode. A mode gives a probability above 0 to its own alone.
     mixture_by_mode = [_list_known_rates(link) for link in link_by_mode]
     links = [link for mixture in mixture_by_mode for _, link in mixture]
     weights = np.zeros((len(link_by_mode), len(links)))

@@ -82,13 +82,17 @@ def bound_overload(
 ) -> Overload:
     """Return how often codewords overload, and a bound on what that does to the rms error of a linear filter.
 
-    y - c + d (c the centre of the codewords, d the dither) is rounded to steps D in the range [-a, a]. If it lies
-    between a + (m - 1/2) D and a + (m + 1/2) D, the end of the range is sent, with an error e = m D beside that of
-    rounding. So
+    A linear filter behind quantised bits (codewords) takes the rounding for noise within the range. A signal beyond the
+    range is sent as the end of the range, an error that the filter does not know of. This function says how often, and
+    how much that may add to its error.
+
+    y - c + d (y the sensor's signal, c the centre of the codewords, d the random dither) is rounded to steps D in the
+    range [-a, a]. If it lies between a + (m - 1/2) D and a + (m + 1/2) D, the end of the range is sent, with an error
+    e = m D in addition to that of rounding. So
 
         E e^2 = D^2 sum_{m >= 1} (2m - 1) P(|y - c + d| > a + (m - 1/2) D)
 
-    since m^2 is the sum of the first m odd numbers. The link's gain g multiplies e, the filter's gain K adds it to the
+    since m^2 is the sum of the first m odd numbers. The link's gain g multiplies e, the filter's gain K adds g e to the
     estimate, and (I - K H) A takes it to the next step. By Minkowski's inequality the rms error changes by at most
 
         sum_j |((I - K H) A)^j K| sqrt(E g^2) sqrt(E e^2)
@@ -96,24 +100,31 @@ def bound_overload(
     y is taken for Gaussian, with its moments before any data and inputs zero.
 
     Args:
-        plant: linear.
-        sensor: of y - c, with the noise of rounding.
-        numbers: the channel of words as numbers about c.
-        encoder: of the words.
-        places: component of each output of the channel.
+        plant: the linear plant.
+        sensor: sensor of y - c, whose noise includes that of rounding.
+        numbers: the channel that carries codewords, as a random affine map of y - c.
+        encoder: rule that turns numbers into codewords: `step` D, range `low` to `high`, `dither`.
+        places: for each output of the channel the component of y that it carries; negative if it reports the channel's
+            mode instead.
     """
     link = at(numbers, k=0)
+    # The sum over j assumes one gain per step: no late messages, no link with memory, every output a signal component.
     no_bound = link.past or link.remembers or any(place < 0 for place in places)
+    # Steps that are looked at, as far as plant, sensor and channel are defined.
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
     outputs = len(at(sensor, k=0).outputs)
+    # D and a of each component (outputs,).
     step, half = encoder.each(encoder.step, outputs), encoder.each(encoder.high - encoder.low, outputs) / 2
+    # Moments of the links, and mean and variance of y - c, at each step.
     links = None if no_bound else _list_links(numbers, horizon)
     system, signals = _describe_system(plant, sensor, links, horizon)
     # P(|y - c + d| > a + (m - 1/2) D) [k, m - 1, output]; m = 1 is an overload.
     tails = np.array([_find_tails(mean, variance, half, step, encoder.dither) for mean, variance in signals])
+    # An overload is m = 1; its probability at the worst step.
     probability = tails[:, 0].max(axis=0)
     odd_numbers = 2 * np.arange(1, BEYOND + 1)[:, None] - 1
     rms_excess = step * np.sqrt(np.sum(odd_numbers * tails, axis=1))  # sqrt(E e^2) [k, output]
+    # Without a bound the second number is NaN, unless overloads are so rare that they do not matter.
     if links is None or system is None:
         return Overload(probability, np.asarray(0.0 if probability.max() < RARE else np.nan))
     return Overload(probability, np.asarray(_bound_error(system, rms_excess, links, places)))

@@ -199,26 +199,30 @@ class WordFilter(AbstractGaussianStateFilter):
     ) -> Innovation:
         """Return the innovation of the codewords as numbers about their centres; NaN for reported modes and dithers.
 
+        A codeword is the quantised signal y in bits. As a number about the centre c of its range it is an affine
+        measurement of y with rounding noise, of which the usual innovation z - E z and its covariance are computed.
+
         Args:
-            signal: moments of y before it is rounded.
+            signal: mean, covariance and noise of y before it is rounded.
             words: what was received.
             z: received codewords and reported modes, then the dithers that are subtracted.
-            numbers: mean and covariance of the gain that the codewords, as numbers, have behind the link.
+            numbers: mean and covariance of the random gain and offset by which the link changes codewords as numbers.
             log_likelihood: of the codewords.
         """
-        # Moments of y - c, c the centres, with the error of rounding as a noise.
+        # Moments of y - c, with the error of rounding as a noise.
         rounding_variance = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
         mean = signal.mean - jnp.asarray(self.centre)
         noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), rounding_variance))
         second = signal.covariance + jnp.diag(rounding_variance) + jnp.outer(mean, mean)
         about_centre = signal._replace(mean=mean, noise=noise, second=second)
-        # Rows of z that are words, and the component of y of each.
+        # Rows of z that are codewords (not the reported mode, FLAG), and the component of y in each.
         rows = np.array([i for i, place in enumerate(self.places) if place != FLAG])
         component = np.array(self.places)[rows]
         gain = jnp.asarray(numbers.mean_gain)
         values = z[rows] - jnp.asarray(self.centre)[component]
         # Dithers that are subtracted pass the link's mean gain, as the words do.
         dithers = jnp.sum(gain, axis=1) * z[len(self.places) :] if len(z) > len(self.places) else 0.0
+        # Innovation: value - dither - (gain mean + offset), and its covariance; NaN where nothing arrived.
         value = values - dithers - (gain @ mean + jnp.asarray(numbers.offset))
         covariance = innovation_covariance(about_centre, numbers)
         present = ~jnp.isnan(value)

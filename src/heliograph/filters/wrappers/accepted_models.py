@@ -82,9 +82,9 @@ def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
 def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
     """Let a function that makes a filter take channels that report numbers of their law with each message.
 
-    Behind such a channel the function then makes a `ToldFilter`, which reads the numbers (they are told) and corrects
-    with a filter of the law that they give. To a type checker the function returns what it returned before: behind any
-    other channel it does.
+    Such numbers, a gain or a noise variance, are told to the receiver as part of z. A decorated function then makes a
+    `ToldFilter`, which reads the numbers and corrects by a filter of the law that they give. Behind any other channel
+    the function is unchanged; its return type is also kept for type checkers.
 
     Args:
         make: a function of a plant, a sensor, a channel, and more.
@@ -98,14 +98,15 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
         `make` is the function that makes the filter, and `parameters` its signature.
         """
         arguments = parameters.bind(*args, **kwargs).arguments
+        # Does the channel report numbers? An argument that is no channel reports nothing, and `make` refuses it.
         channel = arguments.get("channel")
-        # An argument that is no channel reports nothing, and `make` refuses it.
         is_channel = isinstance(first(channel), AbstractRandomAffine)
         reports_numbers = is_channel and len(separate_told_numbers(first(channel)).numbers) > 0
         if not reports_numbers:
             return make(*args, **kwargs)
         from heliograph.filters.wrappers.told_link_law import FilterMaker, build_told_filter
 
+        # `make` is called later, with the channel of the law that the numbers give.
         plant, sensor, link = (arguments.pop(name) for name in ("plant", "sensor", "channel"))
         return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, arguments)))
 

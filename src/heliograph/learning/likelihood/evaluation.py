@@ -54,13 +54,14 @@ def evaluate_at_points(
 ) -> Evaluation:
     """Return log-likelihoods, scores and information of all recordings at each of several points.
 
-    Where a long recording can be divided, it is taken in chunks side by side, point by point. All other points are
-    taken side by side in native code, or one by one by XLA.
+    A maximum search needs them (score: the gradient by the free numbers; information: the Gauss-Newton matrix). A long
+    recording may be divided in chunks that are filtered side by side, point by point. All other points are taken side
+    by side in native code, or one by one by XLA.
 
     Args:
         objective: makes the filter from the free numbers.
-        x: the points (points, p), coordinates on the line.
-        data: the recordings.
+        x: the points (points, p): free numbers as coordinates on the line, where each is unbounded.
+        data: the recordings: measurements (recordings, steps, received), inputs and lengths.
         by_row: whether densities and scores of each row are needed; else there may be sums over all rows.
     """
     with jax.enable_x64(True):
@@ -75,6 +76,7 @@ def evaluate_at_points(
             whole = whole if by_row else _sum_rows(whole)
             for n, i in enumerate(remaining):
                 evaluations[i] = Evaluation(*(leaf[n : n + 1] for leaf in whole))
+    # Join the points again, field by field.
     by_field = zip(*(evaluation for evaluation in evaluations if evaluation), strict=True)
     return Evaluation(*(np.concatenate(leaves) for leaves in by_field))
 

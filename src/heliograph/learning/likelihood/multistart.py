@@ -142,17 +142,21 @@ class MaximumSearch:
     def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> ClimbEnds:
         """Return where climbs end, one by start; in a long recording its first rows lead them most of the way.
 
-        Starts whose climbs by the first rows end at the same point share one climb by all rows from there.
+        A search for the maximum likelihood climbs from several starts, since it may have several maxima. If the
+        recording is long, its first rows, which cost little, lead the climbs most of the way. Starts whose climbs by
+        the first rows end at the same point share one climb by all rows from there.
 
         Args:
-            starts: where to begin (starts, p).
+            starts: points where the climbs begin (starts, p).
             ends: -1 or 1 where a coordinate is held at an end of its domain, else 0 (p,).
-            own: number of the start that climbs by all rows from where it is, since the first rows may not have seen
+            own: index of the start that climbs by all rows from where it is, since the first rows may not have seen
                 what comes later.
         """
+        # Without a short likelihood, or with a single start, climb by all rows at once.
         short = self.surface.of_first_rows() if len(starts) > 1 else None
         if short is None:
             return self._climb(starts, ends)
+        # Climb from all starts but `own` by the first rows. Coordinates at an end of their domain do not move.
         others, x = np.arange(len(starts)) != own, starts.copy()
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
         short_ends = maximise_from_starts(
@@ -165,6 +169,7 @@ class MaximumSearch:
         reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
         lanes, lane_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
+        # Climb by all rows. A point where the likelihood is not finite is first moved towards the start `own`.
         climbed = self._climb(self.surface.move_to_finite_likelihood(x[lanes], starts[own]), ends)
         # Copy each climb's results to all starts that it stands for; `steps` is one number for all.
         by_start = {name: leaf if name == "steps" else leaf[lane_of_start] for name, leaf in climbed._asdict().items()}

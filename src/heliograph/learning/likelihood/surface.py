@@ -163,25 +163,30 @@ class LikelihoodSurface:
     def measure_curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> LeastCurvature:
         """Return the least curvature of -l at x, its direction, and what a step by the Hessian would gain.
 
-        Among `active` coordinates (p,), along directions that the data identify, in units of standard errors.
+        l is the log-likelihood of the free numbers x (p,). A negative least curvature means that x is no maximum but a
+        saddle, from which the search goes on along the direction. Only coordinates with `active` (p,) true count, along
+        directions that the data identify, and lengths are in standard errors.
         """
         evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(places, places)]
         gradient = evaluation.gradient[0][places]
-        # The directions that the data identify, in columns: the information in units of standard errors is above FLAT.
+        # `unit`: standard error of each coordinate alone, 1 / sqrt(I_ii) of the information I. In these units,
+        # eigenvectors of the information with eigenvalues above FLAT are the identified directions; `basis` has them as
+        # columns.
         unit = np.where(np.diag(information) > 0, 1 / np.sqrt(np.maximum(np.diag(information), TINY)), 0.0)
         eigenvalues, directions = np.linalg.eigh(information * unit[:, None] * unit)
         basis = unit[:, None] * directions[:, eigenvalues > FLAT]
         if not basis.size:
             return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
-        # The Hessian along these; where it is not finite nothing is known of the gain, which may be any.
+        # The Hessian of -l along these directions. If it is not finite, the gain is unknown, and said to be infinite.
         observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
         if not np.isfinite(observed).all():
             return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
+        # Its least eigenvalue, with the direction in coordinates x.
         curvatures, vectors = np.linalg.eigh(observed)
         direction = np.zeros(len(x))
         direction[places] = basis @ vectors[:, 0]
-        # g' |H|^-1 g / 2, in the Hessian's eigenvectors.
+        # Gain of a Newton step for the gradient g and the Hessian H, g' |H|^-1 g / 2, in eigenvectors of H.
         slopes = vectors.T @ basis.T @ gradient
         gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
         return LeastCurvature(least=float(curvatures[0]), direction=direction, gain=gain)

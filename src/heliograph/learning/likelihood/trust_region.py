@@ -41,7 +41,6 @@ class OpenEnds(NamedTuple):
     """Coordinates by which an end of a domain is at infinity.
 
     A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
-
     Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
     """
 
@@ -65,9 +64,7 @@ class ClimbEnds(NamedTuple):
     """Ends of the searches, one a lane.
 
     x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
-    steps: number of steps that were taken.
-
-    Shapes: x, gradient (lanes, p), total, converged, remaining (lanes,).
+    steps: number of steps that were taken. Shapes: x, gradient (lanes, p), total, converged, remaining (lanes,).
     """
 
     x: Float[np.ndarray, "lanes p"]
@@ -225,13 +222,13 @@ def _step_lanes(evaluate: Evaluate, state: _Lanes, moving: np.ndarray, domains: 
 
     Args:
         evaluate: log-likelihood (lanes,), gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
-        state: the lanes before the step.
+        state: lanes (searches side by side) before the step.
         moving: coordinates that move (lanes, p).
         domains: coordinates whose domains end at infinity.
-        close: g' I^-1 g at which a lane has arrived.
+        close: a lane has arrived where g' I^-1 g of gradient g and information I is below this.
     """
     going = ~state.done
-    # The best step by the quadratic model; coordinates that are at an end of their domain stay.
+    # The step p of greatest g' p - p' B p / 2 within the radius; coordinates at an end of their domain stay.
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     step, length, foretold = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free
@@ -340,26 +337,29 @@ def _update_hessian(
 ) -> np.ndarray:
     """Return the model B of minus the Hessian of the log-likelihood l for the next step, (lanes, p, p).
 
-    It is the information, or the last B corrected by this step: whichever would have foretold the gain of the step p,
-    g' p - p' B p / 2, better. The last B stays where l is not finite at the end of the step.
+    In each lane (one of several searches side by side) B is the information at the lane's next point, or the last B
+    corrected by this step: whichever would have foretold the gain of the step p, g' p - p' B p / 2, better. The last B
+    stays where l is not finite at the end of the step.
 
     Args:
-        state: the lanes before the step: g, the gradient of l, the information and B.
+        state: lanes before the step: gradient g (lanes, p), information and model B (lanes, p, p).
         step: p (lanes, p).
-        gain: of l by the step (lanes,).
+        gain: actual gain of l by the step (lanes,).
         gradient: of l at the end of the step (lanes, p).
-        information: there (lanes, p, p).
+        information: information at the end of the step (lanes, p, p).
         is_finite: whether l and its derivatives are finite there (lanes,).
         accepted: whether the lane moves to the end of the step (lanes,).
         free: coordinates that are plain real numbers, no logarithms or logits (p,).
     """
     last_model, last_information = np.nan_to_num(state.model), np.nan_to_num(state.information)
-    # The gain that either would have foretold.
+    # The gain that each of the two models would have foretold, g' p - p' B p / 2.
     slope = np.sum(state.gradient * step, axis=1)
     by_model = slope - np.sum(step * multiply_lanes(last_model, step), axis=1) / 2
     by_information = slope - np.sum(step * multiply_lanes(last_information, step), axis=1) / 2
     keeps_model = ~is_finite | (np.abs(gain - by_model) <= np.abs(gain - by_information))
+    # B corrected so that B p is the change of the gradient (symmetric rank-one update).
     corrected = _correct_by_secant(last_model, step, state, gradient, is_finite, free)
+    # A rejected step leaves the lane where it was, with the information of that point.
     current_information = np.where(accepted[:, None, None], information, state.information)
     return np.where(keeps_model[:, None, None], corrected, current_information)
 

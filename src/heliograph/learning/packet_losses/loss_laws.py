@@ -128,28 +128,33 @@ class MarkovLosses(AbstractLossLaw):
     def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
         """Return the law from counts over packets whose last `order` fates are known.
 
-        A stretch may have been cut where packets arrived: its ends say nothing of losses. For order 1 the probabilities
-        then maximise P(fates) / P(the end arrives | the first arrived), and intervals come from the profile of that.
-        For higher orders only the packets between the ends are counted.
+        The law has a probability of loss for each pattern of the last `order` fates (lost or arrived). The ends of a
+        recorded stretch may have been chosen where packets arrived, so they say nothing of losses. For order 1 the
+        probabilities maximise P(fates) / P(the last packet arrives | the first arrived), and the intervals come from
+        the profile of that likelihood. For higher orders only the packets between the ends are counted.
 
         Args:
-            fates: a stretch of packets, 0 (arrived), 1 (lost) or NaN (unknown), or several.
+            fates: stretches of packets in order of sending, 0 (arrived), 1 (lost) or NaN (unknown); one array or
+                several.
             order: how many of the last fates the probability of a loss depends on.
-            intervals: whether to compute the intervals of a likelihood given the ends.
+            intervals: whether to compute confidence intervals (of order 1).
 
         Raises:
             ValueError: an argument that is no fates, or an order that is not from 1 to 12.
         """
         if check_count("order", order) > 12:
             raise fail("order", "at most 12 packets back", order)
+        # counts[past, fate]: how often each fate followed each pattern of last fates, patterns numbered in binary.
         counts = np.zeros((2**order, 2))
         stretches = check_fates(fates)
         for stretch in stretches:
+            # `past`: number of the pattern before each packet. `length`: how many of its fates are known.
             past, length = _number_last_fates(fill_ends(stretch), order)
             # For order 1 P(fates) has the step to the end as a factor, so it is counted too; P(the end arrives) is
             # divided out below. `np.add.at` counts a past each time that it comes.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
+        # Lengths of the stretches, for the division by P(the last packet arrives).
         spans = _measure_spans(stretches)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 

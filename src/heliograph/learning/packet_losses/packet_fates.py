@@ -177,7 +177,8 @@ def fates_by_node(
 def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[str, Fates]:
     """Return {hop: fates (packets,)} of the packets of a route, by which of them arrived behind each of its hops.
 
-    A packet that was lost says nothing of the hops that it did not reach: its fate is NaN there.
+    Fates are 1 (lost), 0 (arrived) or NaN (unknown); laws of losses are fitted to them. A packet that was lost says
+    nothing of the hops that it did not reach: its fate is NaN there.
 
     Args:
         arrived: {hop: (packets,)} in the order of the route, true or 1 where the packet arrived behind this hop.
@@ -190,6 +191,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
     by_hop: dict[str, Fates] = {}
     reached: np.ndarray | None = None  # 1 of packets that passed the hop before; None at the first hop, all of them
     for name, value in arrived.items():
+        # Which packets arrived behind this hop. None can without having arrived behind the hop before.
         passed = array(f"arrivals behind {name!r}", value, (None if reached is None else len(reached),))
         if np.any((passed != 0) & (passed != 1)):
             raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
@@ -199,7 +201,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
             raise fail(
                 f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
             )
-        # A packet has a fate at a hop if it reached it.
+        # A packet has a fate at a hop only if it reached the hop.
         by_hop[name] = [np.where(reached == 1, 1.0 - passed, np.nan)]
         reached = passed
     return by_hop
@@ -233,7 +235,9 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
 def check_fates(value: object) -> Fates:
     """Return fates, checked, as a list of stretches (packets,) without empty ones.
 
-    Ends that were chosen for having arrived (`BetweenArrivals`), and so are no trials, become CHOSEN.
+    Fates of packets are the data from which laws of losses are fitted. A stretch (run of successive packets) may have
+    been cut where packets arrived (`BetweenArrivals`): its ends say nothing of losses, are not counted as trials, and
+    are marked by the value CHOSEN.
 
     Args:
         value: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a sequence of several.
@@ -241,15 +245,18 @@ def check_fates(value: object) -> Fates:
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
+    # What this function returned before is not checked again.
     if isinstance(value, CheckedFates):
         return value
     stretches = _list_stretches(value)
+    # Check the values of each stretch.
     parts = [array("fates", cast(ArrayLike, stretch), (None,), missing=True) for stretch in stretches]
     for fate in parts:
         if np.any((fate != 0) & (fate != 1) & ~np.isnan(fate)):
             raise fail(
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
+    # Mark chosen ends, and leave out empty stretches.
     chosen = [getattr(stretch, "chosen", False) for stretch in stretches]
     fates = CheckedFates(
         _mark_chosen_ends(fate) if is_chosen else fate

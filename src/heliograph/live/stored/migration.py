@@ -133,8 +133,7 @@ class PlantMigration:
     """Migration of stored plants to another network: takes their bytes, returns those that this network stores.
 
     A filter goes on with its state where all parts of this have the shape that they had, or are factors of a covariance
-    that was there; others begin with the network's initial law. Rows that may still change are stepped again, with the
-    new numbers.
+    that was there; others begin with the network's initial law. Rows that may still change are stepped again.
 
     Args:
         fleet: the plants of the network as it is now.
@@ -343,22 +342,23 @@ class _MovedRow(NamedTuple):
 def list_changes(mine: Identity, other: Identity) -> list[str]:
     """Return a line for each thing that has changed from the identity `other` to `mine`.
 
-    These are options and versions, nodes and filters, numbers of the parts, and functions where nothing else has.
+    `other` describes the network by which a state was stored, `mine` the present one: options, versions, nodes and
+    filters, numbers of the parts. A change of functions is listed only where nothing else has changed.
     """
-    # First the entries that are words and can be shown as they stand: options, versions, nodes, filters.
     not_words = (DESCRIPTION, "what is computed", "layout of the store")
+    # First the entries that are words, shown as they stand: options, versions, nodes, filters.
     lines = [
         f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"
         for name in {**mine, **other}
         if mine.get(name) != other.get(name) and not name.startswith("numbers of ") and name not in not_words
     ]
-    # Numbers of the parts (plant, nodes, fusions) that are in both.
+    # Numbers of the parts (plant, nodes, fusions) that are in both networks.
     here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
     same_version = mine.get("heliograph") == other.get("heliograph")
     for name in here:
         if name in there:
             lines += _list_changed_numbers(name, there[name], here[name], same_version)
-            # Of an array longer than MOST only a hash is known.
+            # A long array (more than MOST numbers) is known only by a hash.
             if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
                 lines.append(f"{name}: numbers of a long array")
     # Of a function only the program that it is compiled to is known, which other changes change too: it is named where
@@ -373,8 +373,7 @@ def _list_changed_numbers(
 ) -> list[str]:
     """Return a line for each number of the part `name` of a network that has changed.
 
-    `before` and `after` are {path of an attribute: its numbers}. A path that only one of two versions keeps is derived
-    from others, and passed over.
+    `before` and `after` are {path of an attribute: its numbers}. A path in only one of two versions is passed over.
     """
     return [
         f"{name}{path}: {line}"

@@ -189,8 +189,11 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
 def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, E: np.ndarray, inputs_of_bias: Any) -> tuple[Any, Any]:
     """Return [[A, E], [0, F]] and [B; B_b], as functions of the inputs u where some block is a function of them.
 
-    E is the coupling, by which biases drive the plant; `inputs_of_bias` @ u are those of u that move the biases.
+    They are transition and input matrix of (x, b): the plant x+ = A x + E b + B u, driven by biases b+ = F b + B_b u_b,
+    with E the coupling and u_b = `inputs_of_bias` @ u the inputs that move the biases. If some block is a function of
+    the inputs u, so are the results.
     """
+    # All blocks are numbers: two matrices.
     zeros = np.zeros((len(bias.states), len(plant.states)))
     if not any(isinstance(value, MatrixOfInputs) for model in (plant, bias) for value in vars(model).values()):
         xp = library(plant.matrix, E, bias.matrix, plant.input_matrix, bias.input_matrix)

@@ -34,15 +34,17 @@ class JointSensor(AbstractSensor):
 def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor | JointSensor:
     """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
 
-    Of linear sensors it is a linear one. Angles stay angles, and outputs keep their units.
+    A fusion centre receives the measurements of all nodes, as from one sensor behind one channel. The noises of
+    different sensors are independent. If all sensors are linear, the result is linear. Angles stay angles, and outputs
+    keep their units.
 
     Args:
-        sensors: by node; the outputs are named NODE_OUTPUT.
+        sensors: {node: its sensor}; the outputs are named NODE_OUTPUT.
 
     Raises:
         ValueError: no sensors, or one that varies; nodes and outputs of which two make one name.
     """
-    # Sensors that do not vary, and names of their outputs that are all different.
+    # Only sensors that do not vary over time can be stacked; the names of their outputs must be all different.
     by_node = table("sensors", sensors, "sensors of nodes")
     if not by_node:
         raise fail("sensors", "at least one", "none")
@@ -51,11 +53,12 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor
     outputs = [rename(output, f"{name}_{output}") for name, sensor in by_node.items() for output in sensor.outputs]
     outputs = list(names("outputs of all nodes", outputs, len(outputs), "y"))
     circular = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.circular)
-    # Sensors of inputs are joined under these; linear ones become one matrix.
+    # Sensors that depend on the plant's inputs are joined by another function.
     parts = tuple(by_node.values())
     if any(sensor.inputs for sensor in parts):
         return _join_sensors_of_inputs(parts, outputs, circular)
     noise = Independent([sensor.noise for sensor in parts])
+    # A linear sensor only if all are linear: its matrix stacks theirs, which must be of the same state.
     linear = [sensor.matrix for sensor in parts if isinstance(sensor, LinearSensor)]
     if len(linear) < len(parts):
         return JointSensor(parts=parts, noise=noise, outputs=tuple(outputs), circular=circular)

@@ -17,8 +17,11 @@ ONE_STEP = "a plant without the input dt takes each for one; insert the rows tha
 def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
     """Return the dates in the tables' indices (datetime64[ns], UTC), which must agree, or None if there are none.
 
+    Tables of measurements and inputs that belong together must have the same times in each row. Tables without dates
+    are not checked.
+
     Args:
-        tables: tables of measurements and inputs, by their names for errors.
+        tables: {name for errors: table of measurements or inputs}.
 
     Raises:
         ValueError: dates that are missing, that go backwards, or that differ from those of another table.
@@ -28,6 +31,8 @@ def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
         dates = row_dates(name, rows)
         if dates is None:
             continue
+        # The first table with dates sets them; the others must have the same kind (dates or spans), and the same
+        # values. Tables of another length are refused elsewhere.
         if common_dates is None:
             first_table, common_dates = name, dates
         elif dates.dtype.kind != common_dates.dtype.kind:

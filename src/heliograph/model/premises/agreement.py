@@ -39,11 +39,12 @@ ENCODER = "encoder"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
-    """Return the names of the models that differ: of those for which a filter was made and those where it stands.
+    """Return the names of the models on which a filter's belief and its place in a network differ.
 
-    `believed` are the former, such as plant, sensor and channel, and `own` those of the filter's network and node.
+    A filter's claim (that its covariance is exact or a bound) holds only in the world for which it was made. `believed`
+    has the models that it was made for, such as plant, sensor and channel; `own` has those of the node where it runs.
     """
-    # `order`: up to which moments the filter uses the laws of noises; None for the laws as a whole.
+    # `order`: the moments of noises that the filter uses; None for their laws. Past signals may be states of both.
     order, own = believed.order, _enlarge_world_by_past(believed, own)
     parts = [] if _agree_at_each_step(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:

@@ -49,16 +49,19 @@ def read_state_limits(
 ) -> StateLimits:
     """Return the limits of a plant's states in their order, infinite where there is none; () for no limits.
 
+    Such limits are known bounds of a state, as of a level between 0 and 1; a filter keeps its estimates within them.
+    States without a limit are left out of the result.
+
     Args:
-        limits: lowest and highest value by state, None where there is no limit.
+        limits: {state: (lowest, highest value)}, with None in place of a value that has no limit.
         states: names of the states.
-        circular: those that are angles, which have no limits.
+        circular: names of the states that are angles, which have no limits.
         initial_mean: mean of the state at the start (n,), which must lie within them.
 
     Raises:
         ValueError: what is no such table, a name that is no state or an angle, a start that they exclude.
     """
-    # A table whose keys are states that are no angles.
+    # Read the table: its keys must be states that are no angles.
     expected = 'a table such as {"soc": (0, 1), "speed": (0, None)}'
     try:
         given = dict(limits)
@@ -68,7 +71,7 @@ def read_state_limits(
     for name in given:
         if name not in no_angles:
             raise fail("limits of states", f"names of states that are no angles, {no_angles}", show_value(name))
-    # Each interval holds the initial mean; infinite ones are left out.
+    # Read each interval: it must hold the initial mean (unless JAX traces this); infinite intervals are left out.
     read = []
     for name in (name for name in states if name in given):
         low, high = read_intervals([given[name]], 1, f"limits of {name!r}")[0].tolist()

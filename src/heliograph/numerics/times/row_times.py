@@ -22,7 +22,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     that doubles cannot tell apart stay what they are.
 
     Args:
-        name: of the times, for errors.
+        name: name of the times, for errors.
         value: numbers or dates (count,).
         count: number of rows.
 
@@ -30,6 +30,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
         ValueError: neither numbers nor dates, some that are missing, another count, times that go backwards.
     """
     clock = read_dates(name, value)
+    # Numbers: doubles, unless large whole numbers would lose digits.
     if clock is None:
         if not is_traced(value) and _holds_texts_or_spans(value):
             raise fail(name, "numbers, or dates (datetime64, datetimes, texts of ISO 8601)", show_value(value))
@@ -39,6 +40,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
             whole = np.asarray(whole.tolist())
         if whole.dtype.kind in "iu" and np.abs(clock).max(initial=0) >= 2**53:  # doubles cannot tell these apart
             clock = whole
+    # Dates: as many as rows, none missing.
     elif clock.shape != (count,) or np.isnat(clock).any():
         missing = np.count_nonzero(np.isnat(clock))
         raise fail(name, f"{count} dates", f"shape {clock.shape}, {missing} of them missing")

@@ -17,6 +17,7 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     If there are several such sets of rows, the later rows are marked. The rows that remain are a longest subsequence
     that does not decrease, found by patience sorting.
     """
+    # Times in order, as most are.
     if np.all(time[1:] >= time[:-1]):
         return np.zeros(len(time), dtype=bool)
     # Searched from the end, so that of equally long subsequences the one with the earlier rows remains. Negated times,

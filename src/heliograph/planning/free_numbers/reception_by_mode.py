@@ -316,15 +316,17 @@ def _compute_steps_reception(
 ) -> _StepsReception:
     """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
 
-    H is the mean map from state to what arrives in each of M modes, N the covariance of its noise.
+    A planner finds the error for given powers of transmitters; the channel has M modes that the receiver observes, such
+    as arrived and lost. H is the mean map from state to what arrives in each mode, N the covariance of its noise, which
+    depends on the second moment of the state if gains are random.
 
     Args:
-        sensor: the sensor.
+        sensor: the sensor, with m outputs.
         channel: the channel.
-        modes: its modes that the receiver observes.
+        modes: the modes of the channel that the receiver observes: the channel in each (`maps`), and what arrives.
         states: E (x, 1)(x, 1)' of each step (time, n1, n1).
         young: the scalar b of Young's inequality at each step (time,); None where mean gains are known.
-        law: of the modes at each step (time, M).
+        law: probabilities of the modes at each step (time, M).
     """
     # H and N of each mode, from E (y, 1)(y, 1)' of what the sensor measures at each step.
     y = jax.vmap(lambda second: measured_moment_with_one(sensor, second))(states)
@@ -337,8 +339,8 @@ def _compute_steps_reception(
         powers = [jnp.asarray(power) for power in compute_powers_of_law(channel, moment, law).values()]
         return jnp.stack(powers) if powers else jnp.zeros(0)
 
-    # The modes of a channel without memory are its losses. What is lost is sent nevertheless, so that they do not
-    # matter to the transmitters: a law of one mode, of probability 1.
+    # Modes of a channel without memory are its losses. A lost message is sent nevertheless, so for the powers they do
+    # not matter: take a single mode of probability 1.
     law_of_sending = jnp.ones((len(y), 1)) if modes.forgets else law
     return _StepsReception(
         output=jnp.stack(outputs, axis=1),

@@ -219,8 +219,10 @@ class Discrete(AbstractLaw):
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
         """Return the corners of the polytope of probabilities, one in each row, with every value's probability.
 
-        The polytope: each probability within its radius and in [0, 1], the sum 1. At a corner each but one of the
-        uncertain probabilities is at an end of its interval.
+        The probabilities are known within a radius each. Any law that is possible is a mixture of the polytope's
+        corners, so that a bound which holds at every corner holds for all of them. The polytope: each probability
+        within its radius and in [0, 1], the sum 1. At a corner all uncertain probabilities but one are at an end of
+        their intervals.
 
         Raises:
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
@@ -230,10 +232,12 @@ class Discrete(AbstractLaw):
             return self.probabilities[None]
         if len(free) > CORNER_LIMIT:
             raise fail("uncertain probabilities of one gain", f"at most {CORNER_LIMIT}", len(free))
+        # Interval of each probability.
         low = np.maximum(self.probabilities - self.radius, 0.0)
         high = np.minimum(self.probabilities + self.radius, 1.0)
         corners = set()
-        # A vertex has all uncertain probabilities but one at an end; the one left makes the sum 1.
+        # Try each uncertain probability as the one that is not at an end: it makes the sum 1. This is a corner if it is
+        # then within its own interval.
         for slack in free:
             others = [i for i in free if i != slack]
             for ends in product(*((low[i], high[i]) for i in others)):
@@ -243,7 +247,8 @@ class Discrete(AbstractLaw):
                 corner[slack] = 1.0 - corner.sum()
                 if low[slack] - BEYOND <= corner[slack] <= high[slack] + BEYOND:
                     corners.add(tuple(np.round(np.clip(corner, 0.0, 1.0), 15)))
-        # Rounded, so that each corner is found once; then of sum 1 again.
+        # Rounding to 15 digits made equal corners equal, so that each is listed once. Divide by the sum, to make it 1
+        # again.
         return np.array([np.array(corner) / sum(corner) for corner in sorted(corners)])
 
 

@@ -88,14 +88,19 @@ def sum_moments_by_halves(summands: Sequence[SumMoments], outputs: int) -> SumMo
 def add_independent_moments(t: SumMoments, r: SumMoments, outputs: int) -> SumMoments:
     """Return the moments of t + r, independent of each other, for each pair of an extreme law of t and one of r.
 
-    E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y]. The extreme law ("corner") of t varies slowest.
+    `t` and `r` are random affine functions of y with `outputs` components; moments are polynomials in y. For
+    multi-indices c of each degree E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y], with C the
+    binomial coefficients. An extreme law ("corner") is a vertex of the set of possible laws; that of t varies slowest
+    in the result.
     """
+    # Components of y on which t + r depends; with 1 they are the `size` variables of the polynomials.
     components = tuple(sorted({*t.components, *r.components}))
     size, corners = len(components) + 1, len(t.by_degree[0]) * len(r.by_degree[0])
-    # Numbers of the variables of each polynomial, its components and 1, among those of both.
+    # For each polynomial the indices of its own variables among those of both.
     variables_of_t, variables_of_r = (
         (*(components.index(i) for i in summand.components), size - 1) for summand in (t, r)
     )
+    # Degree 0 is 1.
     by_degree = [library(t.by_degree[0], r.by_degree[0]).ones((corners, 1, 1))]
     for degree in range(1, len(t.by_degree)):
         # The axes are monomial of (y, 1), monomial of t + r, and corner.
@@ -158,21 +163,26 @@ def _place_products(a: Components, b: Components, first: int, second: int, size:
 def assemble_moments(moments: SumMoments, outputs: int, inputs: int, order: int) -> Corners:
     """Return E[Sym^order(H)] of z = H (y, 1) for each extreme law, from the polynomials E[z^a | y], |a| <= order.
 
-    Row z^a 1^(order - |a|) of this matrix has the coefficients of E[z^a | y] in the monomials of (y, 1) of degree
-    `order`. A monomial of degree |a| in the components on which z depends becomes one by 1^(order - |a|).
+    H is the random matrix of a channel, and Sym^order(H) the matrix that takes the monomials of (y, 1) of degree
+    `order` to those of (z, 1). An extreme law is a vertex of the set of possible laws ("corner"). Row z^a
+    1^(order - |a|) of the result has the coefficients of E[z^a | y] in the monomials of (y, 1); a monomial of lower
+    degree |a| is filled up by the factor 1^(order - |a|).
 
     Args:
-        moments: the polynomials, of z.
+        moments: the polynomials E[z^a | y] by degree |a|, in the components of y on which z depends.
         outputs: length of z.
         inputs: length of y.
         order: order of the moments.
     """
     size, corners = len(moments.components) + 1, len(moments.by_degree[0])
-    variables = np.array([*moments.components, inputs])  # of the polynomials, as numbers in (y, 1)
+    # Indices of the polynomials' variables in (y, 1); 1 is the last one, number `inputs`.
+    variables = np.array([*moments.components, inputs])
     xp = library(moments.by_degree)
     matrix: Corners = xp.zeros((corners, count_monomials(outputs + 1, order), count_monomials(inputs + 1, order)))
     for degree, polynomials in enumerate(moments.by_degree):
+        # Rows of the monomials z^a with |a| = degree.
         rows = find_monomials_of_degree(outputs, degree, order)
+        # Columns: the factors of each monomial, filled up with 1 to the degree `order`.
         factors = variables[factor_variables(size, degree)]
         factors_with_ones = np.pad(factors, ((0, 0), (0, order - degree)), constant_values=inputs)
         columns = place_monomials(factors_with_ones, inputs + 1)

@@ -48,12 +48,11 @@ from heliograph.random_affine.sum_of_maps import Superposed
 class SecondOrder(Module):
     """Mean and second moments of z = G y + n, nominal where the law is known, dominating where it is not.
 
-    mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];
-    shift: ((M_v - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored).
-
-    nominal: the spread under the nominal law itself, which is gain_spread : W + Cov n with the columns `noise` of the
-    latter: apart from the gain, so that a combination of outputs that is free of noise stays free of it. Where gain and
-    noise are correlated, gain_spread is all and noise zero.
+    mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)']; shift: ((M_v
+    - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored). nominal: the spread under
+    the nominal law itself, which is gain_spread : W + Cov n with the columns `noise` of the latter: apart from the
+    gain, so that a combination of outputs that is free of noise stays free of it. Where gain and noise are correlated,
+    gain_spread is all and noise zero.
 
     Shapes: mean_gain (m, p), offset (m,), gain_spread (m, m, p + 1, p + 1), noise (m, m).
     """

@@ -159,14 +159,17 @@ def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: 
     rates = items("error rates of hops", hops, "numbers from 0 to 0.5, or Discrete laws of them")
     if not rates:
         raise fail("error rates of hops", "at least one", "none")
+    # Each hop's error rate as pairs (value, probability), of which all combinations are listed.
     laws = [_read_error_rate(rate) for rate in rates]
     atoms = [law.list_atoms() for law in laws]
     if prod(len(a) for a in atoms) > MOST_ATOMS:
         raise fail("error rates of hops", f"laws of at most {MOST_ATOMS} values together", [len(a) for a in atoms])
+    # Of each combination g = prod_h (1 - 2 p_h), and its probability, as hops are independent.
     gains, shares = list[float](), list[float]()
     for combination in product(*atoms):
         gains.append(prod(1 - 2 * float(p) for _, p in combination))
         shares.append(prod(float(share) for share, _ in combination))
+    # p = (1 - g) / 2.
     values = (1 - np.asarray(gains)) / 2
     error = Constant(values[0]) if len(values) == 1 else Discrete(values, np.asarray(shares))
     return Flips(error, check_count("words of a message", dimension), flag("per_message", per_message))

@@ -234,10 +234,13 @@ def _convert_times_to_numbers(time: np.ndarray) -> Float[np.ndarray, " time"]:
 def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
     """Return when each component of each node arrived, at distinct times: rows of one time count as one.
 
+    The diagnosis compares arrivals with what the network declares: losses, periods of sending. Rows of one time count
+    as one, since each node's message may have a row of its own.
+
     Args:
         network: the network.
-        times: of the rows (time,).
-        received: by node, (time, received), NaN where nothing arrived.
+        times: times of the rows (time,).
+        received: {node: what it received (time, received)}, NaN where nothing arrived.
     """
     time, time_of_row = np.unique(times, return_inverse=True)
 
@@ -247,7 +250,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
         at_time[time_of_row[in_row]] = True
         return at_time
 
-    # Is each row there because one node's message is? Then nothing is missing of the others in it. All nodes decide.
+    # If each row exists because one node's message came, nothing is missing of the others in it.
     anything_of_node = {node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()}
     of_messages = rows_are_messages(anything_of_node)
     links = []
@@ -258,7 +261,8 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
         declared = _read_declared_sending(receiver)
         for i, name in enumerate(receiver.received_names):
             arrived_in_row = ~np.isnan(z[:, i])
-            # Numbers that come with the values, such as a mode, stand behind those that shares are of.
+            # A share is the fraction of values that arrive by the model. Numbers that come with the values, such as a
+            # mode, stand behind them and have none.
             has_share = declared.shares is not None and i < len(declared.shares)
             links.append(
                 Arrivals(

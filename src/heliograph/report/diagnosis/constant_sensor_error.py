@@ -157,23 +157,26 @@ def _estimate_error(
 ) -> _ErrorCandidate | None:
     """Return the likeliest constant error b of one output; None where the innovations do not depend on it.
 
-    b = sum r' w / sum r' r over all rows, with white innovations w and the response r of them to an error of one; its
-    likelihood ratio to no error is exp((sum r' w)^2 / (2 sum r' r)).
+    If a sensor output has a constant error b, each row's whitened innovation is w = r b + N(0, I), r the response to an
+    error of 1. Least squares over all rows gives b = sum r' w / sum r' r, and twice the log likelihood ratio to no
+    error is (sum r' w)^2 / sum r' r, the `gain`.
 
     Args:
-        output: its name.
-        white: innovations in units of the filter's claim.
-        response: change of the innovations by an error of one.
-        white_response: this change in units of the filter's claim.
-        received: whether anything arrived in each row.
-        deviation: of the output's innovations.
+        output: name of the output.
+        white: innovations w in units of the filter's claim, that is of the covariance that it states (time, m).
+        response: change of the innovations by an error of one (time, m).
+        white_response: this change in units of the filter's claim: r (time, m).
+        received: whether anything arrived in each row (time,).
+        deviation: standard deviation of the output's innovations.
     """
-    row_agreements = np.sum(white_response * white, axis=1)  # r' w of each row
-    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))  # over all rows
+    # r' w of each row; sum r' r and sum r' w over all rows.
+    row_agreements = np.sum(white_response * white, axis=1)
+    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
     if not (weight > 0 and np.isfinite(agreement)):
         return None
     error = agreement / weight
-    # Mean of r' w over the rows, and the standard error that their own scatter gives it.
+    # Another test of the same, which does not trust the claim: the mean of r' w over the rows, and the standard error
+    # that their own scatter and correlation give it.
     mean, standard_error_of_mean = average_correlated(np.where(received, row_agreements, np.nan))
     return _ErrorCandidate(
         gain=agreement * error,

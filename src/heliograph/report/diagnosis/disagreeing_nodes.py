@@ -32,15 +32,17 @@ def find_constant_error_between_nodes(
 
     Args:
         network: the network.
-        record: what was run through it.
-        inputs: of the plant (time, inputs).
-        level: probability with which a network without such an error may be doubted.
+        record: the recording that was run through it.
+        inputs: inputs of the plant (time, inputs).
+        level: probability with which a network without such an error may be doubted by chance.
     """
+    # Nodes whose measurements can be joined; a network with a central filter is judged by that filter.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node) and _can_be_joined(node)}
     names = [f"{name}: {output}" for name, node in nodes.items() for output in node.received_names]
     has_centre = any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
     if len(nodes) < 2 or len(names) > MOST or has_centre:
         return None
+    # Filter of all nodes' measurements (time, all outputs).
     joint = _make_joint_filter(network, nodes)
     if joint is None:
         return None
@@ -48,8 +50,9 @@ def find_constant_error_between_nodes(
     found = find_constant_error(names, joint, z, inputs)
     if found is None or found.size < LEAST:
         return None
+    # The error in standard errors, by the worse of both tests. The level is shared by all outputs and both signs
+    # (Bonferroni).
     deviations = min(found.significance, abs(found.error) / found.standard_error)
-    # The level is shared by all outputs and both signs (Bonferroni).
     return found if deviations > -ndtri(level / (2 * len(names))) else None
 
 

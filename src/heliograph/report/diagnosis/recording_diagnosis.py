@@ -204,12 +204,17 @@ class Health:
     def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
         """Yield a sentence on the outputs whose innovations are larger than claimed, and one on those that are smaller.
 
-        Each output is judged by itself, since a mean over outputs hides the one that is wrong; all together where none
-        is wrong by itself. `test`: that of the filter's innovations.
+        A filter claims a covariance of its innovations; squares that are larger than claimed mean overconfidence. Each
+        output is judged by itself, since a mean over outputs hides the one that is wrong; all are judged together where
+        none is wrong by itself. `health`: the filter's innovations. `test`: of these over all outputs, with their mean
+        square `power` and its standard error.
         """
+        # `level`: probability of a false alarm that one test may have.
         name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
         of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
-        # By output: mean of innovation^2 / claimed variance, its standard error, how many innovations. "": all outputs.
+        # Outputs with enough innovations. `measured`: for each output the mean of innovation^2 / claimed variance, its
+        # standard error, and the number of innovations; under the name "" for all outputs together. `signs`: 1 of
+        # outputs that are significantly larger, -1 smaller, 0 neither.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
         measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
         signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
@@ -221,7 +226,8 @@ class Health:
         # An output that is far off spoils the estimates, so that others look a little larger too: these are not named.
         largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
         larger = [output for output in larger if sizes[output] - 1 >= PULLED * largest_excess]
-        weighs_any = any(output.weighs for output in of_filter)  # without outliers innovations are smaller: no fault
+        # A filter that weighs outliers down has smaller innovations where there are none: no fault.
+        weighs_any = any(output.weighs for output in of_filter)
         smaller = [output for output, sign in signs.items() if sign < 0 and not weighs_any]
         for named, say in ((larger, say_overconfident), (smaller, say_underconfident)):
             if named:  # an only output, or all together, needs no name in the sentence
@@ -284,9 +290,11 @@ def examine(
     """
     _check_record(network, record)
     shape = len(record.time), len(network.inputs)
+    # Inputs (time, inputs), without columns for a plant without inputs.
     u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
-    # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
+    # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, their correlations over time, and the
+    # health of each sensor output.
     for listener in yield_filters_with_measurements(network, record):
         advance(f"testing {listener.node}/{listener.name}")
         filters.append(_examine_filter(network, listener, record, u))
@@ -313,17 +321,24 @@ def _examine_filter(
 ) -> FilterHealth:
     """Return one filter's innovations scaled to covariance I by its claim (`white`), and what tests say of them.
 
-    Both are None for a filter that claims no covariance, or receives nothing. `expected`: mean squares of `white` that
-    the model expects in this recording. `declared`: tests of variances that are reported with messages.
+    `white` (time, m): innovations L^-1 (z - E z), with L L' the claimed covariance. If the claim (what the covariance
+    is said to be) holds they have variance 1 and no correlation over time, which `test` examines. Both are None for a
+    filter that claims no covariance, or receives nothing. `expected`: mean square of `white` that the model expects in
+    this recording, which random gains may move from 1. `declared`: tests of noise variances that are reported with
+    messages. `listener` holds the filter, its names, and the measurements that it received.
     """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
-    white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
+    # Without a claim there is nothing to test; 1 is the mean square that a true claim gives.
+    white, test, expected = None, None, np.ones(1)
     if filter.claim != "none" and filter.received:
+        # Whiten the innovations, test their correlation over time (of a filter that weighs outliers down, about their
+        # mean), and compare their size with the expected one.
         white = np.asarray(score_innovations(filter, z, inputs)[1])
         test = find_memory(subtract_mean(white) if weighs(filter) else white)
         expected = compute_expected_squares(filter, z, inputs)
         test = None if test is None else scale_size_to_expected(test, white, expected)
-    lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
+    # Whether the filter lost its claim in some row: then it has none for the recording.
+    lost_claim = np.any(record.estimates[node][name].claims == "none")
     return FilterHealth(
         node=node,
         filter=name,

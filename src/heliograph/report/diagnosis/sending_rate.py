@@ -59,17 +59,23 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
 def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
     """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
 
-    A sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. A line is
-    what such a rate makes of the arrivals: their phases (rows times rate, less whole periods) lie in a narrow interval.
+    A sender with its own clock sends at a rate below that of the rows, so that some rows are empty without a loss. It
+    may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. The pattern of
+    such a rate is a line: the phases of arrivals (row times frequency, less whole periods) lie in a narrow interval.
+    Rows whose phase is in it are due. The pattern is accepted if losses in bursts would make it with a probability
+    below CHANCE.
     """
     rows = np.flatnonzero(arrived)
     span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last
+    # Nothing to find in few arrivals, or where each row has one.
     came_in_each_row = len(rows) == span
     if len(rows) < FEWEST or came_in_each_row:
         return None
+    # Law of losses in bursts, the alternative explanation of empty rows.
     loss_law, found = BurstLossLaw.fit_to_intervals(np.diff(rows)), None
     deciding_rows = rows[0] + np.arange(min(span, ENOUGH))
     arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
+    # Frequencies in cycles per row.
     for frequency in _find_likely_frequencies(arrived):
         # Due rows have phases in an interval of length 1 / T = frequency: the rest of the circle, about, is empty.
         _, gap = _find_largest_gap(frequency, rows)
@@ -81,10 +87,10 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
         due = np.mod(line.phases(deciding_rows) + ROUNDING, 1) <= line.width + 2 * ROUNDING
-        # Many lines were possible, any of which would have been taken: the chance of one is multiplied by their number.
+        # Many lines are possible, and any would have been taken, so the chance of one is multiplied by their number.
         log_number_of_lines = LINE_PARAMETERS * np.log(len(arrived))
         log_chance = loss_law.log_chance_within(due, arrivals_after_first) + log_number_of_lines
-        # Multiples of a frequency that passes do so too: the least is the sender's.
+        # If a frequency passes, its multiples do too: the sender's is the least.
         if log_chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
             found = SendingRate(period=1 / line.frequency, slots=slots - slots[0])
     return found

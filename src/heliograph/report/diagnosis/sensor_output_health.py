@@ -189,15 +189,16 @@ def judge_outputs_of_filter(
 ) -> list[OutputHealth]:
     """Return the judgement of each output by the innovations of one filter that claims a covariance.
 
-    A median that the node's law of noise has itself, since it is not symmetric, is no bias.
+    An output is doubted by its innovations, such as a median other than 0 (a bias) or another size than claimed. Where
+    the law of the noise is not symmetric it has a median of its own, which is no bias.
 
     Args:
         network: the network.
-        listener: the filter, with what it received.
-        record: what was run, which holds the innovations of filters that weigh.
-        inputs: of the plant (time, inputs).
+        listener: the filter with its names and the measurements (time, outputs) that it received.
+        record: the run of the network, which holds the innovations of filters that weigh outliers down.
+        inputs: inputs of the plant (time, inputs).
     """
-    # Innovations with variances and weights (time, outputs); a filter that does not weigh is run for them.
+    # Innovations with variances and weights (time, outputs). A filter that does not weigh is run again for them.
     innovations = record.weighed.get(listener.node, {}).get(listener.name)
     has_weights = innovations is not None
     if innovations is None:
@@ -207,13 +208,13 @@ def judge_outputs_of_filter(
             variance=np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1),
             weight=np.ones_like(outcome.innovations),
         )
-    # What they should be by the claim and the law of the noise: variance, median, squares.
+    # Their expected variance, median and squares, by the claim and the law of the noise.
     variance = np.asarray(innovations.variance)
     medians = compute_innovation_medians(network, listener.node, _median_over_time(variance))
     expected = compute_expected_squares(listener.filter, listener.measurements, inputs)
     laws = list_noise_laws(network, listener.node)
-    # A message may tell numbers that a filter takes as they are, such as its gain or a flag: their innovations are 0,
-    # with variance 0, and are not judged.
+    # A message may report numbers that a filter takes as they are, such as its gain or a flag. Their innovations have
+    # variance 0, and are not judged.
     is_taken_as_told = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
     outputs = np.flatnonzero(~is_taken_as_told)
     judged = judge_outputs(

@@ -40,7 +40,8 @@ def draw_predicted_figures(health: Health) -> dict[str, Figure]:
 def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
     """Return the sections of a run's page on predictions and residuals; none unless predictions were asked for.
 
-    `drawings`: each figure as SVG, by the names of `draw_predicted_figures`.
+    `health`: the diagnosis of the run, with the one-step predictions of its filters. `drawings`: each figure as SVG, by
+    the names of `draw_predicted_figures`, "predicted_0" and so on by node.
     """
     if not health.predicted:
         return []
@@ -48,6 +49,7 @@ def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> li
         "What each filter expected of a row, given the rows before it: also where nothing arrived. Of what arrived, "
         "95 of 100 should lie in the band of a filter whose claim is exact."
     )
+    # A picture for each of the first MOST nodes; the others, and figures that are missing, are named in a text.
     nodes = _list_predicting_nodes(health)
     pictures = {}
     for i, node in enumerate(nodes[:MOST]):

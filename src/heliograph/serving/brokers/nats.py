@@ -212,9 +212,14 @@ class Nats:
     async def _open_reader(self) -> JetStreamContext.PullSubscription:
         """Return a consumer of this part that begins after the last acknowledged message; remove all others.
 
+        Several processes share a stream of messages, each reads one numbered part. A consumer is the server's record of
+        what a reader has read; each start of a reader makes a new one with a name of its own, so that a process whose
+        consumer is gone knows that another took its part over.
+
         Raises:
             TakenOverError: another process reads this part by now.
         """
+        # Keep the reader while the connection lasts.
         if self._reader is not None and self._is_connected():
             return self._reader
         server = await self._open()
@@ -225,11 +230,12 @@ class Nats:
         is_taken_over = self._name and consumers and self._name not in [each.name for each in consumers]
         if is_taken_over:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
-        # Begin after the last message that any reader acknowledged.
+        # Begin after the last message that any reader acknowledged, ours or an earlier one; at the newest at most. A
+        # stream without consumers was made anew, so our old position means nothing there.
         by_others = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
-        by_us = self._acknowledged if consumers else 0  # a stream without its consumers is a new one
+        by_us = self._acknowledged if consumers else 0
         self._acknowledged = min(max([by_us, *by_others]), newest)
-        # Make the new consumer before the old ones are removed.
+        # Make the new consumer before the old ones are removed, so that there is always one.
         self._name, self._read = prefix + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._configure_consumer())
         self._reader = await server.pull_subscribe_bind(self._name, self.stream)

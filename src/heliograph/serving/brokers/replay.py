@@ -109,11 +109,14 @@ def row_events(
 ) -> Iterator[Event]:
     """Yield an event for the inputs of each row, and for each node that measured something in it.
 
+    A recording in rows is replayed as the messages that a live service would have received: one event for the inputs,
+    one for each node's measurement.
+
     Args:
-        numbers: counts of the rows, from 0.
+        numbers: running numbers of the rows, from 0.
         time: the times of the rows: steps, or seconds.
-        inputs: the plant's inputs without dt.
-        measurements: values of each node, NaN where one did not arrive.
+        inputs: the plant's inputs without the time step dt (rows, inputs).
+        measurements: {node: values (rows, received)}, NaN where a value did not arrive.
         before: time of the row before the first; None if there is none.
         steps: whether times are steps.
     """
@@ -192,19 +195,21 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     more messages.
 
     Args:
-        events: the events as they are sent.
+        events: the events in order of sending.
         trace: a file with a column `delay`, in the unit of time of the events; NaN where a message was lost.
 
     Raises:
         ValueError: no column `delay`, or a negative one.
     """
     events, trace = items("events", events, "events"), file_path("trace", trace)
+    # Read the delays, and check them.
     columns = convert_to_columns(str(trace), str(trace))
     if DELAY not in columns:
         raise fail(f"trace {trace}", f"a column {DELAY!r}, nan where a message was lost", list(columns))
     delays = np.asarray(columns[DELAY], dtype=float)
     if np.any(delays < 0):
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
+    # Messages are delayed or lost, inputs arrive at once.
     sent = [event for event in events if event.node != INPUTS]
     inputs = [event for event in events if event.node == INPUTS]
     delay_of_sent = np.resize(delays, len(sent)).tolist()

@@ -73,21 +73,26 @@ class ServiceWatch:
     ):
         """Begin without a service.
 
+        The watch collects what pages and metrics show of a running service: tests of filters, counts of messages,
+        delays. A service is added later.
+
         Args:
             states: names of the states.
             title: name of the network.
             time_unit: unit of times that are numbers.
-            fused: by the name of a fusion its claim, and the (node, filter) pairs that it fuses.
-            names: names of the received numbers by node and filter.
-            uncounted: nodes whose messages carry no count.
+            fused: {name of a fusion: (its claim, the (node, filter) pairs that it fuses)}; the claim says what its
+                covariance is.
+            names: names of the received numbers by (node, filter).
+            uncounted: nodes whose messages carry no running count, so that losses cannot be counted.
         """
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused, self.uncounted = dict(fused or {}), uncounted
-        # `lock` is held while a batch is taken, `_noting` while its outputs are recorded. Then: when the batch that is
-        # being taken began.
+        # `lock` is held while a batch of messages is taken, `_noting` while its outputs are recorded. `_batch_started`:
+        # when the batch that is being taken began.
         self.lock, self._noting = threading.Lock(), threading.Lock()
         self._batch_started: float | None = None
-        # Of all plants together: services, tests of claims, weighed outputs, counts, what is wrong, batches.
+        # For all plants together: services, tests of claims (normalised squared innovations), weighed outputs, counts,
+        # troubles, batches.
         self.services: list[WatchableService] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self.outputs = RecentInnovations(MEMORY, names or {})
@@ -95,7 +100,7 @@ class ServiceWatch:
         no_answers = ServiceAnswers(names=[], links={}, malformed=0, wrong=0)
         self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)
         self._batches = BatchHistograms()
-        # Of each plant with a new message.
+        # For each plant with a new message.
         self._memory = RememberedPlants(names or {})
 
     @property

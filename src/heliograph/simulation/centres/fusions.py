@@ -208,13 +208,16 @@ def build_centre_filter(
 ) -> CentreFilter:
     """Return the filter of the centre that receives reports for `fusion`, which has this name in the network.
 
-    `step_filters`: makes all filters of a network, to be stepped without data for the moments of their errors.
+    The nodes' estimates are sent as reports. Their errors are correlated, by the common process noise, so the centre
+    needs their joint moments: it steps all nodes' filters without data to find them (`step_filters` makes these). A
+    claim is what a covariance is said to be: exact, upper bound or nominal.
     """
     # The centre's claim, from those of the nodes' filters and what their uplinks do.
     names = network.nodes_with(fusion.filter)
     complete = {node: network.nodes[node].complete for node in names}
     claim = find_claim_of_report_fusion(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
-    # A network of the nodes with that filter alone, and a fusion that has the moments of its errors computed.
+    # A network whose nodes have that filter alone, with a fusion that makes the joint moments of its errors be
+    # computed.
     alone = Network(
         network.plant,
         {node: _keep_one_filter(network.nodes[node], fusion.filter) for node in network.names},
@@ -222,7 +225,8 @@ def build_centre_filter(
         network.relays,
         network.common,
     )
-    # Reports are received in rows (age, node, component), of which `rows` are those that can arrive.
+    # Reports are received in rows (age, node, component); `rows` are those that can arrive. A report's age is the
+    # number of steps by which it is late.
     uplinks = build_uplinks(fusion, names, len(network.states))
     return CentreFilter(
         filters=step_filters(alone),

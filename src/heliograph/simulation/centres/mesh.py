@@ -129,9 +129,6 @@ class Mesh(Module):
             arrived: which messages arrive (node, rounds, degree); ages in steps, -1 of none, where they may be late.
             u, k: inputs of the plant over the step, and its number.
             precomputed: weights of this step by bucket, if they were computed before; else the rule computes them.
-
-        Returns:
-            The state after the step, and estimates (1, node, ...) by group of nodes.
         """
         measured = jnp.concatenate([self._pad_to_longest(rows) for rows in z])[self.observation_model.order]
         present = ~jnp.isnan(measured)
@@ -281,17 +278,19 @@ class Mesh(Module):
     ) -> PyTree:
         """Return function(rule, estimates of the neighbours, *rest, precomputed) with a leading axis of nodes.
 
+        Each node fuses estimates by a rule. Nodes of about as many neighbours form a bucket, computed by one `vmap`.
+
         Args:
-            function: of one node; its result has a field `neighbour_factors`, of a row for each message.
+            function: computation at one node; its result has a field `neighbour_factors`, one row for each message.
             covariance: of all estimates (row, n, n), one row for each node unless `senders` says otherwise.
             blocks: joint covariance of each neighbourhood (node, degree, n, degree, n); None where no rule needs it.
             present: which messages arrive (node, degree).
             *rest: further arguments, with a leading axis of nodes.
-            precomputed: weights computed before, by bucket.
+            precomputed: weights that were computed before, one for each bucket; () to compute them here.
             senders: row of `covariance` for each message that a node receives (node, degree); None for the graph's.
         """
         information, traces = jax.vmap(invert_positive_definite)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
-        # Axes of the nodes: the last of a rule's arrays, the first of all else.
+        # The axis of nodes is the last one of a rule's arrays, and the first one of all other arguments.
         over_nodes = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
         by_bucket = []  # nodes of about as many neighbours together
         for bucket, bucket_weights in zip(self.buckets, precomputed or [()] * len(self.buckets), strict=True):
@@ -310,7 +309,7 @@ class Mesh(Module):
             by_bucket.append(over_nodes(bucket.rule, received, *(leaf[rows] for leaf in rest), bucket_weights))
         if len(by_bucket) == 1:  # it has all nodes, in their order
             return by_bucket[0]
-        # Padded to as many messages for all nodes, and in the order of the nodes.
+        # Pad the results to the same number of messages, and put them in the order of the nodes.
         degree = self.senders.shape[1]
         padded = [r._replace(neighbour_factors=_pad_to_degree(r.neighbour_factors, degree)) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
@@ -374,8 +373,7 @@ class Mesh(Module):
     def compute_weights_of_steps(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> PrecomputedWeights:
         """Return frozen weights of many steps, with a leading axis of steps, for each bucket of nodes.
 
-        Frozen weights depend on nothing but which messages arrive. The result is empty for other rules, and where there
-        is no native code to compute the weights.
+        Frozen weights depend on arrivals alone. The result is empty for other rules, and without native code for them.
         """
         weights = [bucket.rule.compute_weights_of_steps(arrived[:, bucket.rows, -1, : bucket.width])  # the last round
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip

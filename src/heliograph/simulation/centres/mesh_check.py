@@ -41,10 +41,14 @@ RANK = 1e-9  # relative: singular values of a mode's observability below are zer
 def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     """Raise ValueError for a fusion between neighbours that does not fit its network, naming the node that does not.
 
+    In such a fusion nodes exchange estimates among themselves, without a centre. It is checked before a run, since a
+    fusion that does not fit would give wrong covariances or growing errors, without an error message.
+
     Args:
-        name: of the fusion.
-        fusion: with whom each node receives.
-        network: its plant, nodes and filters.
+        name: name of the fusion.
+        fusion: the fusion: each node's neighbours, the local filter whose estimates are exchanged, the rule of
+            combination (shares or covariances), the links between nodes.
+        network: the network with its plant, nodes and filters.
 
     Raises:
         ValueError: unknown nodes, nodes with a sensor but without the filter, models that are not linear, relays or
@@ -54,27 +58,30 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     neighbours = fusion.neighbours or {}
     if unknown := sorted(set(neighbours) - set(network.nodes)):
         raise fail(what, f"nodes of the network {list(network.nodes)[:5]}", f"unknown ones {unknown[:5]}")
-    # Relays, and nodes that share a channel, have correlated noises.
+    # Rules combine nodes whose measurement noises are uncorrelated. Relays and shared channels correlate them.
     if network.relays is not None or network.common is not None:
         sharing = [node for node in network.mesh_nodes(name) if network.nodes[node].received][:5]
         got = "relays" if network.relays is not None else f"{sharing}, which share a channel: stack their measurements"
         raise fail(what, "nodes with a sensor and a channel each, whose noises are uncorrelated", got)
+    # The covariances of the rules are those of linear dynamics.
     if not isinstance(first(network.plant), LinearPlant):
         raise fail(what, "a LinearPlant", type(first(network.plant)).__name__)
-    # A node has the fusion's filter, or no sensor; and none of its filters has the name of the fusion.
+    # A node with a sensor (`Node`) must have the local filter. The fusion's result is stored under its name beside the
+    # node's filters, so no filter may have that name.
     for node_name in network.mesh_nodes(name):
         node = network.nodes[node_name]
         if isinstance(node, Node) and fusion.filter not in node.filters:
             raise fail(f"{what}: node {node_name!r}", f"the filter {fusion.filter!r}", list(node.filters) or "none")
         if name in node.filters:
             raise fail(f"{what}: node {node_name!r}", "a name that no filter has", repr(name))
-    # Rule and messages; then what the rule and the claim refuse themselves.
+    # The rule and the messages between nodes.
     _check_rule(what, fusion, network)
     graph = graph_of(neighbours, network.mesh_nodes(name))
     _check_messages(what, fusion, network, graph)
     fusion.rule.placed(graph)  # raises for shares or blocks that do not fit the graph
     find_claim_of_mesh(name, fusion, network)  # raises for filters that the rule refuses
-    # Whether errors stay bounded.
+    # Whether errors stay bounded: each node sees, or hears of, all unstable modes; messages are not lost too often; and
+    # fixed shares do not amplify errors.
     _check_detectability(what, name, fusion, network)
     _check_losses(what, fusion, network, graph)
     _check_fixed_shares(what, fusion, network, graph)

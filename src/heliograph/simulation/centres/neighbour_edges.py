@@ -138,21 +138,28 @@ class MeshEdges(Module):
     ) -> Bool[np.ndarray, "time node rounds degree"]:
         """Return the flags of each step, or ages where messages may be late, from a recording.
 
+        In a fusion between neighbours nodes exchange messages in several rounds within a step. The recording says which
+        messages arrived, so that the run over it loses the same ones. On the last axis of the result a node's own
+        message is at 0, and its neighbours follow.
+
         Args:
             name: of the fusion.
             nodes: names of its nodes.
-            reports: for each node that has neighbours (steps, rounds times neighbours), NaN where nothing arrived, else
-                the message's age in steps (any number where none is late); None where none were recorded.
+            reports: recorded arrivals of each node that has neighbours: (steps, rounds times neighbours), NaN where
+                nothing arrived, else the message's age in steps (any number if no message can be late); None if nothing
+                was recorded.
             steps: number of steps.
 
         Raises:
             ValueError: nodes without flags or the reverse, shapes that do not fit, ages that the links do not have.
         """
-        # Everything arrives, unless a report says otherwise.
+        # Start from `lossless`: every message arrives at once. The reports below replace this.
         flags = np.repeat(self.lossless()[None], steps, axis=0)
+        # Without random links (`groups` is empty) nothing is ever lost, and no report is needed.
         if reports is None and not self.groups:
             return flags
-        # Reports of exactly the nodes that have a neighbour.
+        # There must be a report of each node with a neighbour (`present` (node, degree), the node itself at 0), and no
+        # other.
         receivers = [node for node, row in zip(nodes, self.present, strict=True) if row[1:].any()]
         if reports is None or set(reports) != set(receivers):
             given = "none" if reports is None else list(reports)
@@ -160,6 +167,8 @@ class MeshEdges(Module):
         for i, node in enumerate(nodes):
             if node in reports:
                 ages = self._read_ages(node, reports[node], steps, neighbours=int(self.present[i, 1:].sum()))
+                # Ages of -1 mean lost. They are kept as ages if messages may be late (`past` > 0), else reduced to
+                # flags.
                 flags[:, i, :, 1 : ages.shape[2] + 1] = ages if self.past else ages >= 0
         return flags
 

@@ -157,8 +157,7 @@ def judge_declared(
 
     Args:
         filter: a filter behind a link whose Gaussian noise is told (`hg.model.told`).
-        data: values and what was declared of them (steps, received), NaN where a component did not arrive; the first
-            2,000 rows count.
+        data: values and what was declared of them (steps, received), NaN where none came; the first 2,000 rows count.
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
 
     Raises:
@@ -191,8 +190,7 @@ def judge_declared_links(
 
     Args:
         filter: a filter.
-        data: values and what was declared of them (steps, received), NaN where a component did not arrive; the first
-            2,000 rows count.
+        data: values and what was declared of them (steps, received), NaN where none came; the first 2,000 rows count.
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
 
     Raises:
@@ -263,7 +261,8 @@ def _classify_rows(
 ) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
     """Divide the rows with messages of a link into classes by the mean logarithm of the variances that they declare.
 
-    `link`: its number among the links that report numbers with each message. `z`, `u`: measurements and inputs.
+    It is to be tested if errors grow with the noise variances that messages report. `link`: its number among the links
+    that report numbers. `z`, `u`: measurements and inputs.
 
     Returns:
         The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
@@ -277,7 +276,7 @@ def _classify_rows(
             z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
         variances = _compute_declared_variances(place, z)
         log_size = np.mean(np.log(variances), axis=1)
-    # Rows in which the link declared something and a value came.
+    # Rows in which the link reported a variance and a value came.
     heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
     sizes, numbers = log_size[heard], int(np.count_nonzero(~np.isnan(z[heard][:, place.values])))

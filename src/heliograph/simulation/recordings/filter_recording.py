@@ -309,22 +309,25 @@ def _find_refused_rows(
 ) -> dict[str, dict[int, str]]:  # fmt: skip
     """Return, by node, the rows that its filters refuse as implausible and that were not refused `before`.
 
-    A central filter refuses a row of all nodes' measurements. The row is then refused of one node alone, which is to
-    blame: one that no filter of its own judges, and without whose values the central filters find the row plausible.
+    A row is implausible if the measurement cannot be true by the filter's model. The nodes' own filters judge their
+    node. A central filter judges the row of all nodes' measurements; the row is then refused of one node alone, which
+    is to blame: one that no filter of its own judges, and without whose values the central filters find the row
+    plausible.
 
     Args:
         network: the network.
-        outputs: of filtering the rows with judgements, by row.
-        z: measurements by node.
+        outputs: results of filtering with judgements, by row.
+        z: {node: measurements (steps, received)}.
         z_by_group: the same (steps, node, received) by group.
-        task: filters and all else that the recording is filtered with.
-        before: rows that were refused already, by node, with the reason.
+        task: what the recording is filtered with: filters, inputs, and all else.
+        before: rows that were refused already: {node: {row: reason}}.
 
     Returns:
         {node: {row: reason}}.
     """
     refused, refused_centrally = find_refused_rows(network, outputs)  # by the nodes' filters, and by central ones
     filters, u = task.filters, task.u
+    # Try without one node's values at a time, from the central filters' states before the row.
     if refused_centrally:
         central_states = find_central_states_before_rows(task, z_by_group)
         z_in_order = {name: z[name] for name in network.names}
@@ -332,6 +335,7 @@ def _find_refused_rows(
         refused |= blame_nodes_for_implausible_rows(
             filters.central, central_states, z_in_order, u, refused_centrally, nodes_to_blame
         )
+    # Leave out rows that were refused before.
     new_rows = {
         name: {k: reason for k, reason in rows.items() if k not in before.get(name, ())}
         for name, rows in refused.items()

@@ -178,13 +178,18 @@ def describe_doubts(
 ) -> list[str]:
     """Return messages about a recording: rows that are implausible to all filters or to one alone, and inputs.
 
+    While a recording is filtered each filter judges each row, and skips a measurement that cannot be true by its model
+    (or that is not a number). The messages tell the user which rows were skipped, and why.
+
     Args:
-        network: the network.
-        outputs: of filtering the rows with judgements, by row.
-        refused: rows that all filters of a node refuse, by node, with the reason.
-        u: inputs of the plant.
+        network: the network that the recording ran through.
+        outputs: output of filtering, by row: "judged" holds judgements by kind of filter (reason (row, filter, node), 0
+            for a plausible row, and distance), "judged_centrally" those of fusions by name.
+        refused: rows that all filters of a node refuse: {node: {row: reason}}.
+        u: inputs of the plant, (steps, inputs).
     """
-    # Rows that are implausible for all filters of a node; the first is explained, by a function's fault if any has one.
+    # Rows that all filters of a node find implausible. The message explains the first row, and names a function of the
+    # model (such as the transition) that returned numbers that are not finite, if there is one.
     faults = _NonFiniteFunctionFinder(network, outputs, u)
     lines = []
     for node, by_row in refused.items():
@@ -192,7 +197,8 @@ def describe_doubts(
         named = [faults.name_fault(node, name, first_row) for name in network.nodes[node].filters]
         fault = next((words for words in named if words), "")
         lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
-    # Rows that a single filter skips, those of above aside. Of the judgements of a kind one filter's at one node.
+    # Rows that one filter alone skips. `places` says where in the arrays of a kind the judgements of (node, filter)
+    # are.
     judgements = {
         place: Judgement(*(field[:, at.filter, at.node] for field in outputs["judged"][at.kind]))
         for place, at in network.places.items()
@@ -206,7 +212,7 @@ def describe_doubts(
             reason, distance = np.asarray(judgement.reason)[rows[0]], np.asarray(judgement.distance)[rows[0]]
             why = Judgement.describe(reason, distance) + faults.name_fault(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
-    # Inputs, judged by all filters.
+    # Inputs are implausible if some filter finds them so, and no filter finds them plausible.
     if network.inputs:
         votes = JudgementReader(network).read_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]

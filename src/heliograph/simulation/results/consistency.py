@@ -140,10 +140,13 @@ def _compute_normalised_square(
 ) -> Float[np.ndarray, "*steps"]:
     """Return x' P^-1 x of each step over the components of x that are not NaN, or NaN if all are.
 
+    For errors of a filter it is the normalised squared error, whose mean is n if the covariance P is right. All steps
+    are computed at once.
+
     Args:
-        x: errors or innovations.
-        covariance: P of each step.
-        size: the numbers of which x is a difference; their size bounds the rounding error of x.
+        x: errors or innovations (..., n), NaN where a component is missing.
+        covariance: P of each step (..., n, n).
+        size: size of the numbers whose difference x is (..., n); it bounds the rounding error of x.
 
     Raises:
         ValueError: a covariance with a negative eigenvalue.
@@ -156,7 +159,7 @@ def _compute_normalised_square(
     # Join all leading axes into one, so that matrices stand one after another.
     squares = _square_distances(with_missing.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
     squares_by_step = np.asarray(squares).reshape(x.shape[:-1])
-    # Of an indefinite matrix the square is NaN, which would count as missing.
+    # The square of an indefinite matrix is NaN, which would count as missing: refuse it, and name the step.
     is_known = np.isfinite(with_missing).all(axis=(-1, -2))
     indefinite = np.argwhere(np.isnan(squares_by_step) & is_known)
     if len(indefinite):

@@ -161,17 +161,23 @@ class Trajectories(AbstractReducer[Record]):
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Return the record of trajectories, with nodes in the network's order.
 
+    A scan returns arrays grouped by kind of filter and node. A user reads them by name: this function sorts them into a
+    `Record`, one entry for each node and filter.
+
     Args:
-        network: the network.
-        batch: what a scan over time put out, as `AbstractReducer` describes a step, with leading axes (run, time) or
-            (time).
-        time: of the steps.
+        network: the simulated network, which has the order and the names of nodes and filters.
+        batch: output of the scan over steps, with leading axes (run, time) or (time): "truth" (..., n), "measurements",
+            "estimates" with mean (..., filter, node, n) for each kind of filter, "uplinks" and "reports" (what arrived
+            at the centre), and more where the network has it.
+        time: times of the steps (time,).
     """
     measurements = split_measurements(network, batch["measurements"])
     # The axis of filters is the third from last of means (..., filter, node, n), the fourth of covariances.
     mean = split_by_name(network, batch, attrgetter("mean"), axis=-3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), axis=-4)
+    # Probabilities of the modes of links or plant, of filters that estimate them; and rotations among the states.
     modes, attitude = collect_mode_probabilities(network, batch), first(network.plant).manifold.rotations
+    # One estimate for each node and filter. The claim says what its covariance is: exact, an upper bound or nominal.
     estimates = {
         node: {
             name: Estimate(mean[node][name], covariance[node][name], claim, modes.get((node, name)), attitude=attitude)
@@ -179,6 +185,7 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         }
         for node, claims in network.claims().items()
     }
+    # What the centre received from each node.
     uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])
     return Record(
         time=time,

@@ -87,11 +87,14 @@ class SavableResults:
 def save(dataset: "xr.Dataset", path: str | Path) -> None:
     """Write a dataset to a NetCDF file or a Zarr folder, replacing an earlier one.
 
+    The ending of `path` chooses the format. An earlier file is replaced only when the new one is complete.
+
     Raises:
         ValueError: another ending, a place that cannot be written or that holds something else.
         ModuleNotFoundError: an extra is not installed.
     """
     path = file_path("file of results", path)
+    # The package that writes this format; raise now if it is not installed.
     package = _find_package(path)
     import_module(package)  # raises now if the extra is not installed
     # Names as text that any file can hold; floats without a fill value.

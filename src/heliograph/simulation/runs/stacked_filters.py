@@ -121,12 +121,15 @@ class StackedFilters(Module):
     ) -> tuple[PyTree, StepOutput]:
         """Step each filter: return the next states (filter and node, ...), and outputs (filter, node, ...).
 
+        A stack holds filters of one structure at the nodes of a group, `self.count` filters at each of `self.nodes`
+        nodes; all are stepped by one map.
+
         Args:
-            states: before the step (filter and node, ...).
+            states: states before the step (filter times node, ...).
             z: measurements (node, received) of the group.
             u: inputs of the plant over the step.
             k: number of the step.
-            skip: codes of the reasons not to use them (filter, node), 0 where there is none; None: use all.
+            skip: codes of reasons not to use the measurements (filter, node), 0 to use them; None: use all.
         """
 
         def step_one(
@@ -139,9 +142,11 @@ class StackedFilters(Module):
             """
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
+        # Join the axes of filters and nodes; each filter of a node gets the node's z.
         reasons = None if skip is None else skip.reshape(-1)
         step_all = map_all(step_one, self.count * self.nodes)
         after, outputs = step_all(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
+        # Outputs get separate axes (filter, node) again.
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
 
     def compute_by_node(
@@ -208,12 +213,13 @@ def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
 def stack_by_kind(network: Network, smoothed_kinds: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
     """Return the filters of a network's nodes as stacks: filters that differ in numbers alone along one axis.
 
-    A group holds the nodes of one structure. A kind holds filters of one structure at all nodes of one group; along its
-    axis are the first filter of all nodes, then the second one, and so on.
+    Filters of one structure differ in numbers alone, so that one `vmap` steps them all. A group holds the nodes of one
+    structure. A kind holds filters of one structure at all nodes of one group; along its axis are the first filter of
+    all nodes, then the second one, and so on.
 
     Args:
         network: the network.
-        smoothed_kinds: numbers of the kinds whose estimates are to be smoothed.
+        smoothed_kinds: indices of the kinds whose estimates are to be smoothed.
         judges: whether filters judge if their measurements are plausible.
     """
     alike = []

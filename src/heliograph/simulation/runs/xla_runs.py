@@ -18,13 +18,14 @@ def simulate_trajectories(
 ) -> PyTree:
     """Return the outputs over time of all runs, (run, time, ...), or (1, time, ...) of what all runs share.
 
-    Inside, the axis of runs is the last one of every array: a processor works through them contiguously.
+    Numbers that do not depend on a run's random key, such as many covariances, are computed once for all runs. Inside,
+    the axis of runs is the last one of every array: a processor works through them contiguously.
 
     Args:
-        init: of a run's key, its state before the first step.
-        step: of (state, key, row), the next state and the outputs.
-        keys: of the runs (run,).
-        rows: what the steps are given, with a leading axis of time; common to all runs.
+        init: function from a run's key to its state before the first step.
+        step: function from (state, key, row) to the next state and the outputs.
+        keys: random keys of the runs (run,).
+        rows: data of the steps, common to all runs, with a leading axis of time.
     """
     # Leaves of the first states; `start_varies` marks those that differ between runs.
     start, start_varies, tree = _start_runs(init, keys)
@@ -37,8 +38,9 @@ def simulate_trajectories(
     )(example_state, keys[0], example_row)
     body = _drop_unused(traced)
     row_varies = [False] * len(jax.tree.leaves(example_row))
-    # Leaves of the state that differ between runs at some step: marks are passed through the step until no leaf is
-    # marked any more. Then leaves of the outputs. The key, marked True, differs always.
+    # Which leaves of the state differ between runs at some step? What depends on the key (marked True), or on a leaf
+    # that differs, differs: marks are passed through the step until no more leaves are marked. Then the same for
+    # outputs.
     state_varies = _find_fixed_point(
         lambda marks: _mark_dependent_results(body, [*marks, True, *row_varies])[:count], start_varies
     )
@@ -52,7 +54,7 @@ def simulate_trajectories(
         results = advance(*state, keys, *jax.tree.leaves(row))
         return results[:count], results[count:]
 
-    # What is common at first and differs later begins as copies.
+    # Leaves that are common at first and differ later begin as copies.
     begin = [jnp.broadcast_to(leaf[..., None], (*leaf.shape, len(keys))) if later and not now else leaf
              for leaf, now, later in zip(start, start_varies, state_varies, strict=True)]  # fmt: skip
     _, outcome = jax.lax.scan(step_all, begin, rows)
