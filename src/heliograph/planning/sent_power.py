@@ -290,7 +290,11 @@ def _average_draws(
 def _draw_output_squares(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, key: jax.Array
 ) -> dict[str, jax.Array]:
-    """Return (y, 1)(y, 1)' of what each sensor measures at each step of one drawn trajectory, (steps, m1, m1)."""
+    """Return (y, 1)(y, 1)' of what each sensor measures at each step of one drawn trajectory, (steps, m + 1, m + 1).
+
+    The mean over trajectories estimates the second moments of y, which give the power that is sent. `inputs` are those
+    of the plant, (steps, inputs); sensors have m outputs each.
+    """
     key_of_start, key_of_steps = jax.random.split(key)
 
     def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:

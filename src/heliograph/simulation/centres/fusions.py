@@ -305,11 +305,12 @@ def _build_centre(
 ) -> FusionCentre | LinearisedCentre:
     """Return the centre that fuses the estimates of the filter `name` of all nodes that have it.
 
-    `rules`: by name of the fusion; each needs the joint covariance of the nodes' errors, which the centre propagates.
+    The centre propagates the joint covariance of the nodes' errors, which its rules need, from models of all nodes.
+    `rules`: the fusion rules by name of the fusion.
     """
     places, claims = network.places, network.claims()[FUSED]
     nodes = network.nodes_with(name)
-    # In which stacks of filters (sources) the nodes' filters are, and the nodes of each stack.
+    # sources: (kind, number in the kind) of the filters' stacks; order: brings their nodes into the order of `nodes`.
     sources, order = find_source_filters(network, places, nodes, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     longest_measurement = max(network.nodes[node].received for node in nodes)

@@ -59,9 +59,10 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def of_step(self, step: PyTree) -> OfStep:
         """Return the numbers of one step of one run that are summed over runs, and flags of failures.
 
-        They are, for each estimate with error e and claimed covariance B: the products e_i e_j (i <= j), the normalised
-        error squared (NEES) e' B^-1 e, B_ij, and whether e or the NEES is no number; and what the nodes' quantizers
-        sent. The flags are also returned as `ever`, to count the runs in which they are true at some step.
+        They are, for each estimate with error e and the covariance B that the filter states: the products e_i e_j
+        (i <= j), the normalised error squared (NEES) e' B^-1 e, B_ij, and whether e or the NEES is no number; and what
+        the nodes' quantizers sent. Their means over runs show if B is right. The flags are also returned as `ever`, to
+        count the runs in which they are true at some step.
 
         `step`: the truth, estimates by kind (a stack of filters of one structure), and fused ones by name. All lie one
         after another along one axis (`part`). But covariances are a tuple with an array for each kind: if a filter's
