@@ -209,13 +209,15 @@ def judge_events(
 ) -> Int[np.ndarray, " events"]:
     """Return the number of the verdict on each event, among `VERDICTS`: the first that holds.
 
-    An event is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was
-    final before it came: at each arrival the rows older than that by more than the window become final. Of events of
-    one node, count and time the first stays. Where rows are joint, so does the first of a node's values at a time.
+    An event is a message of a node, with its time, arrival and running count. Events of one time, or one event alone,
+    make a row. An event is in the future if its time is later than its arrival by more than `ahead`. It is late if its
+    row was final before it came: at each arrival the rows older than that by more than the window become final. Of
+    events of one node, count and time only the first is used. If rows are joint, only the first values of a node at a
+    time are used.
 
     Args:
         events: the events, in order of arrival.
-        values: the values of the event with a number.
+        values: a function that returns the values of an event from its number in that order.
         joint: whether all events of one time are one row.
         window: how late an event may be, in the unit of the times.
         ahead: how much later than its arrival the time of an event may be.

@@ -102,8 +102,8 @@ class StepProblem:
     ):
         """Compile the problem of one step: Phi < 0 with the known part of Phi as a parameter.
 
-        Phi is the quadratic form by which the weight (x, e)' P (x, e) of state x and error e grows over the step. It
-        is linear in the unknowns, so that Phi < 0 is a linear matrix inequality.
+        Phi is a quadratic form in the state x, the filter's error e, and the disturbances of the step: the step keeps
+        the H-infinity level where it is negative definite. It is linear in the unknowns: a linear matrix inequality.
 
         Args:
             step: matrices of the step's state, error and measurement over all variables, in scaled coordinates.

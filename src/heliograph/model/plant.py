@@ -239,7 +239,7 @@ class Plant(AbstractPlant):
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
-        u = np.zeros(len(self.inputs))
+        u = np.zeros(len(self.inputs))  # an example, with which the shapes of f and of the noise are checked
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
         if callable(noise):
             check_shape("process noise covariance(u)", noise, (u,), (n, n))

@@ -123,10 +123,11 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
 def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
     """Return the amplitudes a_i = min(theta b_i / D_i, cap_i) (links,) that maximise (b' a)^2 / (a' D a + N).
 
-    theta is where theta b' a = a' D a + N, found by bisection.
+    That ratio is the information in z = b' a x + noise, the sum of links that send one signal x with amplitudes a_i.
+    Without caps a is in proportion to b_i / D_i. theta is where theta b' a = a' D a + N, found by bisection.
 
     Args:
-        b: gains, not negative.
+        b: gains of the links, not negative.
         noise: the diagonal of D, the variances of the links' noises.
         floor: N, the variance of the receiver's noise.
         caps: largest amplitudes.

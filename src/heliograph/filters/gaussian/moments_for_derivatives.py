@@ -111,8 +111,10 @@ def find_quadratic_image(function: Function, x: Gaussian) -> Image:
 def find_grid_image(function: Function, x: Gaussian, nodes: jax.Array, weights: jax.Array) -> Image:
     """Return the image of x by the product rule of these nodes (points, n) and weights (points,) of a normal vector.
 
-    In the columns over which f is nearly linear it is f + 1/2 sum_j d_j f''[L_j, L_j] at the points of all others, with
-    f'[L_j] xi_j beside it. A column over which only some components of f are so is taken by values.
+    x = m + sum_j L_j xi_j with Var xi_j = d_j, L_j the columns of `x.root`. Points m + sum_j sqrt(d_j) L_j node_j would
+    lose derivatives to rounding in the columns over which f is nearly linear (`near`). There f is expanded about the
+    points of all other columns: f + 1/2 sum_j d_j f''[L_j, L_j], plus f'[L_j] xi_j. A column over which only some
+    components of f are nearly linear is taken by values.
     """
     parts = find_odd_and_even_parts(function, x, jnp.max(nodes) ** 2)
     d, root, near = x.variances, jnp.asarray(x.root), jnp.all(parts.linear, axis=0)
@@ -125,6 +127,8 @@ def find_grid_image(function: Function, x: Gaussian, nodes: jax.Array, weights: 
         return function(point) + jnp.where(near, d / 2, 0.0) @ bends, slopes.T
 
     values, slopes_at_points = jax.vmap(at_point)(nodes)  # (points, p), (points, p, n)
+    # E f(x); the slopes that fit f best, E[f xi_j] / d_j by values; and the covariance of what the slopes leave: of f
+    # at the points, and in near columns of slopes that differ from point to point.
     center = weights @ values
     by_values = (values.T * weights) @ nodes / jnp.where(near, 1.0, jnp.where(deviations > 0, deviations, 1.0))
     slopes = jnp.where(near, jnp.einsum("k,kpj->pj", weights, slopes_at_points), by_values)

@@ -212,7 +212,8 @@ def record_step_matrices(
 
     Args:
         filter: a filter in which only the mean depends on data, by an affine function.
-        state: state of the filter before the step, with mean m. Its mean does not matter for the matrices; the returned states have started from mean 0.
+        state: state of the filter before the step, with mean m. Its mean does not matter for the matrices; the returned
+            states have started from mean 0.
         z: measurement (m,), NaN where a component did not arrive.
         u: input.
         k: number of the step.

@@ -81,6 +81,7 @@ def fates_of_sequence(
     Raises:
         ValueError: no packet, numbers that are not whole, times of another length.
     """
+    # Numbers have to be whole, and no larger than doubles hold exactly.
     check_count("jump", jump, 2)
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):

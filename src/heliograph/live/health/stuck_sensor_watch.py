@@ -82,6 +82,7 @@ class RepeatWatch:
         reading before; None at the first one. In the result `found` is one more where a run has become too long with
         this reading.
         """
+        # One step for each component, in four cases: no reading, an equal one, another one, and a run now too long.
         m, before = len(values), before or FIRST
         # The fields of `Repeats`, as lists with an entry for each component; empty before the first reading. newest:
         # last value; lengths: of its run; steps: least difference of two successive readings that differ; readings and

@@ -199,7 +199,7 @@ class Translator:
             return why
 
     def _make_message(self, topic: str, reading: Reading, known: datetime | None, repeatable: bool) -> Message:
-        """Return the message that the service gets of a reading; without a running count it gets a number as `sequence`.
+        """Return a reading's message to the service; without a running count it gets a number as its `sequence`.
 
         A message has a plant, a node, a number, a time and values. Numbers tell copies and losses.
 

@@ -121,7 +121,7 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
         z: measurements (steps, node, received) for each group of nodes of one structure.
         judged: True to leave out measurements that filters judge implausible.
     """
-    # Chunks, where the filters are linear enough for them: None where they are not.
+    # Chunks side by side need linear filters, no fusion, no smoother and many rows; else `results` is None.
     results = None if judged else _filter_in_chunks(task, z)
     if results is not None:
         return results

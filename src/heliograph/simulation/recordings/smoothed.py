@@ -323,8 +323,9 @@ def finish_result(
     """Return the result of a network's runs, with that of its smoothed part; warn of filters that are not consistent.
 
     Args:
-        reducer: by which the runs were reduced.
-        recorded: sums over the runs, and what was collected.
+        reducer: makes a result, such as error statistics, from sums over the runs.
+        recorded: sums by batch of runs; sums of numbers that all runs share (common), once; runs in each batch
+            (count); and arrays that were collected.
         network: the network.
         smoothing: its smoothed part; None where nothing was smoothed.
     """
