@@ -106,8 +106,8 @@ class RecordingBlocks:
     def _yield_cells(self, parts: Iterable[TableRows]) -> Iterator[RecordingRows]:
         """Yield the rows of each part of a table that can be read, as they came; of the first parts at least two rows.
 
-        A large table is read part by part. Some rows' values follow from two rows together (their distance in time), so
-        a single first row is held until the next one comes, where it has to be (`lacks_second_row`).
+        A large table is read part by part. Rows at its beginning may be unreadable; where each row is a step, their
+        times follow from the first two readable rows. Then a single first row is held until the next one comes.
         """
         held: RecordingRows | None = None  # while nothing was yielded
         is_first = True

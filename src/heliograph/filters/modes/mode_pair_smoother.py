@@ -126,10 +126,10 @@ class FutureObservation(NamedTuple):
 def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
     """Return the ratio of two densities N(x; s, S) / N(x; q, Q) as an observation that turns N(q, Q) into N(s, S).
 
-    It is what the later data alone say of x, which a smoother can use with another N(q, Q). The columns of V diagonalise
-    both covariances: V' Q V = I, V' S V = diag(e). Component by component, where e < 1, the observation is V'x + noise
-    = (V's - e V'q) / (1 - e), its noise of variance e / (1 - e). Rows are multiplied by sqrt(1 - e), so that no noise
-    is infinite: its variance is then e.
+    It is what the later data alone say of x, which a smoother can use with another N(q, Q). The columns of V make both
+    covariances diagonal: V' Q V = I, V' S V = diag(e). Component by component, where e < 1, the observation is V'x +
+    noise = (V's - e V'q) / (1 - e), its noise of variance e / (1 - e). Rows are multiplied by sqrt(1 - e), so that no
+    noise is infinite: its variance is then e.
 
     Args:
         later: N(s, S), what is known with later data.

@@ -165,8 +165,8 @@ class LimitedFilter(AbstractSizedFilter):
     def _condition_with_log_probability(self, state: PyTree) -> tuple[jax.Array, PyTree]:
         """Return the log probability that the plant's state lies within the limits, and the filter's state given that.
 
-        Limits are known bounds, such as a level that is not negative; after each correction the estimate is cut to
-        them. `state` is one of four: one that holds another filter's state, particles, a Gaussian, or a mixture.
+        Limits are known bounds of the plant's states, such as a level that is not negative; estimates are conditioned
+        on them. `state` is one of four: one that holds another filter's state, particles, a Gaussian, or a mixture.
         """
         # States that hold another one, of a filter of sensor inputs or of a gate, and particles.
         if isinstance(state, StateUnderInputs):

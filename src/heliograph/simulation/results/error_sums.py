@@ -281,8 +281,8 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
         raise fail("node and filter", f"one of {known}", show_value((node, name)))
     estimate = record.estimates[node][name]
     # Sums over runs of errors' products, of normalised squares and of stated covariances, in BATCHES batches for
-    # standard errors: run r belongs to batch r mod BATCHES. They have the form that a simulation with this one estimate,
-    # a fused one, would give.
+    # standard errors: run r belongs to batch r mod BATCHES. Their form is that of a simulation with this one estimate,
+    # a fused one.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
     step: OfStep = over_runs(partial(_reduce_run, attitude=estimate.attitude), *arrays)
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))
