@@ -153,7 +153,13 @@ def _check_options(
 ) -> None:
     """Check that the options fit together and that files can be written.
 
-    `wanted`: the options that are given of --report, --smooth, --forecast and --predicted.
+    Args:
+        measurements: the file or store that is read.
+        out: file or store for the estimates; None if they are not stored.
+        report: folder for a report; None without one.
+        lag: estimates given what came up to this much later are stored too; at most the window. None without them.
+        options: how measured data are read; its window is how late a message may be.
+        wanted: the options that are given of --report, --smooth, --forecast and --predicted.
     """
     from heliograph.numerics.check import fail, scalar
 

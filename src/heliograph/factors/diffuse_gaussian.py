@@ -219,7 +219,7 @@ def _decorrelate_measurement(
     measured without a noise: N^-1 would spread derivatives that are as large as a noise is small.
 
     Args:
-        x: the state, about its mean: a Gaussian with infinite variances of what is not known yet (`infinite`).
+        x: the state: a Gaussian whose variances `infinite` stand for what is not known yet.
         matrix: H (m, n).
         innovation: e (m,), 0 of what is missing.
         noise: N (m, m), unit lower triangular, and its weights r (m,).

@@ -233,7 +233,7 @@ class Plant(AbstractPlant):
         attitude: Sequence[str] = (),
         limits: StateLimitsLike = (),
     ):
-        """Check and hold x+ = f(x, u) + w: f, the laws of w and x_0, names, angles, attitudes and limits."""
+        """Check and hold x+ = f(x, u) + w: f = `transition`, laws of w and x_0, names, angles, attitudes, limits."""
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _read_initial_law(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]

@@ -146,10 +146,10 @@ Gains = dict[str, Float[np.ndarray, "slots n _"]]
 def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     """Return the relays' gains with which the best linear receiver has a small steady error, averaged over the slots.
 
-    A schedule of slots says who sends to whom; its slots are used in turn, one each step. A relay sends a linear
-    estimate of the state, so its estimator's gains decide what it sends: they are what is free. They are found by one
-    descent through the fixed point of all second moments. The design's `present` error, to compare with, is that of
-    gains with which each relay minimises the error of its own estimate.
+    A schedule of slots says who sends to whom; its slots are used in turn, one each step. A relay sends C s, with s
+    its own linear estimate of the state, so the gains of its estimator decide what it sends: they are what is free.
+    They are found by one descent through the fixed point of all second moments. The design's `present` error, to
+    compare with, is that of gains with which each relay minimises the error of its own estimate.
 
     Args:
         problem: the design problem; its budget's total is the power that all relays together may send in each slot.

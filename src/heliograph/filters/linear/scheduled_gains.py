@@ -279,8 +279,8 @@ def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, roundin
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds of second moments at each step, of the next state (time, N) and of the measurement (time, m).
 
-    A filter with gains computed in advance adds the rounding of its sums to its noises. The rounding of a sum A x + a
-    is proportional to the size of its terms. So the bound for x+ = A x + a + w is (|A| root + |a|)^2, with root_i =
+    The rounding of a filter's sums is added to its noises, in proportion to these bounds. The rounding of A x + a is
+    proportional to the size of its terms. So the bound for x+ = A x + a + w is (|A| root + |a|)^2, with root_i =
     sqrt(E[x_i^2]) before any data, and alike for z = C x + c + v with the next x. An unstable system's moments grow
     without limit; they are kept so small that their squares are finite.
     """

@@ -253,8 +253,8 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         channel: a channel that delivers numbers after z; it may vary over time.
         make: builds a filter from a plant, a sensor and a link of known law.
 
-    Such numbers may be a gain or a noise variance, measured by the receiver. At each message the filter corrects with
-    the link's law given its numbers.
+    Such numbers, reported with each message, may be its gain or its noise variance. At each message the filter corrects
+    with the link's law given its numbers.
 
     Claim (what the covariance is said to be): that of the filter for typical numbers, the ones assumed where none came;
     "nominal" if the numbers depend on the state, or if they leave something random that is not drawn anew with each

@@ -14,7 +14,7 @@ def run_summary(health: Health) -> dict[str, Json]:
     """Return all numbers of the report of a run by name, as summary.json holds them.
 
     Numbers of filters and outputs are by node and filter, those of links by node and received component. A link's
-    numbers are of its losses; overloads are of quantizers whose range was exceeded.
+    numbers are of its losses. Overloads are the probabilities that a signal is beyond the range of its codewords.
 
     Args:
         health: what `examine` returned: tests of a run's filters, outputs and links, with their verdicts.

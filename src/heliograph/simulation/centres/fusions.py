@@ -159,9 +159,9 @@ class ReportFusion(Module):
         """Send the nodes' means as reports, and correct the centre's filter with those that arrive at step k.
 
         Args:
-            state: of reports in transit and of the centre's filter, before the step.
-            estimates: of the nodes' filters, for each stack of filters of one structure (filter, node, ...).
-            drawn: gains, offsets and delays of the uplinks at this step.
+            state: reports in transit and state of the centre's filter, before the step.
+            estimates: estimates of the nodes' filters, for each stack of filters of one structure (filter, node, ...).
+            drawn: gains, offsets and delays of the uplinks at this step: a report m arrives as gain m + offset.
             u: inputs of the plant over the step.
             k: number of the step.
 

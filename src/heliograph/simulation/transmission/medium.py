@@ -228,7 +228,7 @@ def _transmit(
     y, z, memory = _send_through_channel(node, link.memory, y, key, k)
     if node.trigger is None or link.sender is None:  # it always sends
         return LinkState(memory=memory, feed_back=link.feed_back, modes=modes), z
-    # A trigger sends only if y differs enough from a reference: the sender's own, or the filter's prediction r.
+    # The sender sends or not by how far y is from a reference: its own, or the filter's prediction r.
     sender = link.sender
     if node.trigger.reference == "prediction" and reference is not None:
         sender = sender._replace(reference=reference)
