@@ -118,7 +118,7 @@ class Network(Module):
         relays: "RelayNetwork | None" = None,
         common: "CommonReception | None" = None,
     ):
-        """Check that all parts fit, lower claims (what covariances are said to be) that are wrong here, and index all."""
+        """Check that all parts fit, lower claims (what covariances are said to be) that are wrong here, and index."""
         self.plant, self.relays, self.common = plant, relays, common
         # Nodes, and fusions between neighbours apart from those at a centre.
         self.nodes = {
