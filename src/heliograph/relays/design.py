@@ -352,9 +352,10 @@ def make_receiver_view(
     """Return the linear system of zeta = (x, e_1 ... e_relays), x the state and e_r relay r's error, over one step.
 
     Args:
-        step: the network: x+ = A x + w, sensor noise v, links' random gains, relay gains.
-        moments: covariance of x and all filters' errors before the step, the receiver's last. Random gains add noise.
-        gain: K of all filters as one block matrix, (filters n, received numbers R).
+        step: the network in this step: x+ = A x + w, the sensor's noise v, mean and spread of the links' random gains.
+        moments: covariance of (x, e_1 ... e_F) of all filters before the step, the receiver last; it decides how much
+            noise random gains add.
+        gain: K of all filters as one block matrix (filters n, R), over all R numbers that they receive.
     """
     n, r = step.transition.shape[-1], step.received[-1]
     maps, d = make_error_step_maps(step), moments.shape[0]

@@ -102,7 +102,7 @@ class AllFilters(Module):
         self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
         self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
         self.tests = make_fused_innovations(network, self.alike) if tests else {}
-        # Measurements are drawn by groups of nodes with one structure: the order of the nodes, and if nothing is lost.
+        # `order` brings the groups' measurements into the nodes' order; `complete`: nothing of a group is ever missing.
         self.order = find_measurement_order(network.groups, network.rows)
         self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
         self.n = len(network.states)

@@ -139,7 +139,7 @@ def _describe_system(
         motion, sensing, link = _find_models_of_step(plant, sensor, links, k)
         # E x+ = A E x + b, P+ = A P A' + Q; E(y - c) = C E x + shift, Cov y = C P C' + Cov v.
         mean, P = motion.matrix @ mean + motion.shift, motion.matrix @ P @ motion.matrix.T + motion.covariance
-        # `sensing.shift` = E v - c, so that the y of the code is E(y - c).
+        # `sensing.shift` includes -c, so that the y of the code is E(y - c); CPC = C P C'.
         y, CPC = sensing.matrix @ mean + sensing.shift, sensing.matrix @ P @ sensing.matrix.T
         signals.append((y, np.diag(CPC + sensing.covariance)))
         if link is not None:  # E[(y - c)(y - c)'], of the rounded signal that is sent

@@ -82,7 +82,6 @@ class RepeatWatch:
         reading before; None at the first one. In the result `found` is one more where a run has become too long with
         this reading.
         """
-        # One step for each component, in four cases: no reading, an equal one, another one, and a run now too long.
         m, before = len(values), before or FIRST
         # The fields of `Repeats`, as lists with an entry for each component; empty before the first reading. newest:
         # last value; lengths: of its run; steps: least difference of two successive readings that differ; readings and
@@ -90,6 +89,7 @@ class RepeatWatch:
         newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
         least_steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
         equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
+        # For each component: the reading continues its run or begins a new one; then whether the run is now too long.
         for i, value in enumerate(values):
             if value != value:  # NaN: nothing arrived, and the run goes on
                 continue
