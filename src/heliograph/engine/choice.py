@@ -95,7 +95,8 @@ def choose_code(
 ) -> EngineChoice:
     """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
 
-    SETTING is the environment variable that forces an engine ("native" or "xla"); "" stands for none.
+    Native code is quicker for short functions, but does not take all operations of JAX; XLA, JAX's own compiler, does.
+    SETTING is the environment variable that forces one of these engines ("native" or "xla"); "" stands for none.
 
     Args:
         function: a function of the arrays of one run.

@@ -64,7 +64,8 @@ def find_amplitudes_by_formula(links: SummedLinks, total: float, caps: Vector) -
     are independent.
 
     Args:
-        links: rows B (of one signal: multiples b of one direction), D, T and N.
+        links: the gains as rows B (with one signal all rows are multiples b_i of one direction), D (links, links), the
+            diagonal of T (power of a link with amplitude 1), and N.
         total: largest power that all may send together.
         caps: largest size of each amplitude.
     """

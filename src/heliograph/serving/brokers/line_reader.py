@@ -140,7 +140,7 @@ class LineReader:
 
         A message in another form than heliograph's own, or with a topic, goes to the translator, which knows the
         senders' forms. One in our own form is read as a message to a service if it is one, else as an event in a file.
-        A payload is a message, or why there is none.
+        A payload is a message, or the reason why it cannot be read.
 
         Args:
             message: the message, or why it could not be read.

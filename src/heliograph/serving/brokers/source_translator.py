@@ -142,7 +142,7 @@ class Translator:
 
         Args:
             topic: topic from which it came.
-            payload: text or bytes, as the broker gave it.
+            payload: JSON as the broker gave it, bytes or a text; or its content, if that was read already.
             arrival: when it came, None for now.
             stored: whether the broker had kept it from earlier. Then its arrival does not date it, and a reading
                 without a time of its own is left out, and counted.

@@ -161,7 +161,7 @@ def propagate_errors_over_time(
     """
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-    # Before any data all nodes have the same error, x_0 - E x_0.
+    # Before any data all nodes have the same error, x_0 - E x_0: every block of the joint covariance J is Cov x_0.
     covariance, moments = start.covariance, start.plant
     _, initial_covariance = start.plant
     count, n = start.mean.shape
@@ -173,7 +173,7 @@ def propagate_errors_over_time(
             step = to_numpy(
                 _compute_step_when_all_is_measured(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k))
             )
-        joint = _propagate_joint(mesh, joint, step, arrived)
+        joint = _propagate_joint(mesh, joint, step, arrived)  # J+ = M J M' + F Q F' + sum_l W_l S_l W_l'
         covariance, moments = step.gains.covariance, step.plant
         diagonal_blocks = np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy()
         # Nodes that follow the joint covariance claim their part of it, the others the covariance of their rule.
@@ -235,7 +235,7 @@ def best_possible(
     Args:
         network: the network.
         fusion: name of its fusion between neighbours.
-        arrived: as for `mesh_errors`.
+        arrived: which messages arrive (horizon, node, rounds, degree), or a number of steps at which all arrive.
         inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Raises:
