@@ -172,8 +172,8 @@ def _find_usable_measurements(
     """Return for each pattern of what arrives the sums of received numbers whose gain on a subspace of x is known.
 
     The plant is x+ = A x + w. The pattern of arriving components (a kind of losses) is all that the receiver sees of
-    the channel's mode. Gains that differ between modes with one pattern are unknown to it, and no filter can rely on
-    them; sums D z whose gain does not differ remain usable.
+    the channel's mode. Gains that differ between modes with one pattern are unknown to it; used are sums D z of the
+    received numbers z whose gain does not differ.
 
     Args:
         a: A (n, n).

@@ -73,7 +73,7 @@ def differentiate_twice(function: Function, at: jax.Array, direction: jax.Array)
 
 
 def find_quadratic_image(function: Function, x: Gaussian) -> Image:
-    """Return the image f(x) of a Gaussian x by a function of degree 2, with derivatives that JAX can differentiate.
+    """Return the image f(x) of a Gaussian x by a function of degree 2, by formulas that have accurate derivatives.
 
     With x = m + L xi, Var xi_i = d_i, f(x) = f(m) + sum_i s_i xi_i + sum_i q_i xi_i^2 + sum_i<j c_ij xi_i xi_j. The
     image has the mean E f(x), the columns s_i with weights d_i, and the columns of the curvature: q_i d_i of the weight

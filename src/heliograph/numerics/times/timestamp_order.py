@@ -81,7 +81,7 @@ def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, 
       of this century.
 
     Args:
-        time: the stamps (events,), whole numbers.
+        time: the stamps (events,).
         year: a year in the unit of the stamps (default: in nanoseconds).
     """
     # Stretches of messages, as arrays of their indices, between which the stamp jumps by more than a year.
