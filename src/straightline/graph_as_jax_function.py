@@ -134,9 +134,11 @@ class _JaxEvaluation:
     def _evaluate_loop(self, loop: Loop) -> None:
         """Evaluate a loop by JAX's loop, and note its results.
 
-        The carry of JAX's loop is a pair: numbers, one for each parameter whose place is in `carried`, and arrays, one
-        for each buffer that the body fills (`filled`). Values that are computed in a turn hold in that turn alone:
-        `self.values` is the outer one again behind the loop.
+        A graph of scalar operations is evaluated by JAX, so that XLA can compile it. `loop` has nodes for each carried
+        number: its `initial` value, its `parameters` in the body, its `following` value at a turn's end, and its
+        `results` after the loop. The carry of JAX's loop is a pair: numbers, one for each parameter whose index is in
+        `carried` (the others are not needed), and arrays, one for each buffer that the body fills (`filled`). Values
+        computed in a turn hold in that turn alone: after the loop `self.values` is the outer dictionary again.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
         carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # their places in loop.parameters

@@ -114,6 +114,7 @@ def compile_scan(
         """Return the last state and the outputs of all rows."""
         return jax.lax.scan(lambda state, row: step(fixed, state, row), begin(fixed), rows)
 
+    # Rows of any number, as placeholders of arrays, with which JAX traces the scan; native code follows from the trace.
     rows = jax.tree.map(lambda x: make_placeholder((ANY_LENGTH, *np.shape(x)), _find_dtype(x)), row)
     program = lower_traced(*trace_function(scan, fixed, rows), most or 2 * LONGEST)
     _check_outputs(program.outputs)

@@ -57,9 +57,9 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
     """Return the campaign that the text of a TOML file describes.
 
     Args:
-        text: of the file.
+        text: the text of the file: network, horizon, runs, settings, and optional keys (`load_campaign` has all).
         source: Python source of the network's module.
-        path: of the file, named in errors.
+        path: path of the file, named in errors.
 
     Raises:
         ValueError: as `load_campaign`, except for settings that the function does not take.

@@ -105,8 +105,18 @@ def _compute_missing(
 ) -> CampaignRun:
     """Compute the chunks that the store lacks, and write failures and summary; return what was done.
 
-    Arguments are those of `run_campaign`. Nobody else works in the folder `out`.
+    A campaign is many simulations of a network under several settings; its runs are computed in chunks, and each chunk
+    is stored when it is done. So an interrupted campaign goes on from there. Nobody else works in the folder `out`.
+
+    Args:
+        campaign: network, settings, number of runs and steps.
+        out: folder with the store of results, the summary and the failures.
+        workers: number of worker processes; None for one for each CPU, 0 to compute in this process.
+        scheduler: address of a Dask scheduler, used instead of worker processes; None without one.
+        only: pairs (setting, chunk) to compute; None for all.
+        progress: called as progress(what, done, total).
     """
+    # What an interrupted call left behind is removed; `missing` are the jobs without a complete chunk.
     store = (out / STORE).absolute()
     remove_leftover_folders(store)
     check_only_results(out, f"{STORE}/zarr.json")
@@ -198,8 +208,8 @@ def _prepare_store(
         engine: does the jobs that describe a setting: build its network, and return its labels and claims.
         campaign: the campaign.
         store: path of the store.
-        settings: numbers of those of which chunks are to be computed.
-        progress: called after each description.
+        settings: numbers of the settings of which chunks are to be computed.
+        progress: called after each description, as progress(what, done, total).
     """
     is_new = not store.is_dir()
     if is_new:

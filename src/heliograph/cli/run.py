@@ -153,7 +153,13 @@ def _check_options(
 ) -> None:
     """Check that the options fit together and that files can be written.
 
-    `wanted`: the options that are given of --report, --smooth, --forecast and --predicted.
+    Args:
+        measurements: the file or store that is read.
+        out: file or store for the estimates; None if they are not stored.
+        report: folder for a report; None without one.
+        lag: estimates given what came up to this much later are stored too; at most the window. None without them.
+        options: how measured data are read; its window is how late a message may be.
+        wanted: the options that are given of --report, --smooth, --forecast and --predicted.
     """
     from heliograph.numerics.check import fail, scalar
 
@@ -197,12 +203,19 @@ def _describe_estimation_errors(record: "Record") -> list[str]:
 def _check_output_places(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None
 ) -> None:
-    """Check before the work starts that packages for these files are installed, and that they can be written."""
+    """Check before the work starts that packages for these files are installed, and that they can be written.
+
+    Args:
+        measurements: the file or store that is read; its ending decides which packages are needed.
+        out: the file or store for the estimates; None if they are not stored.
+        report: the folder for a report; None without a report.
+    """
     from heliograph.disk.atomic_files import FORMATS, check_writable
     from heliograph.files.logs.vehicle_log import PACKAGES
     from heliograph.numerics.process.optional_packages import check_installed
     from heliograph.report.results_folder import NEEDS
 
+    # Packages by the endings of files: of logs (PACKAGES), of ROS bags, of Parquet tables; a report needs NEEDS.
     endings = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
     needed = [package for ending in endings & PACKAGES.keys() for package in PACKAGES[ending]]
     if endings & BAGS:
@@ -210,6 +223,7 @@ def _check_output_places(
     if ".parquet" in endings:
         needed.append("pyarrow")
     check_installed([*needed, *(NEEDS if report is not None else ())])
+    # What is written: a table in a store or a file, and the folder of the report.
     if isinstance(out, StoreAddress):
         from heliograph.files.stores.store_tables import check_store
 

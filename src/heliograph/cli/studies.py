@@ -167,6 +167,10 @@ class OptionValue(str):
 def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
     """Collect values by name: of options that are set, and of each `name=value`.
 
+    Args:
+        changes: texts `name=value`, one for each --set of the command line; None without any.
+        **options: the command's own options by name, such as seed and runs; None for those that are not set.
+
     Raises:
         ValueError: a change without a name or `=`, an invalid seed or count, a name set twice.
     """

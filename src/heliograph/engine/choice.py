@@ -95,7 +95,8 @@ def choose_code(
 ) -> EngineChoice:
     """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
 
-    SETTING is the environment variable that forces an engine ("native" or "xla"); "" stands for none.
+    Native code is quicker for short functions, but does not take all operations of JAX; XLA, JAX's own compiler, does.
+    SETTING is the environment variable that forces one of these engines ("native" or "xla"); "" stands for none.
 
     Args:
         function: a function of the arrays of one run.
@@ -182,9 +183,10 @@ def map_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> P
 def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that is called now and then, once per structure and shapes of its arguments.
 
-    Native code computes it if it is short, else XLA as by `float64.compiled`; both in double precision, from numbers
-    and to NumPy arrays. Inside a trace it is the plain function; of arguments that are all traced it is traced once for
-    equal structures and shapes, so that a step alone and one in a loop over rows, however many, share a trace.
+    There are two compilers. Straightline's native code costs little per call, and computes the function if it is short;
+    JAX's XLA computes it otherwise. Both compute in double precision, and return NumPy arrays. Inside a trace of JAX
+    the function itself is called. If all its arguments are traced, it is traced once for equal structures and shapes,
+    so that a step alone and a loop over rows share one trace, which saves time.
     """
     by_xla = float64.compile_in_float64(function)
 
@@ -195,6 +197,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
         Native code takes known arguments and a function of at most SHORT operations. Where all arguments are traced,
         the function is traced too, once for each structure. `by_xla`, the function compiled by XLA, takes all else.
         """
+        # All arguments traced: the operations of one stored trace. Some of them traced, or keywords: XLA's function.
         leaves, structure = jax.tree.flatten(args)
         are_all_traced = bool(leaves) and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
         if are_all_traced and not kwargs:
@@ -202,6 +205,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
             return traced
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
+        # Numbers: native code, or XLA above SHORT operations. A fork of a process lacks JAX's threads: it is refused.
         float64.refuse_forked_process()
         arrays = jax.tree.map(float64.as_array, args)
         returned: R = compute_once(function, by_xla, arrays, most=SHORT)

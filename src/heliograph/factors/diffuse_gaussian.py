@@ -214,20 +214,22 @@ def _decorrelate_measurement(
 ) -> tuple[Diffuse, jax.Array, jax.Array]:
     """Return the state, rows (h, e) of scalar measurements e = h'x + v, and the variances (m,) of v, uncorrelated.
 
-    Where the program is differentiated, the noises become states of their own, measured without a noise: the inverse of
-    their factor N would spread derivatives that are as large as a noise is small.
+    A measurement e = H x + v with Cov v = N diag(r) N' becomes m scalar ones, to be used one after another: N^-1 e has
+    uncorrelated noises of variances r. Where the program is differentiated, the noises become states of their own,
+    measured without a noise: N^-1 would spread derivatives that are as large as a noise is small.
 
     Args:
-        x: the state.
+        x: the state: a Gaussian whose variances `infinite` stand for what is not known yet.
         matrix: H (m, n).
         innovation: e (m,), 0 of what is missing.
-        noise: N (m, m), unit lower triangular, and weights.
+        noise: N (m, m), unit lower triangular, and its weights r (m,).
         present: which components arrived (m,); the others get rows of zeros and the noise 1.
     """
     variances = jnp.where(present, noise.weights, 1.0)
     rows = jnp.where(present[:, None], jnp.concatenate([matrix, innovation[:, None]], axis=1), 0.0)
     if not writes_for_derivatives():
         return x, decorrelate(noise.matrix, rows), variances
+    # The state (x, v): its factor is blockdiag(L, N), its variances are those of x and r. Rows are (H, I, e).
     n, m = len(x.mean), len(innovation)
     root = jnp.zeros((n + m, n + m)).at[:n, :n].set(x.root).at[n:, n:].set(noise.matrix)
     none, of_noise = jnp.zeros(m), jnp.where(present[:, None], jnp.eye(m), 0.0)

@@ -235,10 +235,10 @@ def condition_on_observation(
 def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array:
     """Return Kalman's gain K (n, m) of a measurement z = E z + slopes xi + v of x = m + L xi.
 
-    `noise` has the factors N diag(r) N' of Cov v, N unit lower triangular. The components of N^-1 z have uncorrelated
-    noises, and are measured one after another. Their innovations e, each given those before it, satisfy
-    N^-1 (z - E z) = V e with a unit lower triangular V. If component j moves the mean by k_j e_j, then
-    K (z - E z) = [k_1 ... k_m] e, so K = [k_1 ... k_m] V^-1 N^-1.
+    `x` has the mean m, the factor L (`root`) and the variances d of xi; `slopes` is (m, n). `noise` has the factors
+    N diag(r) N' of Cov v, N unit lower triangular. The components of N^-1 z have uncorrelated noises, and are measured
+    one after another. Their innovations e, each given those before it, satisfy N^-1 (z - E z) = V e with a unit lower
+    triangular V. If component j moves the mean by k_j e_j, K (z - E z) = [k_1 ... k_m] e: K = [k_1 ... k_m] V^-1 N^-1.
     """
     n, rows = len(x.mean), decorrelate(noise.matrix, slopes)
     weights = jnp.asarray(noise.weights)
@@ -340,9 +340,10 @@ class BackwardGain(NamedTuple):
 def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
     """Return the regression of a state x on the next one, x+, by measuring x+ part by part.
 
-    x = m + L_x xi and x+ = ahead + slopes xi + N omega have together the factors [[L_x, 0], [slopes, N]], with the
-    variances d of xi and r of omega. Each part of x+ is measured without a noise but omega: its innovation, given those
-    before it, is a part of e, its gain a column of K for x and of L for the parts of x+ to come.
+    A smoother needs x = m + K e + a noise, e the innovations of x+. x = m + L_x xi and x+ = ahead + slopes xi + N omega
+    have together the factors [[L_x, 0], [slopes, N]]; xi and omega are uncorrelated, of variances d and r. Each part
+    (component) of x+ is measured, with no noise but omega. Its innovation given the parts before it is e_i, its gain
+    column i of K (rows of x) and of L (rows of the later parts of x+): x+ = ahead + L e.
 
     Args:
         x: the state's Gaussian, with L_x (n, n) and d (n,).
@@ -351,9 +352,10 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         noise: N (n, n), unit lower triangular, as `triangularise` makes it, and r (n,).
 
     Returns:
-        The law of x given x+ (its mean m), K, the mean of x+, and L.
+        The law of x given x+ (its mean m), K (n, n), the mean of x+, and the entries of L below its diagonal.
     """
     n, root = len(x.mean), jnp.concatenate([x.root, slopes])
+    # Var x+_i = sum_j slopes_ij^2 d_j + sum_j N_ij^2 r_j, and the variance up to which slopes of x+ are rounding.
     variances_of_next = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
     rounding_of_next = rounding_of_products(n, variances_of_next)
     omega_rows, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
@@ -364,7 +366,7 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         """Measure part i of x+: return the rows and variances after it, and its gain."""
         # N is unit lower triangular, so part i is the first that omega_i is in, and the parts before it have determined
         # omega_0 ... omega_i-1. So it takes one more column than xi has: that of omega_i, with the slope 1 in part i.
-        f, column, r = root[n + i], omega_rows[:, i], weights[i]
+        f, column, r = root[n + i], omega_rows[:, i], weights[i]  # Var(part i) = f diag(d) f' + r
         product = d * f
         power = f * product
         # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.

@@ -113,8 +113,7 @@ class NodeEvents:
     def describe_doubtful_count(self, name: str) -> list[str]:
         """Return a line if a count begins at 0 again sooner than its bits say, and one if it stands still.
 
-        It begins sooner where it fell at least three times, each time from the largest number, which is 2^b - 1.
-        `name`: of the node, with which each line begins.
+        It begins sooner where it fell at least three times, each time from 2^b - 1. `name` of the node begins a line.
         """
         if not self.period or not len(self.time):
             return []
@@ -209,13 +208,14 @@ def judge_events(
 ) -> Int[np.ndarray, " events"]:
     """Return the number of the verdict on each event, among `VERDICTS`: the first that holds.
 
-    An event is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was
-    final before it came: at each arrival the rows older than that by more than the window become final. Of events of
-    one node, count and time the first stays. Where rows are joint, so does the first of a node's values at a time.
+    An event is a node's message, with time, arrival and running count; all events of a time, or one alone, make a row.
+    It is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was final
+    before it came: at each arrival the rows older than that by more than the window become final. Of events of one
+    node, count and time the first is used; if rows are joint, so are the first values of a node at a time.
 
     Args:
         events: the events, in order of arrival.
-        values: the values of the event with a number.
+        values: a function that returns the values of an event from its number in that order.
         joint: whether all events of one time are one row.
         window: how late an event may be, in the unit of the times.
         ahead: how much later than its arrival the time of an event may be.

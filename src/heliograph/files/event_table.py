@@ -315,7 +315,7 @@ class EventTable:
         return self.rows(window, ahead)[0]
 
     def rows(self, window: float = np.inf, ahead: float = AHEAD) -> tuple[Recording, Bool[np.ndarray, " rows"]]:
-        """Return the recording, and whether each of its rows is of a message of a node: the others are of inputs.
+        """Return the recording, and whether each of its rows has a message of a node: other rows have inputs alone.
 
         Args:
             window: how late an event may be, in seconds or steps (default any).

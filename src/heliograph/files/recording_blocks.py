@@ -106,7 +106,8 @@ class RecordingBlocks:
     def _yield_cells(self, parts: Iterable[TableRows]) -> Iterator[RecordingRows]:
         """Yield the rows of each part of a table that can be read, as they came; of the first parts at least two rows.
 
-        A single row is held until the next comes where the times of rows ahead of it follow from both.
+        A large table is read part by part. Rows at its beginning may be unreadable; where each row is a step, their
+        times follow from the first two readable rows. Then a single first row is held until the next one comes.
         """
         held: RecordingRows | None = None  # while nothing was yielded
         is_first = True
@@ -119,6 +120,7 @@ class RecordingBlocks:
             if held is not None and held.time.dtype != cells.time.dtype:  # which the order of blocks refuses
                 yield held
                 held, is_first = None, False
+            # The held row goes before these; if they are still too few, both are held.
             cells = cells if held is None else join_recording_rows([held, cells])
             held = None
             if is_first and lacks_second_row(cells, self._reader.network, str(self._path)):

@@ -36,9 +36,14 @@ TIME = "time"
 def convert_to_columns(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
     """Return columns by name, missing values NaN or NaT: numbers as float64, dates as datetime64[ns] in UTC.
 
-    Whole numbers that float64 cannot tell apart stay int64, missing ones MISSING. Columns that are not among `only` are
-    left out unread.
+    Whole numbers that float64 cannot tell apart stay int64, missing ones MISSING.
+
+    Args:
+        table: path of a CSV or Parquet file, a DataFrame (of pandas, polars or pyarrow), or columns by name.
+        name: name of a table without a file, for errors.
+        only: names of the columns to read; others are left out unread. None for all.
     """
+    # A file's columns are read; those of other tables are collected by name.
     if isinstance(table, str | os.PathLike):
         return read_rows(Path(table), only, strict=True).columns
     if isinstance(table, Mapping):
@@ -56,6 +61,7 @@ def convert_to_columns(table: object, name: str = "table", only: Container[str] 
     for column in named:
         if not isinstance(column, str):
             raise fail(f"{name}, columns", "names that are text", show_value(column))
+    # Wanted columns as arrays, all of one length.
     kept = {column: values for column, values in named.items() if only is None or column in only}
     _check_indexes(name, kept)
     columns = {column: _convert_column(values, f"{name}, column {column!r}") for column, values in kept.items()}

@@ -18,14 +18,16 @@ from heliograph.random_affine.memories_of_channels import memories
 def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: bool) -> AbstractFilter:
     """Return the filter whose innovations give the likelihood.
 
-    It is `imm_filter` if plant or sensor has modes, and `kalman_filter` if the start is unknown. Else `linear` decides.
+    The likelihood of a model is the product of p(z_k | z_0 ... z_k-1), which the filter's innovations give. The filter
+    is `imm_filter` if plant or sensor has modes (a Markov chain), and `kalman_filter` if the initial state is unknown,
+    which has no channel. Else `linear` decides.
 
     Args:
         plant: the plant.
         sensor: its sensor.
         channel: from the sensor to the filter.
-        linear: True for `linear_filter`, which uses the state's moments before any data; False for `cubature_filter`,
-            which uses its moments given the data.
+        linear: True for `linear_filter`, whose covariances with random gains use the state's moments before any data;
+            False for `cubature_filter`, which uses its moments given the data.
 
     Raises:
         ValueError: parts that do not fit; a channel beside an unknown start.

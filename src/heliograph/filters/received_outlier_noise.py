@@ -125,10 +125,15 @@ def describe_outlier_noise(
 ) -> ReceivedNoise:
     """Return the noise that may hold outliers, as it arrives in m received numbers.
 
+    The channel maps the sensor's y to z = G y + n with a random gain G. Each received number may carry the noise of one
+    output, g times a mixture of Gaussians with g = G_ia, and that of the last hop. A filter that reweighs outliers
+    needs their branches: the Gaussians of the mixtures.
+
     Args:
         sensed: noise of the sensor's p outputs.
-        late: noise of the last hop; None where that has no outliers.
-        plain: moments of the channel without the noise of the last hop.
+        late: noise of the channel's last hop; None where that has no outliers.
+        plain: the channel's first two moments without the noise of the last hop: E[G] (`mean_gain`, (m, p)) and
+            E[H_ia H_jb] for H = (G, n) (`power.center[i, j, a, b]`).
         independent: whether correlated components are refused.
 
     Raises:
@@ -139,7 +144,7 @@ def describe_outlier_noise(
     rows, xp = np.arange(m), library(plain.power.center, sensed, late)
     squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
     # Moments of the noise without its outliers, as it arrives: Cov_ij = sum_ab E[G_ia G_jb] R_ab, with the gain G.
-    base = sensed.without_outliers()
+    base = sensed.without_outliers()  # R = base.covariance
     covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
     center = plain.mean_gain @ base.mean
     # Index of the sensor's output whose noise each received number carries, (m,).
@@ -148,7 +153,7 @@ def describe_outlier_noise(
         last = late.without_outliers()
         covariance, center = covariance + last.covariance, center + last.mean
     _check_weighable(covariance, independent)
-    # Branches of the sensor's noise, and their pairs with those of the last hop's.
+    # Gaussian branches of the sensor's noise (m, branches); with a late noise one for each pair of a branch of each.
     log_share, mean, variance = (values[source] for values in sensed.branches())
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean

@@ -132,8 +132,8 @@ def scan_with_last_state(
         filter: the filter.
         z: measurements, NaN for what did not arrive.
         u: inputs.
-        output: what is kept of a row, of its state after the row, its innovation and the row's number k.
-        state: before the first row; by default that before any data.
+        output: a function that returns what is kept of a row, from the state after it, its innovation and its number k.
+        state: the filter's state before the first row; by default that before any data.
         begin: number of the first row.
     """
 

@@ -224,11 +224,12 @@ def _complete_inputs(
     """Return the inputs of the rows ahead but dt, ([plants,] count, others), and whether they were given or held.
 
     Args:
-        origin: has the inputs of the last row; `several` where it is of several plants.
-        names: of all inputs.
-        others: names of those but dt, the length of a step.
-        inputs: an array (count, others), or one for each plant; "held" for those of the last row; None for none.
-        count: number of rows.
+        origin: where the forecast begins: it has the inputs of the last row ([plants,] inputs); `several` is whether it
+            is of several plants.
+        names: names of all inputs.
+        others: names of the inputs other than dt, the length of a step.
+        inputs: an array (count, others), or one for each plant; "held" to repeat the last row's; None for none.
+        count: number of rows ahead.
     """
     plants = (len(origin.inputs),) if origin.several else ()  # leading axis of several plants
     if isinstance(inputs, str) and inputs != "held":

@@ -67,30 +67,35 @@ def make_prediction(
 ) -> Prediction:
     """Return the prediction of a mixture of K Gaussians at each horizon, its angles between -pi and pi.
 
+    It has the mean and covariance of all m numbers together, and of each number alone its law: a mixture of Gaussians,
+    given by weights, means and variances of its parts.
+
     Args:
         moments: weights (..., horizons, K), means (..., horizons, K, m) and covariances (..., horizons, K, m, m).
-        names: of the m numbers.
-        claim: what the covariance is.
-        angles: indices of angles among them.
-        limits: index, lowest and highest value of those that have some, to which their laws are cut.
+            `laws` has the laws of the single numbers where they are not the same mixture, else it is None.
+        names: names of the m predicted numbers.
+        claim: what the covariance is said to be (exact, upper bound, nominal); "none" if it says nothing.
+        angles: indices of the numbers that are angles.
+        limits: index, lowest and highest value of each number that has limits; its law is cut to them.
     """
     weights, means, covariances = map(np.asarray, moments[:3])
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
     means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
-    # First two moments of the mixture: within its parts, and between their means.
+    # Moments of the mixture: mean = sum_k w_k m_k, covariance = sum_k w_k (P_k + (m_k - mean) (m_k - mean)').
     mean = np.einsum("...k,...km->...m", weights, means)
     apart = means - mean[..., None, :]
     within = np.einsum("...k,...kij->...ij", weights, covariances)
     covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
     if claim == "none":
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
-    # The law of each number by itself: of these parts, or one of its own; without end where there is no variance.
+    # The law of each number by itself: of these parts, or that in `laws`, whose variances count where one is known.
     law_weights, law_means = np.broadcast_to(weights[..., None], means.shape), means
     if moments.laws is not None:
         law_weights, law_means, law_variances = map(np.asarray, moments.laws)
         law_means = wrap_near(law_means, mean[..., None, :], angles)
         known = np.diagonal(covariance, axis1=-2, axis2=-1)[..., None, :]
         variances = np.where(np.isfinite(known), np.maximum(law_variances, 0.0), known)
+    # Angles of the mean come to -pi ... pi, and the parts' means move by the same whole turns.
     wrapped = wrap_angles(mean, angles)
     whole_turns = (wrapped - mean)[..., None, :]
     ends = np.tile([-np.inf, np.inf], (len(names), 1))

@@ -47,6 +47,7 @@ def predict_rows(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
+    # The predictor knows the filter's plant, sensor and channel; without a sensor received numbers get plain names.
     predictor = make_multistep_predictor(filter)
     sensor = first(predictor.sensor)
     names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)

@@ -137,7 +137,8 @@ def record_residuals(
         inputs: (steps, inputs), as they were given to `hg.run`; by default a plant without inputs is assumed.
 
     Returns:
-        By node and filter, of those that claim a covariance of what arrives.
+        By node and filter, for filters that state a covariance of what arrives: residuals (z - E z) / deviation
+        (steps, received), and tests whether they are uncorrelated, normal and of constant variance.
 
     Raises:
         ValueError: a record of a file or a simulation, which does not know its filters; inputs of another shape.
@@ -160,7 +161,8 @@ def record_residuals(
 def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: int) -> Residuals | None:
     """Return the standardised residuals e = (z - E z) / deviation of all rows, and tests of each received number.
 
-    Return None if the filter predicts no received numbers, or claims no covariance of them.
+    If model and filter are right, these are independent, normal and of variance 1; the tests ask if they are. Return
+    None if the filter predicts no received numbers, or states no covariance of them.
 
     Args:
         predicted: the forecast one step ahead whose horizons are the rows.
@@ -171,7 +173,7 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
     prediction = predicted.received
     if prediction is None or prediction.claim == "none":
         return None
-    # A deviation is infinite before the first measurement if nothing is known of the initial state.
+    # e; a deviation is infinite before the first measurement if nothing is known of the initial state.
     deviation = np.where(np.isfinite(prediction.deviation), prediction.deviation, np.nan)
     values = (wrap_near(rows, prediction.mean, angles) - prediction.mean) / deviation
     by_number = list(values.T)  # residuals e (steps,) of each received number

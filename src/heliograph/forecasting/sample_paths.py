@@ -181,7 +181,8 @@ def _draw_initial_states(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of Gaussians.
 
-    Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none.
+    Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none. `target` has the
+    filter (`predictor`) and its last state.
 
     Raises:
         ValueError: a filter that claims no covariance, a state of which not all is known.

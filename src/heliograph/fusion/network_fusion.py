@@ -73,8 +73,9 @@ class Fusion(Module):
     ):
         """Check and store the rule, what is fused (the filter of this name), and how estimates are exchanged.
 
-        Without `neighbours` the fusion is at a centre, to which uplinks lead. With them messages go over the `link`
-        between two nodes, in one or more `rounds` a step, perhaps only if an estimate has moved by more than `alpha`.
+        Without `neighbours` (names of the nodes that each node hears) the fusion is at a centre, to which uplinks lead.
+        With them messages go over the `link` between two nodes, in one or more `rounds` a step, perhaps only if an
+        estimate has moved by more than `alpha`. A `quantizer` rounds the estimates that are sent.
         """
         self.filter = instance("filter of a fusion", filter, str, "its name")
         self.rule = instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")

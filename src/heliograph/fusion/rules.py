@@ -101,7 +101,10 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     Args:
         rule: the fusion rule, such as `CovarianceIntersection()`.
         estimates: estimates of one state, with means (..., n) and covariances (..., n, n).
-        angles: which states are angles, by place, or the plant whose they are; none by default.
+        angles: indices of the states that are angles, or the plant, which knows them; none by default.
+
+    Returns:
+        The fused mean and covariance, with the claim (exact, upper bound or nominal) that the rule gives them.
 
     Raises:
         ValueError: no estimates, estimates of different state dimensions, angles that are no places in the state.

@@ -64,10 +64,11 @@ class SplitIntersection(AbstractIntersection):
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Return the fused mean and covariance of estimates whose errors are correlated in a known part only.
 
-        The known parts have the joint covariance P^a (`known`); what covariance estimate i has beyond P^a_ii, P^b_i, is
-        of a part whose correlation with others is unknown. P(w) = P^a + blockdiag(P^b_i / w_i) bounds the joint
-        covariance for all shares w, sum w = 1. Weights W and shares are found in turn: W by least squares for P(w),
-        then w_i in proportion to root(tr W_i P^b_i W_i'). The trace of W P(w) W' falls with each.
+        The known parts of the errors have the joint covariance P^a (`known`). P^b_i, the covariance of estimate i less
+        P^a_ii, belongs to a part of its error whose correlation with the others is unknown. P(w) = P^a +
+        blockdiag(P^b_i / w_i) bounds the joint covariance for all shares w, sum w = 1. Weights W and shares are found
+        in turn: W by least squares for P(w), then w_i in proportion to root(tr W_i P^b_i W_i'). The trace of W P(w) W'
+        falls with each.
 
         Args:
             means: of the estimates, (estimate, n).

@@ -75,9 +75,10 @@ def scale_steps(
 ) -> tuple[list[StepMatrices], ScaledCoordinates]:
     """Return the steps in coordinates in which all numbers are of order one, and the way back to the user's units.
 
-    Scales are the deviations of x, e and what is received, if disturbances were independent noises of unit variance and
-    the filter had these `gains`; None stands for gains near the best predictor's. These are the nominal gains of the
-    scaled steps, whose unknown is a correction of them.
+    A solver of matrix inequalities needs numbers of like size. Scales are the deviations of the state x, the error e
+    and what is received, if disturbances were independent noises of unit variance and the filter had these `gains`;
+    None stands for gains near the best predictor's. These are the nominal gains of the scaled steps, whose unknown is a
+    correction of them. `steps` has each step's matrices over eta, the vector of x, e, nonlinear parts and disturbances.
     """
     n, nothing_grows = system.states, system.growth.absent and system.output_growth.absent
     # Covariances of x_0 and e_0 from the initial weight.

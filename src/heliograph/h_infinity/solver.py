@@ -102,13 +102,16 @@ class StepProblem:
     ):
         """Compile the problem of one step: Phi < 0 with the known part of Phi as a parameter.
 
+        Phi is a quadratic form in the state x, the filter's error e, and the disturbances of the step: the step keeps
+        the H-infinity level where it is negative definite. It is linear in the unknowns: a linear matrix inequality.
+
         Args:
-            step: the step's matrices in scaled coordinates.
-            layout: where each unknown stands in the vector of unknowns.
+            step: matrices of the step's state, error and measurement over all variables, in scaled coordinates.
+            layout: which entries of the vector of unknowns are the weights P1 (of x) and P2 (of e), and the gain's.
             objective: which of the possible weights after the step is taken.
             solver: "clarabel" or "scs".
             sizes: of x and e, in whose units the objective measures.
-            start: the weight before the first step, which may couple x and e; None at all others.
+            start: the weight (2 n, 2 n) before the first step, which may couple x and e; None at all others.
         """
         cp = import_cvxpy()
         self.layout, self.solver = layout, solver
@@ -116,7 +119,8 @@ class StepProblem:
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
         forms, n = make_linear_forms(step, layout), layout.states
         constraints = self._list_constraints(cp, step, forms, start)
-        # Objectives on L, one problem after another; `reached`: the best value of the first, which the next keeps.
+        # One or two objectives on the weight's diagonal blocks, of x and of e, minimised one after another. `reached`
+        # is the best value of the first, which the second keeps.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
         goals = _list_objectives(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)

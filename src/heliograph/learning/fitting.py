@@ -157,7 +157,7 @@ class Fit:
             method: "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as with
                 random gains; "white" does not. "hessian" also believes the model. "profile" cuts the likelihood for
                 numbers with a coordinate of their own, others are as by "hessian". "bootstrap" draws blocks of scores.
-            form: "linear" or "conditional"; by default the form of the best solution.
+            form: "linear" (moments before data) or "conditional" (given them); by default that of the best solution.
             level: probability with which an interval holds the number, 0.95 by default.
 
         With every method, a number whose logarithm (or logit) is known to a factor of e or worse has its interval by

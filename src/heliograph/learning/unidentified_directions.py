@@ -125,17 +125,21 @@ def _make_confounded_numbers(
 ) -> ConfoundedNumbers:
     """Return a group of numbers v_i that the data do not separate, with the combinations that they do identify.
 
-    These are products prod_i v_i^e_i with whole exponents e, if the same ones are identified at all points; else sums
-    sum_i w_i v_i. `fix` in the result: how many of the numbers must be known so that the others become so.
+    A combination is identified if it does not change along the flat directions, in which the likelihood has no
+    information. These are products prod_i v_i^e_i with whole exponents e, if the same ones are identified at all points
+    at which the information was computed; else sums sum_i w_i v_i. `fix` in the result: how many of the numbers must be
+    known so that the others become so.
 
     Args:
-        group: the coordinates.
-        of_logs: flat directions (without information) of the logarithms of numbers at each point, in columns.
-        of_numbers: flat directions of the numbers at each point, in columns.
+        group: numbers of the coordinates that flat directions move together.
+        of_logs: for each point the flat directions of the numbers' logarithms, (numbers, directions), orthonormal.
+        of_numbers: the same of the numbers themselves.
     """
+    # As many numbers have to be known as there are flat directions within the group.
     places = list(group)
     unknown = int(max(np.linalg.matrix_rank(basis[places], tol=SAME) for basis in of_logs))
     no_rows = np.zeros((0, len(group)))
+    # Products: a sum of logarithms e' log v that no flat direction changes; used if its exponents are small and whole.
     powers = _find_identified_combinations([basis[places] for basis in of_logs])
     if len(powers):
         # In each row the least exponent becomes 1.
@@ -143,6 +147,7 @@ def _make_confounded_numbers(
         are_whole = np.all(np.abs(powers - np.round(powers)) < WHOLE)
         if are_whole and np.max(np.abs(powers)) <= LARGEST + WHOLE:
             return ConfoundedNumbers(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
+    # Otherwise sums w' v.
     sums = _find_identified_combinations([basis[places] for basis in of_numbers])
     return ConfoundedNumbers(group, exponents=no_rows, weights=sums, fix=unknown)
 

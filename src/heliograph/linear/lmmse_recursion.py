@@ -99,6 +99,8 @@ def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noise
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """Return gains of the best linear filter of x = W y from z_1 ... z_k: a Kalman recursion, since w and v are white.
 
+    The system is y+ = A y + a + w, z = C y+ + c + v with white, uncorrelated w and v. Gains and error covariances do
+    not depend on data, so they are computed once. They are found by roots, P = root root', which lose fewer digits.
     `claim` says what the covariance is: "exact" if the system's moments are the true ones. It is lowered to "nominal",
     with a warning, if rounding of the system's own covariances is a visible share of the error's.
 
@@ -112,6 +114,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """
     instance("system", system, LinearSystem, "a LinearSystem")
     root, gains_by_step = roots_of(system.covariance), list[Gains]()
+    # E[y_i^2] at the start, by whose size the noises' rounding is judged.
     second_moments = system.mean**2 + np.diag(system.covariance)
     noises = find_noise_roots(system.step(0), second_moments)
     rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
@@ -127,6 +130,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         matrices = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
             noises = find_noise_roots(matrices, second_moments)
+        # P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, P = P- - K S K', by roots; then the rounding that P carries.
         covariances = step_covariance_roots(root, matrices, noises)
         gains, root = _make_gains(system, matrices, covariances), covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)

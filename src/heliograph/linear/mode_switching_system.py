@@ -112,8 +112,9 @@ def _propagate_modes(
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
     """Return the transition F, Cov(w) and the next second moments of the stacked state (y~ 1{mode j})_j.
 
-    In a step to mode j, y~ = (y, 1) becomes H_j y~ with a random H_j. Given mode i before, the next mode is j with
-    probability Pi_ij. So
+    y is the state of a system that switches between modes of a Markov chain; stacked with the modes' indicators it
+    follows a linear system with white noise w. In a step to mode j, y~ = (y, 1) becomes H_j y~ with a random H_j. Given
+    mode i before, the next mode is j with probability Pi_ij. So
 
         F[j, i] = Pi_ij E H_j,   E_j+ = E H_j Y_j E H_j' + S_j,   Y_j = sum_i Pi_ij E_i,
         Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl S_j,

@@ -217,15 +217,19 @@ def gain_over_linear(
 ) -> GainOverLinear:
     """Return the error covariances of the best filters of several degrees, to compare with the linear one's.
 
-    They follow from the model alone: no data are simulated.
+    A filter of degree d is the best one that is a polynomial of this degree in each measurement. It is linear in the
+    monomials of the measurement and of the state, so its covariance follows from the model: no data are simulated.
 
     Args:
         plant: linear plant without inputs.
         sensor: linear sensor.
-        channel: its channel.
+        channel: from the sensor to the filter.
         horizon: number of steps, 100 unless given.
         degrees: degrees to compare with 1, each at least 2; (2, 3) unless given.
-        after: first step that counts, a third of the horizon unless given.
+        after: first step whose error counts in the comparison, a third of the horizon unless given.
+
+    Returns:
+        Error covariances (time, n, n) by degree, and the skewness that higher degrees exploit.
 
     Raises:
         ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
@@ -236,7 +240,8 @@ def gain_over_linear(
     first_step = horizon // 3 if after is None else after
     if not 0 <= first_step < horizon:
         raise fail("first step that counts", f"one from 0 to {horizon - 1}", first_step)
-    # Degree 1 to compare with, and degree 2 for the skewness.
+    # Lifted systems: the monomials of x as states, those of z as measurements. Degree 1 to compare with, 2 for the
+    # skewness, the largest standardised third moment of (x, z).
     systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in sorted({1, 2, *degrees})}
     n, m = len(first(plant).states), int(first(channel).outputs)
     covariances = {d: lmmse(system).gains.covariance for d, system in systems.items()}

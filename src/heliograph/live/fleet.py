@@ -242,14 +242,14 @@ class Fleet:
     ) -> Verdict:  # fmt: skip
         """Return the verdict on an event of a plant, and hold the event in its row if that is "used".
 
-        An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
-        the same; if the next event is dated before that gap, it is withdrawn (`ClockLeap` has the rule).
+        An event dated more than `options.leap` after all before it is used, but that clock may be wrong: no row becomes
+        final by it until another clock says the same, and events dated before the gap take it back (`ClockLeap`).
 
         Args:
-            plant: the plant.
-            event: the event.
+            plant: rows and newest time of the plant.
+            event: a message of a node: its time, arrival, running count and values.
             arrival_known: whether its arrival was given, by another clock than the sender's.
-            wall: time by the clock on the wall, if it is known.
+            wall: time by the receiver's own clock, if it is known.
             clock: name of the node by whose clock it is dated (None: its own).
         """
         if self.program.dt is None and event.time > LAST_STEP:  # beyond it one step cannot be told from the next

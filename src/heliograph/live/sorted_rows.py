@@ -137,15 +137,18 @@ class SortedRows:
     ) -> tuple[float, list[tuple[HeldRow, float]]]:
         """Return how many of a sender's messages were lost just before an event, by the running count; NaN if unknown.
 
-        An event that arrives late changes this number for the sender's next event: the row of this and its new number
+        A sender counts its messages, so a gap between the counts of two events tells how many were lost between them.
+        An event that arrives late changes this number for the sender's next event: that event's row and its new number
         are returned as well, in a list that is empty where there is no later event.
 
         Args:
             index: index of the event's row.
             event: the event.
-            column: column of the number in a row.
-            newest: greatest running count before the event, -1 if there was none.
+            column: column of a row in which the number of lost messages stands.
+            newest: count before the event where the rows show none (older rows are final and gone); -1 if there was
+                none.
         """
+        # (row, running count) of the sender's nearest events before and after this one; None where there is none.
         before = self._find_event_of(event.node_index, range(index - 1, -1, -1))
         after = self._find_event_of(event.node_index, range(index + 1, len(self.held)))
         count = event.sequence

@@ -111,8 +111,8 @@ class Stream:
     def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> JudgedEstimate:
         """Advance one step: `inputs` led to this `measurement`; return the posterior estimate.
 
-        It has the normalised innovation squared of the measurement, `nis`, how many numbers arrived, `received`, and of
-        a filter that weighs them the `weight` of each.
+        The estimate also has `nis`, the normalised innovation squared e' S^-1 e of the measurement, `received`, how
+        many numbers arrived, and of a filter that weighs measurements the `weight` of each.
 
         Args:
             measurement: received values, shape (received,); NaN where a component did not arrive.

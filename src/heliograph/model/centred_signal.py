@@ -76,7 +76,8 @@ def expected_signal(
 ) -> Float[np.ndarray, "horizon outputs"]:
     """Return E[y_k] at each step for a linear plant and sensor, or h along the noise-free path for nonlinear ones.
 
-    Of all references r that do not depend on data, E[y_k] leaves the least to send: E (y - r)^2 = Var y + (E y - r)^2.
+    y_k is the sensor's signal. A sender that transmits y - r needs the power E (y - r)^2 = Var y + (E y - r)^2. Among
+    all references r that do not depend on data, it is least for r = E[y_k].
 
     Args:
         plant: the plant.

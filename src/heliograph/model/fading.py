@@ -103,8 +103,8 @@ def autoregressive_fading(
 ) -> Faded:
     """Return a link z = g y + n whose gain drifts: Gaussian, stationary, with `correlation` from one step to the next.
 
-    `noise` is as for a hop, with `dimension` components where it is a variance. Links of one `name` drift together,
-    each with its own mean and deviation.
+    The gain is g_k = mean + deviation s_k with s_k+1 = correlation s_k + noise, Var s = 1. z, y and n have one or more
+    components, with the same g. Links of one `name` share s: they drift together, each with its own mean and deviation.
 
     Args:
         mean: mean of the gain.
@@ -215,10 +215,11 @@ def without_memory(channel: Channel) -> Channel:
 def memory_matters(channel: Channel) -> bool:
     """Return whether mean gains are correlated over time, so that a linear filter without memory claims too much.
 
-    A linear filter without memory assumes Cov(E[H_k | mode], E[H_l | mode]) = 0 for steps k and l. A sum of links may
-    have independent fadings: this is tested for each group of links that share a fading, on its joint modes. Memory in
-    only the variance of noise does not matter. A chain with uncertain transitions counts as one that matters, since
-    some possible law may be correlated.
+    A channel draws a random map H_k = (G_k, n_k) at each step, whose law depends on the mode of a Markov chain (a
+    fading). A linear filter without memory assumes Cov(E[H_k | mode], E[H_l | mode]) = 0 for steps k and l; where that
+    is wrong, its covariance is too small. A sum of links may have independent fadings: this is tested for each group of
+    links that share a fading, on its joint modes. Memory in only the variance of noise does not matter. A chain with
+    uncertain transitions counts as one that matters, since some possible law may be correlated.
 
     Args:
         channel: the channel of a node; it may vary over time.

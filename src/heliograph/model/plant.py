@@ -233,13 +233,13 @@ class Plant(AbstractPlant):
         attitude: Sequence[str] = (),
         limits: StateLimitsLike = (),
     ):
-        """Check and hold x+ = f(x, u) + w: f, the laws of w and x_0, names, angles, attitudes and limits."""
+        """Check and hold x+ = f(x, u) + w: f = `transition`, laws of w and x_0, names, angles, attitudes, limits."""
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _read_initial_law(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
-        u = np.zeros(len(self.inputs))
+        u = np.zeros(len(self.inputs))  # an example, with which the shapes of f and of the noise are checked
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
         if callable(noise):
             check_shape("process noise covariance(u)", noise, (u,), (n, n))

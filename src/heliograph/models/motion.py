@@ -80,7 +80,8 @@ def singer(
 ) -> LinearPlant:
     """Return Singer's plant of a vehicle that manoeuvres: the acceleration of each axis is a Gauss-Markov process.
 
-    da = -a / T dt + dW, of the same deviation at all times. States as of `constant_acceleration`.
+    The acceleration a follows da = -a / T dt + dW, with the same deviation at all times. Each axis has the states AXIS
+    (its position), "AXIS_velocity" and "AXIS_acceleration".
 
     Args:
         deviation: standard deviation of an acceleration.
@@ -96,6 +97,8 @@ def singer(
 
     Source: Singer, Estimating optimal tracking filter performance for manned maneuvering targets (1970).
     """
+    # d(position, velocity, a) = motion (position, velocity, a) dt + (0, 0, dW), rate = 1 / T. Var a = deviation^2
+    # stays the same if dW has the variance 2 deviation^2 / T in a unit of time.
     size, rate = _read_deviation_and_rate(deviation, time)
     motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
     start = library(size).asarray([WIDE, WIDE, size**2])

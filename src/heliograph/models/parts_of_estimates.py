@@ -135,6 +135,7 @@ def components(source: HasMeans | HasMean, weights: Weights) -> Components:
     named = table("weights", weights, "weights of states")
     if not named:
         raise fail("weights", "at least one combination", "none")
+    # Combination j has the weights w_j: the mean w_j' m, and the covariance w_i' P w_j of two of them.
     each = [_read_weights(name, value, mean) for name, value in named.items()]
     rows = np.stack(each, axis=-2)
     combined = np.einsum("...mn,...n->...m", rows, mean)

@@ -255,7 +255,8 @@ def _apply_to_first_order(
 ) -> list[Compensated]:
     """Return f of numbers in two parts, as numbers in two parts: f(high), and f'(high) low, to first order.
 
-    A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was lost.
+    A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was lost. Results
+    are so corrected for earlier roundings: f(high + low) is f(high) + f'(high) low, nearly.
 
     Args:
         function: f, of the high parts.

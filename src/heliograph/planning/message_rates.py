@@ -55,13 +55,14 @@ def simulate_rate(
 ) -> MessageRate:
     """Return the rate of messages and the error of `event_filter` behind a rule, by simulation: any plant, any link.
 
-    Means over the last three quarters of the steps, when the start is forgotten.
+    A sender transmits only when its rule asks for it, and `event_filter` uses its silence too. Results are means over
+    the last three quarters of the steps, when the start is forgotten.
 
     Args:
         plant: the plant.
         sensor: the sensor.
         channel: the link, with its losses.
-        trigger: the sender's rule.
+        trigger: the sender's rule of when to send.
         runs: number of simulated runs (default 64).
         horizon: steps of a run (default 400).
         seed: seed of the draws (default 0).

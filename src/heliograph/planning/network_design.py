@@ -146,15 +146,20 @@ Gains = dict[str, Float[np.ndarray, "slots n _"]]
 def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     """Return the relays' gains with which the best linear receiver has a small steady error, averaged over the slots.
 
-    The gains of a relay decide what it sends, so that they are what is free; `present` is where each relay minimises
-    its local error. The budget's total is what all relays together may send in each slot. Found by one descent through
-    the fixed point of all second moments.
+    A schedule of slots says who sends to whom; its slots are used in turn, one each step. A relay sends C s, with s
+    its own linear estimate of the state, so the gains of its estimator decide what it sends: they are what is free.
+    They are found by one descent through the fixed point of all second moments. The design's `present` error, to
+    compare with, is that of gains with which each relay minimises the error of its own estimate.
+
+    Args:
+        problem: the design problem; its budget's total is the power that all relays together may send in each slot.
+        relays: plant, sensor, relays, and the links of each slot.
 
     Raises:
         ValueError: another error than the steady trace, a target error, some relays free alone, limits of single ones.
     """
     power_limit = _find_relay_power_limits(problem)
-    # Error covariances (slots, n, n) with the designed gains, and with those that minimise each relay's own error.
+    # The receiver's error covariances (slots, n, n) with the designed gains, and with those of the best own estimates.
     gains = periodic_relays_for_best_receiver(relays, power_limit=power_limit)
     local_gains = periodic_local_error_design(relays).gains
     covariance, local_covariance = (periodic_behind_relays(relays, design) for design in (gains, local_gains))

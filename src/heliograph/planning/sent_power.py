@@ -220,8 +220,10 @@ def _compute_innovation_moments(
 def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
     """Return what a sensor and relays that filter send, at each step of the horizon or of their schedules.
 
-    A schedule is a relay's filter s+ = A s + K (z - B s - b) with gains K given for each step. The power is exact where
-    a relay expects the z that others would send if all of them had its own estimate s, as `relay_schedules` makes them.
+    A schedule is a relay's filter s+ = A s + K (z - B s - b), where s is its estimate of the state, z what it receives,
+    and gains K are given for each step. The power is exact if B s + b is the z that it would receive if all others had
+    its own estimate s, as `relay_schedules` makes them. `horizon` is a number of steps; None for all that schedules
+    cover. Powers are by name of the sender, (steps,).
 
     Raises:
         ValueError: a schedule of another kind.
@@ -290,7 +292,11 @@ def _average_draws(
 def _draw_output_squares(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, key: jax.Array
 ) -> dict[str, jax.Array]:
-    """Return (y, 1)(y, 1)' of what each sensor measures at each step of one drawn trajectory, (steps, m1, m1)."""
+    """Return (y, 1)(y, 1)' of what each sensor measures at each step of one drawn trajectory, (steps, m + 1, m + 1).
+
+    The mean over trajectories estimates the second moments of y, which give the power that is sent. `inputs` are those
+    of the plant, (steps, inputs); sensors have m outputs each.
+    """
     key_of_start, key_of_steps = jax.random.split(key)
 
     def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:

@@ -206,8 +206,9 @@ class ScaledProgramme:
     def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
         """Return the step d from z, the multipliers m of the active limits, and which limits are active.
 
-        Over the variables at no bound it solves H d - A' m = -g and A d = -room, with the gradient g of the value, the
-        slopes A of the active limits' room, and H the Hessian of the Lagrangian value - m' room. None where all
+        The value is minimised with room(z) >= 0 for each limit; a limit is active where its room is about 0. Over the
+        variables at no bound d solves H d - A' m = -g and A d = -room, with the gradient g of the value, the slopes A
+        of the active limits' room, and the Hessian H of the Lagrangian, value - m' room. None is returned where all
         variables are at bounds, or derivatives are not finite.
         """
         index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))  # variables at no bound
@@ -227,6 +228,7 @@ class ScaledProgramme:
         right = np.concatenate([-gradient, -room[active]])
         if not np.all(np.isfinite(system)):
             return None
+        # Least squares, since limits that agree make the system singular; then d in the variables' own units.
         solution = np.linalg.lstsq(system, right, rcond=ROUNDING)[0]
         step = np.zeros_like(z)
         step[index] = scale * solution[: len(index)]

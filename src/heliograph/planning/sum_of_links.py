@@ -64,7 +64,8 @@ def find_amplitudes_by_formula(links: SummedLinks, total: float, caps: Vector) -
     are independent.
 
     Args:
-        links: rows B (of one signal: multiples b of one direction), D, T and N.
+        links: the gains as rows B (with one signal all rows are multiples b_i of one direction), D (links, links), the
+            diagonal of T (power of a link with amplitude 1), and N.
         total: largest power that all may send together.
         caps: largest size of each amplitude.
     """
@@ -123,10 +124,11 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
 def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
     """Return the amplitudes a_i = min(theta b_i / D_i, cap_i) (links,) that maximise (b' a)^2 / (a' D a + N).
 
-    theta is where theta b' a = a' D a + N, found by bisection.
+    That ratio is the information in z = b' a x + noise, the sum of links that send one signal x with amplitudes a_i.
+    Without caps a is in proportion to b_i / D_i. theta is where theta b' a = a' D a + N, found by bisection.
 
     Args:
-        b: gains, not negative.
+        b: gains of the links, not negative.
         noise: the diagonal of D, the variances of the links' noises.
         floor: N, the variance of the receiver's noise.
         caps: largest amplitudes.

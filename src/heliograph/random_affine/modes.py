@@ -352,10 +352,11 @@ def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
 def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant: bool) -> bool:
     """Decide whether the best linear filter may ignore memory: Cov(Hbar_k, Hbar_l) = 0 for k < l.
 
-    Hbar_k,i = E[H_k | mode i]. With the law p_k of the modes the covariance is
-    sum_ij p_k,i (Hbar_k,i - E Hbar_k) (Pi^(l - k))_ij Hbar_l,j. Where nothing varies (`constant`, one step given), the
+    A channel of random maps H_k = (G_k, n_k) has modes with the chain Pi and the law p_k. Hbar_k,i = E[H_k | mode i].
+    Maps of two steps depend on each other by the modes alone, and a linear filter sees only their covariance,
+    sum_ij p_k,i (Hbar_k,i - E Hbar_k) (Pi^(l - k))_ij Hbar_l,j. If nothing varies (`constant`, one step given), the
     law must be that of all steps, and lags up to the number of modes decide, since Pi^t is a combination of lower
-    powers (Cayley-Hamilton).
+    powers (Cayley-Hamilton). `steps`: chain, law and maps of each step.
     """
     # A step that does not vary stands for itself and as many later ones as there are modes.
     repeated = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
@@ -368,6 +369,7 @@ def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant
     # Pairs (k, l) of steps: of what does not vary only the lag counts, so k = 0 is enough.
     first_steps = 1 if constant else len(repeated)
     for k, law in enumerate(mode_laws_over_time(repeated)[:first_steps]):
+        # p_k,i (Hbar_k,i - E Hbar_k); each later step multiplies it by Pi', and the sum over i and j has to be 0.
         deviations = law[:, None] * (means[k] - law @ means[k])
         for step, later in zip(repeated[k:-1], means[k + 1 :], strict=True):
             deviations = np.asarray(step.transition).T @ deviations

@@ -258,15 +258,16 @@ class _MapsWithMemories(NamedTuple):
 def split_terms_without_common_memory(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return maps that share no memory, independent of each other, whose sum is the channel; one if it is no sum.
 
-    The maps of a sum that share a memory (a chain of modes, or a gain that drifts) stay together in one term, and so do
-    those without any. The first term has the noise of the sum.
+    A channel may be a sum of random maps of parts of its input, as where transmitters share a medium. The maps of a sum
+    that share a memory (a chain of modes, or a gain that drifts) stay together in one term, and so do the maps without
+    any. So moments of the sum over time follow from those of its terms. The first term has the noise of the sum.
     """
     if not isinstance(channel, Superposed):
         return [channel]
     # Map after map: the groups that share a memory with it are joined, and so are groups without any memory.
     groups: list[_MapsWithMemories] = []
     for i, affine in enumerate(channel.maps):
-        identities, numbers = set(memories(affine)), [i]
+        identities, numbers = set(memories(affine)), [i]  # names of its memories; numbers of the maps in the group
         for group in [group for group in groups if group.memories & identities or not (group.memories or identities)]:
             groups.remove(group)
             identities, numbers = identities | group.memories, group.maps + numbers

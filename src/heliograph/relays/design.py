@@ -350,13 +350,13 @@ class ReceiverViewOfRelays(NamedTuple):
 def make_receiver_view(
     step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]
 ) -> ReceiverViewOfRelays:
-    """Return the linear system of zeta = (x, e_1 ... e_relays) that the receiver estimates, in one step.
+    """Return the linear system of zeta = (x, e_1 ... e_relays), x the state and e_r relay r's error, over one step.
 
     Args:
-        step: of the network, with x+ = A x + w, a sensor's noise v, and random gains of its links.
-        moments: covariance of (x, e_1 ... e_F) of all filters before the step, the receiver last, which decides how
-            much noise random gains add.
-        gain: K of all filters as one block matrix, over what all of them receive.
+        step: the network in this step: x+ = A x + w, the sensor's noise v, mean and spread of the links' random gains.
+        moments: covariance of (x, e_1 ... e_F) of all filters before the step, the receiver last; it decides how much
+            noise random gains add.
+        gain: K of all filters as one block matrix (filters n, R), over all R numbers that they receive.
     """
     n, r = step.transition.shape[-1], step.received[-1]
     maps, d = make_error_step_maps(step), moments.shape[0]

@@ -136,17 +136,18 @@ class ForecastPublisher:
         """Add the probabilities of passing each threshold to the forecasts from one row, in `bodies`.
 
         Args:
-            row: the row.
+            row: a row of live data, from whose filter states the forecasts begin.
             found: the forecasts from all rows, by node and filter.
-            bodies: what is published of them, which is changed.
-            number: number of the row among them.
+            bodies: the published forecasts by node and filter: for each row a list with a dictionary for each horizon.
+                The probabilities are added to them as "thresholds".
+            number: number of the row among all rows.
         """
         # Paths are drawn from this row alone.
         start = ForecastStart(make_forecast_origin(self._fleet, row.slot, float(row.key[0])))
         for node, filters in found.items():
             for name, forecast in filters.items():
                 of_row = bodies[node][name][number]
-                if of_row[0]["claim"] == "none":
+                if of_row[0]["claim"] == "none":  # no covariance, and so no probabilities
                     continue
                 crossings = self._find_all_crossings(start, (node, name), forecast)
                 for i, body in enumerate(of_row if crossings else []):

@@ -228,9 +228,9 @@ class Service:
         return self._commit({}, entries, 0)
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
-        """Use messages and commit; return the outputs to publish, and the seconds of the commit.
+        """Use messages and commit; return the outputs to publish, and the seconds of the commit (storing in one go).
 
-        `payloads`: what the messages were read from, one each.
+        `payloads`: what the messages were read from, one each, to show those that were not used.
         """
         outcomes = self._intake.apply_batch(messages, self._damage, datetime.now(UTC))
         touched = {outcome.plant.name: outcome.plant for outcome in outcomes if outcome.plant is not None}

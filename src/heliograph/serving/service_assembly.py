@@ -301,8 +301,8 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
     """Open the store, with the snapshot and the plants to begin anew, and report its state.
 
     Args:
-        settings: which store, which snapshot, which plants.
-        fleet: the plants of the network.
+        settings: address of the store, snapshot to begin from, plants to begin anew; no store means memory alone.
+        fleet: all plants that are filtered with this network.
         owning: holds the store for this service alone until it is closed; None where processes share it.
     """
     if settings.store is None:

@@ -116,11 +116,12 @@ def choose_store_location(network: str, given: str | None, parts: int | None, no
 def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     """Return the settings of a process that serves one node of a fusion between neighbours.
 
-    It reads and writes the topic that ends in the node's name, below the topic of the whole network. Sources of other
-    nodes are left out; the length of a step in seconds (`step`) is the same for all nodes.
+    In such a fusion each node runs the filter in a process of its own, and neighbours exchange estimates over a broker.
+    The process reads and writes the topic that ends in the node's name, below the topic of the whole network. It keeps
+    the node's own network (`node_network`) and sources; the length of a step in seconds (`step`) is the same for all.
 
     Args:
-        settings: those of the whole network.
+        settings: settings of the whole network: network, broker, topics of states, sources, options.
         node: name of the node.
 
     Raises:

@@ -174,14 +174,16 @@ def _find_usable_measurements(
 ) -> UsableMeasurements:
     """Return for each pattern of what arrives the sums of received numbers whose gain on a subspace of x is known.
 
-    The pattern of arriving components (a kind of losses) is all that the receiver sees of the channel's mode. Gains
-    that differ between modes with one pattern are unknown to it.
+    The plant is x+ = A x + w. The pattern of arriving components (a kind of losses) is all that the receiver sees of
+    the channel's mode. Gains that differ between modes with one pattern are unknown to it; used are sums D z of the
+    received numbers z whose gain does not differ.
 
     Args:
         a: A (n, n).
         q: Cov w (n, n).
-        links: joint model of all links.
-        basis: of the subspace, one column each.
+        links: joint model of all links: the Markov chain of their modes, and for each mode the possible outcomes
+            (which components arrive, with which probability, and gain and noise).
+        basis: basis of the subspace (n, d), in columns.
     """
     # All outcomes of all modes one after another, the mode of each, and its pattern of what arrives.
     outcomes = [outcome for outcomes_of_mode in links.outcomes for outcome in outcomes_of_mode]
@@ -194,7 +196,7 @@ def _find_usable_measurements(
         _find_known_sums([o for o, pattern in zip(outcomes, patterns, strict=True) if pattern == kind], links, basis)
         for kind in kinds
     ]
-    # Chain of (mode, outcome), with its long-run law.
+    # Chain of pairs (mode, outcome), P(next pair | pair) = P(next mode | mode) P(outcome | mode), and its long-run law.
     probability = np.array([outcome.probability for outcome in outcomes])
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)

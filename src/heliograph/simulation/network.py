@@ -118,7 +118,7 @@ class Network(Module):
         relays: "RelayNetwork | None" = None,
         common: "CommonReception | None" = None,
     ):
-        """Check that all parts fit, lower the filters' claims to what their places allow, and index what there is."""
+        """Check that all parts fit, lower claims (what covariances are said to be) that are wrong here, and index."""
         self.plant, self.relays, self.common = plant, relays, common
         # Nodes, and fusions between neighbours apart from those at a centre.
         self.nodes = {
@@ -136,7 +136,7 @@ class Network(Module):
         self.states, self.inputs = first(plant).states, first(plant).inputs
         self._check_nodes()
         self.rows = FrozenMapping(find_rows_of_nodes({name: node.received for name, node in self.nodes.items()}))
-        # Filters that believe another world than their node's claim less; arrays get one length, so that they stack.
+        # A filter made for other models than its node's claims less. Arrays get one length, so that they stack.
         self.nodes = pad_filters_alike(lower_claims_of_nodes(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}

@@ -91,8 +91,8 @@ class AllFilters(Module):
             network: the network.
             smoothed_kinds: numbers of the kinds of filters to be smoothed, with all central filters; None if nothing
                 is.
-            judges: whether filters judge if their measurements are plausible, and leave out others on request.
-            tests: fused estimates are tested by what arrives at the next step.
+            judges: whether filters test if their measurements are plausible, and leave out others on request.
+            tests: whether fused estimates are tested: if what arrives at the next step is as they predict.
         """
         self.smooths, self.judges = smoothed_kinds is not None, judges
         self.alike = stack_by_kind(network, smoothed_kinds or (), judges)
@@ -102,6 +102,7 @@ class AllFilters(Module):
         self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
         self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
         self.tests = make_fused_innovations(network, self.alike) if tests else {}
+        # `order` brings the groups' measurements into the nodes' order; `complete`: nothing of a group is ever missing.
         self.order = find_measurement_order(network.groups, network.rows)
         self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
         self.n = len(network.states)

@@ -134,13 +134,16 @@ def _smooth_settled(
 ) -> tuple[PyTree, ...]:
     """Smooth one chunk in which covariances have settled: filter its means ahead, then pass them back.
 
+    Covariances have settled where they are the same in each row, so only means are computed. The smoothed mean at the
+    chunk's end needs data from after it: the backward pass begins some rows later, from the filtered mean.
+
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
-        back: the backward pass over settled smoother steps.
+        back: the backward pass over smoother steps (what a smoother needs of each row) with the settled covariances.
         smoothed: the smoothed law with a settled covariance.
         means: the filter's means before the first row, one array for each Gaussian of its state.
-        rows: of the chunk and of the rows after it.
-        first: number of its first row.
+        rows: measurements and inputs (rows, ...) of the chunk and of some rows after it.
+        first: number of the chunk's first row.
 
     Returns:
         The filter's means after the chunk's own rows, the smoothed means of the states after and before these rows, the
@@ -157,6 +160,7 @@ def _smooth_settled(
         law, estimate = step_settled(back, smoothed.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
         return means_of(law), smoothed.select_varying(estimate)
 
+    # Back over the rows after the chunk, which yields the smoothed mean at its end, and then over its own.
     filtered_mean = [gaussian_of(with_means(settled.state, last_means)).mean]
     smoothed_after, _ = jax.lax.scan(pass_back, filtered_mean, steps_after, reverse=True)
     smoothed_before, estimates = jax.lax.scan(pass_back, smoothed_after, steps, reverse=True)

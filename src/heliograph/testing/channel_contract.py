@@ -38,7 +38,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
     """
     generator = np.random.default_rng(seed)
-    # Draws of H = [[G, n], [0, 1]]; its upper rows map (y, 1) to z = G y + n.
+    # Two successive draws of H = [[G, n], [0, 1]] in each of the samples; its upper rows map (y, 1) to z = G y + n.
     first, second = (h[:, :-1] for h in _draw_twice(channel, seed, samples))
     points = [channel.example_input(generator), channel.example_input(generator)]
     # With modes: two successive draws, compared jointly. Another kind of memory has no moments.

@@ -65,6 +65,8 @@ def check_scaling(
         rows[random.random(rows.shape) < MISSING] = np.nan
         if (limits := network.nodes[name].limits) is not None:  # in these units: what a node refuses never arrives
             rows[limits.outside(rows)] = np.nan
+    # The estimates in the user's units, and their greatest difference from those in drawn units: a factor for each
+    # state, then (one_factor) one for all states.
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, dtype=float)
     plain, worst = run(network, z, u).estimates, 0.0
     for _ in range(trials):

@@ -140,13 +140,15 @@ def lay_out_memory(parts: ProgramParts, block_items: Collection[Any]) -> MemoryL
     the buffer has a copy for each iteration.
 
     Args:
-        parts: the program's items, and which of them differ between runs.
+        parts: the program's items, and which of them differ between runs (`per_run`).
         block_items: the items of the block function, which computes what differs between runs.
     """
+    # Buffers (arrays in memory) by their owners: a part of a buffer lies in its owner.
     whole_buffers = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
     sums = set(parts.outputs_summed_in_memory)
     _check_sums(parts.items, sums)
-    caller_arrays = {*parts.outputs, *parts.lanes} if parts.alone else set()  # used in place: one run has one lane
+    caller_arrays = {*parts.outputs, *parts.lanes} if parts.alone else set()  # one run alone uses its arrays in place
+    # Sums over runs and arrays of the caller have memory elsewhere.
     differing = [b for b in whole_buffers if b in parts.per_run and b not in sums and b not in caller_arrays]
     common = [b for b in whole_buffers if b not in parts.per_run and b.kind in FILLED]
     filled_in_loops = {b for b in common if b.block.list_loops()}

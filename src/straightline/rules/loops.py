@@ -47,13 +47,14 @@ def _lower_loop(
 ) -> tuple[list[np.ndarray], Any]:
     """Lower a loop; return the carry after it, and what the body returns in addition to its carry.
 
-    A matrix that is symmetric before the loop is taken for symmetric within it: the loop carries its upper triangle.
-    Where the body does not keep a matrix symmetric, the body is lowered once more, with all its entries carried.
+    To lower is to write an operation of JAX as nodes, one for each number. A matrix that is symmetric before the loop
+    is taken for symmetric within it: the loop carries its upper triangle. Where the body does not keep a matrix
+    symmetric, the body is lowered once more, with all its entries carried.
 
     Args:
-        lowering: the program.
+        lowering: the program that is being written: its `graph` holds the nodes and the open block.
         length: how many iterations; None of a loop that ends by its condition.
-        carry: the arrays of nodes before the first iteration.
+        carry: the arrays of nodes before the first iteration, which each iteration replaces by new ones.
         body: function of the loop and of the carry before an iteration. It lowers the iteration into the open block,
             and returns the carry after it, and something else.
     """
@@ -62,7 +63,7 @@ def _lower_loop(
     while True:
         nodes_before = graph.serial
         loop = Loop(Block(outer), length, _flatten_carry(carry, by_triangle))
-        # In the body the carry is a parameter; the turn is traced once.
+        # In the body the carry is a parameter; the body is traced once for all iterations.
         loop.parameters = _make_carried_nodes(graph, "parameter", loop, loop.body)
         graph.current = loop.body
         following, beside = body(loop, _restore_arrays(carry, loop.parameters, by_triangle))

@@ -70,15 +70,17 @@ def _scatter_by_cases(
 ) -> np.ndarray:
     """Scatter at indices that data decide: each entry that an update may change becomes a choice of new and old number.
 
-    The entry is new where the update's window starts at the place that would put it there.
+    A scatter writes windows (blocks of numbers) of `updates` into an array. Native code has no address that depends on
+    data here, so every place at which a window may start is tried: an entry gets the new number if the window does
+    start where that puts it there.
 
     Args:
-        lowering: the program.
-        equation: the scatter.
+        lowering: the program that is being written, a graph with a node for each number.
+        equation: JAX's scatter, whose parameters say which axes are a window's.
         op: combines an old and a new number; None where the new one replaces the old.
         inputs: the array, the indices as JAX has them (not used), and the updates.
         indices: nodes (..., k) of the windows' first places.
-        sizes: of a window, along each axis of the array.
+        sizes: size of a window along each axis of the array.
 
     Returns:
         The array after all updates.
@@ -89,7 +91,7 @@ def _scatter_by_cases(
     # The updates with the axes of the indices first, then those of a window: windows[row] is the window of one index.
     along = numbers.update_window_dims
     windows = np.moveaxis(updates, along, range(updates.ndim - len(along), updates.ndim))
-    updated, count = x.copy(), 0  # count: of selections
+    updated, count = x.copy(), 0  # count: number of choices of new or old; above WRITTEN_OUT is refused
     for row in np.ndindex(*indices.shape[:-1]):
         for start, is_here in _yield_starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)

@@ -94,8 +94,9 @@ def _sum_lower_series(a: jax.Array, x: jax.Array, skipped: jax.Array) -> jax.Arr
 def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> jax.Array:
     """Return Q(a, x) / (x^a e^-x / Gamma(a)) where x > a + 1, by a continued fraction; elsewhere any number.
 
-    It is 1 / (x + 1 - a - 1 (1 - a) / (x + 3 - a - 2 (2 - a) / (x + 5 - a - ...))), by Lentz's method: the value is a
-    product of C_n D_n, quotients of consecutive numerators and of consecutive denominators.
+    Q is the regularised upper incomplete gamma function. The ratio is 1 / (x + 1 - a - 1 (1 - a) / (x + 3 - a -
+    2 (2 - a) / (x + 5 - a - ...))), by Lentz's method: the value is a product of C_n D_n, quotients of consecutive
+    numerators and of consecutive denominators. `serves`: where x > a + 1; the loop ends at once for other entries.
 
     Source: Lentz, Generating Bessel functions in Mie scattering calculations using continued fractions (1976).
     """

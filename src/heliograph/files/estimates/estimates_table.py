@@ -94,7 +94,14 @@ def _find_angles(record: Record) -> Angles:
 def _make_columns(
     states: Sequence[str], units: Mapping[str, str], estimate: Estimate, angles: Angles
 ) -> list[tuple[str, np.ndarray]]:
-    """Return the columns that show an estimate: means, standard deviations and covariances as claimed, and validity."""
+    """Return the columns (header, values) that show an estimate: means, standard deviations, covariances, validity.
+
+    Args:
+        states: names of the n states.
+        units: units by name of the state; "" or none for states without.
+        estimate: mean (rows, n) and covariance (rows, n, n); without covariances (claim "none") only means are shown.
+        angles: indices of the states that are angles, shown between -pi and pi.
+    """
     mean, covariance = wrap_angles(np.asarray(estimate.mean), angles), np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")

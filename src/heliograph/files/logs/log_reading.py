@@ -22,8 +22,8 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
     Args:
         path: the log, or the folder.
-        sources: which database and which channel of a bus, and when the log began.
-        wanted: whether a message of a name is decoded.
+        sources: what decodes it: the database of a bus's signals, the channel of the bus, and when the log began.
+        wanted: a function that says whether a message of a name is decoded.
 
     Raises:
         ValueError: what `open_log` refuses.
@@ -32,7 +32,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     logs = [open_log(part, sources, wanted) for part in list_logs(path) or [path]]
     if len(logs) == 1:
         return logs[0]
-    # Notes come with the messages: once all of a log have been read.
+    # A log's notes (lines on what was left out) are complete once all its messages have been read.
     notes = list[str]()
 
     def read_one_after_another() -> Iterator[FileMessage | InputError]:

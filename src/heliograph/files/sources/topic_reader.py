@@ -302,7 +302,7 @@ class TopicReader:
         return [MappedSource(source, topic, self._find_output_places(topic, source)) for source in sources]
 
     def _find_output_places(self, topic: str, source: Source) -> dict[str, np.ndarray]:
-        """Return {node: which of its numbers each value of a source is, (values,)}.
+        """Return {node: which of its numbers each value of a source (the form of a topic's messages) is, (values,)}.
 
         Raises:
             ValueError: a source that does not fit the network; one line that names the topic.

@@ -31,10 +31,11 @@ def check_header(source: str, header: Sequence[str], path: Path | None, marked: 
 
     Args:
         source: the name of the table, for errors.
-        header: the names.
-        path: the file, if it can be read again.
-        marked: whether the first of several names may begin with a mark of comments.
+        header: the fields of its first line.
+        path: the file, if it can be read again: then the error says how to rewrite it. None else.
+        marked: whether the first of several names may begin with a mark of comments, "#" or "%".
     """
+    # Bytes that are no text, a comment, names with another separator, names twice, or numbers alone.
     line = ",".join(header)
     if not is_valid_text(line):
         raise fail(

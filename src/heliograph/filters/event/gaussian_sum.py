@@ -178,7 +178,7 @@ def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int]) -> Gaussia
 
     Cost of a pair: w_a w_b / (w_a + w_b) sum_i (m_a - m_b)_i^2 / (v_a + v_b)_i, w weight, m mean and v variance, over
     the components i from ends[0] to ends[1] - 1. It is how much the merged Gaussian spreads more than its parts, in
-    units of their variance.
+    units of their variance. A filter merges pairs to keep few Gaussians.
     """
     size, places = len(mixture.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))

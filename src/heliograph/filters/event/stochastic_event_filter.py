@@ -175,9 +175,10 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         Args:
             prior: Gaussian of x before the step's data. That the link is down says nothing of x.
-            silent: a sum of one Gaussian, with weight P(silent).
-            law: probabilities of the link's M modes.
-            channel: the link, by mode and pattern of arrivals.
+            silent: Gaussian of x given that the sender was silent, as a sum of one Gaussian with weight P(silent).
+            law: probabilities of the M modes of the link's Markov chain.
+            channel: the link: probabilities `chance` of each pattern of arrivals in each mode, and which components
+                arrive (`present`).
             down: a flag that the receiver gets, (1,): 1 if the link is down; (0,) if it gets none.
         """
         # P(nothing arrives | mode) (M,). A label holds P(mode, link up or down), whose sum multiplies the weight.
@@ -210,9 +211,15 @@ class StochasticEventFilter(AbstractSizedFilter):
     ) -> tuple[jax.Array, jax.Array]:
         """Return by how much the mean (m,) and covariance (m, m) of z = G y + n change given that y was sent.
 
-        Let y ~ N(m, S), s = P(silent), and m + d and S_s the mean and covariance of y given silence. Law of total
-        probability: (moment of y) = s (moment given silence) + (1 - s) (moment given sent). `link`: E G, and the
-        covariance C of the entries of (G, n); `reference`: what the sender compares y with.
+        A sender that is silent while y is near a reference sends only a y that is far from it, so a sent y has another
+        law. Let y ~ N(m, S), s = P(silent), and m + d and S_s the mean and covariance of y given silence. By the law of
+        total probability, (moment of y) = s (moment given silence) + (1 - s) (moment given sent).
+
+        Args:
+            link: E G (m, p), and the covariances C_ijkl = Cov(H_ik, H_jl) of H = (G, n).
+            signal: mean m and covariance S of y.
+            reference: what the sender compares y with.
+            log_silent: log s.
         """
         (gain, gain_covariance), m, S = link, signal.mean, signal.covariance
         s = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)  # so that 1 - s is not 0

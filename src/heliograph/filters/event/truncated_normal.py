@@ -102,9 +102,10 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormalMomen
 def upper_tail(lower: jax.Array) -> TruncatedNormalMoments:
     """Return log mass, mean and variance of N(0, 1) above `lower`, by a tenth of `truncated_normal`'s operations.
 
-    With the hazard h = phi(a) / Q(a) the mean is h, the variance 1 - h (h - a). Far out both lose digits, but by
-    Laplace h = a + u_1 / a with u_n = n / (1 + u_{n+1} / a^2), and the variance is u_1 (u_2 - u_1) / a^2, which loses
-    none. The fraction is evaluated as numerator and denominator. Relative errors as of `truncated_normal`.
+    phi and Q are density and upper tail of N(0, 1), and a = `lower`. With the hazard h = phi(a) / Q(a) the mean is h,
+    the variance 1 - h (h - a). Far out both lose digits, but by Laplace h = a + u_1 / a with u_n = n / (1 + u_{n+1} /
+    a^2), and the variance is u_1 (u_2 - u_1) / a^2, which loses none. The fraction is evaluated as numerator and
+    denominator. Relative errors are those of `truncated_normal`.
 
     Shapes: any; the results have it.
 

@@ -102,8 +102,12 @@ class AdaptiveFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
-        """Correct the state and the laws of the noise variances with z (m,), NaN where a component did not arrive."""
-        # Moments of the measurement without its noise.
+        """Correct the state and the laws of the noise variances with z (m,), NaN where a component did not arrive.
+
+        Each variance R_i has an inverse gamma law of shape a_i and scale b_i. Variational Bayes corrects the state for
+        given R and the laws of R for a given state, in turn. `state` has the Gaussian of x, a and b.
+        """
+        # Moments of the measurement without its noise, before the channel (`signal`) and behind it (`predicted`).
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))

@@ -100,8 +100,8 @@ def gaussian_filter(
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
 
-    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
-    (then it is the Kalman filter).
+    Claim (what the covariance is said to be): "nominal"; "exact" where plant and sensor are linear, no gain is random
+    and the initial law is the plant's (then it is the Kalman filter).
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, an initial covariance that is none, what is no transform
@@ -138,8 +138,8 @@ def cubature_filter(
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
 
-    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
-    (then it is the Kalman filter).
+    Claim (what the covariance is said to be): "nominal"; "exact" where plant and sensor are linear, no gain is random
+    and the initial law is the plant's (then it is the Kalman filter).
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
@@ -170,7 +170,8 @@ def extended_filter(
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
 
-    Claim: as `cubature_filter`.
+    Claim (what the covariance is said to be): "nominal"; "exact" where plant and sensor are linear, no gain is random
+    and the initial law is the plant's.
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.

@@ -73,10 +73,13 @@ def differentiate_twice(function: Function, at: jax.Array, direction: jax.Array)
 
 
 def find_quadratic_image(function: Function, x: Gaussian) -> Image:
-    """Return the image of x by a function of degree 2, as `_quadratic_image` of `moment_transforms.py` does.
+    """Return the image f(x) of a Gaussian x by a function of degree 2, by formulas that have accurate derivatives.
 
-    Its columns are in units of xi, with their variances as weights: of xi_i xi_j the weight is d_i d_j.
+    With x = m + L xi, Var xi_i = d_i, f(x) = f(m) + sum_i s_i xi_i + sum_i q_i xi_i^2 + sum_i<j c_ij xi_i xi_j. The
+    image has the mean E f(x), the columns s_i with weights d_i, and the columns of the curvature: q_i d_i of the weight
+    2, since Var xi_i^2 = 2 d_i^2, and c_ij of the weight d_i d_j. They add up to Cov f(x).
     """
+    # s_i = parts.slopes, and parts.even = f(m + sqrt(d_i) L_i) + f(m - sqrt(d_i) L_i) - 2 f(m) = 2 q_i d_i.
     parts, d = find_odd_and_even_parts(function, x, 1.0), x.variances
     deviations, root = square_root(d), jnp.asarray(x.root)
     squares = parts.even / 2
@@ -89,6 +92,8 @@ def find_quadratic_image(function: Function, x: Gaussian) -> Image:
 
     def mixed(i: jax.Array, j: jax.Array) -> jax.Array:
         """Return the coefficient of xi_i xi_j, by values or by slopes in the column over which f is nearly linear."""
+        # By values (`both`): the mixed difference over both steps. By slopes: how the slope in one column changes along
+        # the other; it keeps its digits where the step changes f hardly more than a straight line.
         (at_i, at_j), middle = (mean + deviations[k] * root[:, k] for k in (i, j)), slopes_at(mean)
         both = function(at_i + deviations[j] * root[:, j]) - function(at_i) - function(at_j) + function(mean)
         s_i, s_j = (jnp.where(deviations[k] > 0, deviations[k], 1.0) for k in (i, j))
@@ -106,8 +111,10 @@ def find_quadratic_image(function: Function, x: Gaussian) -> Image:
 def find_grid_image(function: Function, x: Gaussian, nodes: jax.Array, weights: jax.Array) -> Image:
     """Return the image of x by the product rule of these nodes (points, n) and weights (points,) of a normal vector.
 
-    In the columns over which f is nearly linear it is f + 1/2 sum_j d_j f''[L_j, L_j] at the points of all others, with
-    f'[L_j] xi_j beside it. A column over which only some components of f are so is taken by values.
+    x = m + sum_j L_j xi_j with Var xi_j = d_j, L_j the columns of `x.root`. Points m + sum_j sqrt(d_j) L_j node_j would
+    lose derivatives to rounding in the columns over which f is nearly linear (`near`). There f is expanded about the
+    points of all other columns: f + 1/2 sum_j d_j f''[L_j, L_j], plus f'[L_j] xi_j. A column over which only some
+    components of f are nearly linear is taken by values.
     """
     parts = find_odd_and_even_parts(function, x, jnp.max(nodes) ** 2)
     d, root, near = x.variances, jnp.asarray(x.root), jnp.all(parts.linear, axis=0)
@@ -120,6 +127,8 @@ def find_grid_image(function: Function, x: Gaussian, nodes: jax.Array, weights: 
         return function(point) + jnp.where(near, d / 2, 0.0) @ bends, slopes.T
 
     values, slopes_at_points = jax.vmap(at_point)(nodes)  # (points, p), (points, p, n)
+    # E f(x); the slopes that fit f best, E[f xi_j] / d_j by values; and the covariance of what the slopes leave: of f
+    # at the points, and in near columns of slopes that differ from point to point.
     center = weights @ values
     by_values = (values.T * weights) @ nodes / jnp.where(near, 1.0, jnp.where(deviations > 0, deviations, 1.0))
     slopes = jnp.where(near, jnp.einsum("k,kpj->pj", weights, slopes_at_points), by_values)

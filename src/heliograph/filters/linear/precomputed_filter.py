@@ -208,9 +208,12 @@ def record_step_matrices(
 ) -> tuple[LinearStep, PyTree, PyTree]:
     """Return the matrices of step k, the state after its prediction, and that after its correction.
 
+    With these matrices, stored in advance, a step of the filter is m- = F m + f and m = m- + K (z - C m- - c).
+
     Args:
         filter: a filter in which only the mean depends on data, by an affine function.
-        state: before the step. Its mean does not matter for the matrices; the returned states have started from mean 0.
+        state: state of the filter before the step, with mean m. Its mean does not matter for the matrices; the returned
+            states have started from mean 0.
         z: measurement (m,), NaN where a component did not arrive.
         u: input.
         k: number of the step.

@@ -279,9 +279,10 @@ def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, roundin
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds of second moments at each step, of the next state (time, N) and of the measurement (time, m).
 
-    The rounding of a sum A x + a is proportional to the size of its terms. So the bound for x+ = A x + a + w is (|A|
-    root + |a|)^2, with root_i = sqrt(E[x_i^2]) before any data, and alike for z = C x+ + c + v. An unstable system's
-    moments grow without limit; they are kept so small that their squares are finite.
+    The rounding of a filter's sums is added to its noises, in proportion to these bounds. The rounding of A x + a is
+    proportional to the size of its terms. So the bound for x+ = A x + a + w is (|A| root + |a|)^2, with root_i =
+    sqrt(E[x_i^2]) before any data, and alike for z = C x + c + v with the next x. An unstable system's moments grow
+    without limit; they are kept so small that their squares are finite.
     """
     steps, mean, covariance = system.steps, system.mean, system.covariance
     largest_moment = float(np.finfo(float).max) ** 0.5  # its square is finite
@@ -295,6 +296,7 @@ def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarr
 
     state_moments, received_moments = [], []
     for k in range(len(steps.transition)):
+        # Mean and covariance before any data: E x+ = A E x + a, P+ = A P A' + Q; then the bound of z is of x+.
         A, a = steps.transition[k], steps.drift[k]
         state_moments.append(bound(A, a))
         mean = np.clip(A @ mean + a, -largest_mean, largest_mean)

@@ -41,7 +41,8 @@ def trace_log_likelihood(
 def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
     """Return the log-likelihood of all rows; NaN where the estimate is no number, as such a row looks lost.
 
-    Values are by the filter's factors, derivatives by its covariances (`step_by_covariances`).
+    The likelihood is maximised over free numbers of the model, so it has derivatives by them. Its values come from the
+    filter's own steps, by factors of covariances; the derivatives from the same steps written by covariances.
 
     Args:
         filter: the best linear one of a linear plant and sensor behind a channel of known law, without angles: a
@@ -62,6 +63,7 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
         after, innovation = constant.correct(prior, _hold_constant(z), k)
         corrected = gaussian_of(after)
         factored = FactoredStep(gaussian_of(prior), corrected, innovation.value, innovation.covariance)
+        # The same step by covariances: innovation e, its covariance S, and log N(e; 0, S) with the value by factors.
         matrices, before_data = find_model_matrices(filter, before_data, u, k)
         moments, e, S = step_by_covariances(matrices, moments, z, factored)
         lost = jnp.any(jnp.isnan(corrected.mean))

@@ -105,9 +105,15 @@ class ModeObservedFilter(AbstractSizedFilter):
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
         """Correct with z, given the states of the links' memories that came with it.
 
-        Where `late`, they are those of the step before: its measurement is used again with them, then z under the law
-        of the memories that follows. z: what the channel delivers (m,), then one number for each memory, the number of
-        its mode or its gain; NaN for what did not arrive. Without these numbers z is not used.
+        A link's gain depends on a memory (a Markov chain's mode, or a gain that drifts), which the receiver is told. If
+        `self.late`, it is told the states of the step before: then that step's measurement is used again with them, and
+        z with the law of the present states that follows from them.
+
+        Args:
+            state: estimate, and what the last correction used, to repeat it.
+            z: what the channel delivers (m,), then one number for each memory, the number of its mode or its gain; NaN
+                for what did not arrive. Without these numbers z is not used.
+            k: number of the step.
         """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         m = channel.outputs

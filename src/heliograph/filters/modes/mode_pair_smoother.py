@@ -126,13 +126,14 @@ class FutureObservation(NamedTuple):
 def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
     """Return the ratio of two densities N(x; s, S) / N(x; q, Q) as an observation that turns N(q, Q) into N(s, S).
 
-    With V' Q V = I and V' S V = diag(e), and where e < 1, it is V'x + noise = (V's - e V'q) / (1 - e), the noise of
-    variance e / (1 - e), component by component. Rows are multiplied by sqrt(1 - e), so that no noise is infinite: its
-    variance is then e.
+    It is what the later data alone say of x, which a smoother can use with another N(q, Q). The columns of V make both
+    covariances diagonal: V' Q V = I, V' S V = diag(e). Component by component, where e < 1, the observation is V'x +
+    noise = (V's - e V'q) / (1 - e), its noise of variance e / (1 - e). Rows are multiplied by sqrt(1 - e), so that no
+    noise is infinite: its variance is then e.
 
     Args:
         later: N(s, S), what is known with later data.
-        known: N(q, Q), what was known before these.
+        known: N(q, Q), what is known without the later data.
     """
     # W with W Q W' = I, and zeros for components that `known` has exactly.
     variances = jnp.sum(known.root**2 * known.variances, axis=1)

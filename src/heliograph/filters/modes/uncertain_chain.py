@@ -132,9 +132,11 @@ class UncertainModalFilter(AbstractJointModalFilter):
     ) -> tuple[jax.Array, jax.Array, WeightedColumns]:
         """Return F L, b, and columns of (1 + 1/b) D + W, for the bound Sigma+ <= (1 + b) F Sigma F' + (1 + 1/b) D + W.
 
-        Sigma = L diag(variances) L' bounds the covariance of zeta = (x~ 1{mode = 1}, ...), x~ = (x - c, 1), and F has
-        the blocks F_ji = Pi_ij A~. Row i of the chain is Pi_i + Delta_i, the modes have the law p, and p+ is the next
-        one. With X = A~ E[x~ x~'] A~' and Kronecker's product (x), for all possible Delta and p,
+        The filter estimates zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - c, 1), c = `state.centre`. Sigma =
+        L diag(variances) L' (`state.gaussian`) bounds the covariance of its error. F has the blocks F_ji = Pi_ij A~.
+        The chain of modes is known up to a radius: its row i is Pi_i + Delta_i. The modes have the law p, then p+; p
+        lies between `state.low` and `state.high`. A~ moves x~, and Q~ is the noise's covariance. With X = A~ E[x~ x~']
+        A~' and Kronecker's product (x), for all possible Delta and p,
 
             D = D_m (x) X,                 D_m >= sum_i p_i Delta_i' Delta_i
             W = J_m (x) X + N_m (x) Q~,    J_m >= sum_i p_i Cov(1{next mode} | mode = i),    N_m >= diag(p+)
@@ -142,7 +144,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         A, _, _ = centred_transition(at(self.plant, k), u, state.centre)  # A~
         transition, radius = self._chain_and_radius(state, k)
         X = A @ state.second @ A.T
-        # J_m and D_m: bounds for each mode i, then on their mean over all laws p of the modes.
+        # J_m and D_m: bounds for each mode i, then on their mean over all laws p: |p - middle| is at most `reach`.
         middle, reach = _find_middle_law(state.low, state.high)
         J_m, D_m = (_bound_mean(by_mode, middle, reach) for by_mode in _bound_moves(transition, radius))
         # b = sqrt(tr D / tr(F Sigma F')) makes the trace of the bound least; tr D = tr D_m tr X.

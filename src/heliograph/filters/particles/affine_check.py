@@ -80,7 +80,9 @@ def _trace_known_array(value: Any) -> _EntryDegrees:
 def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of the results of one traced operation (a JAX equation), from the degrees of its operands x.
 
-    KNOWN: a constant, with its value; GIVEN: no function of the variables; AFFINE: in the variables; OTHER: any other.
+    A function is affine in its variables if all its results are at most AFFINE. Degrees are of single entries of an
+    array. KNOWN: a constant, with its value; GIVEN: no function of the variables; AFFINE: a sum of given numbers and of
+    variables times given numbers; OTHER: anything else.
     """
     name, params = equation.primitive.name, equation.params
 
@@ -89,6 +91,7 @@ def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryD
         results = equation.primitive.bind(*(jnp.asarray(array) for array in arrays), **params)
         return list(results) if equation.primitive.multiple_results else [results]
 
+    # An operation that calls a traced program (as a jitted function): the degrees of its results.
     if (called := called_program(equation)) is not None:
         return _classify_dependence(called, x)
     # Constants give constants, and given operands (no functions of the variables) given results.
@@ -103,6 +106,7 @@ def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryD
     if name in LOOKUPS and all(index.value is not None for index in x[1:]):
         moved = compute([x[0].degree, *(index.value for index in x[1:])])
         return [_EntryDegrees(np.asarray(degree)) for degree in moved]
+    # Sums and products, by the degrees of their operands.
     return [_EntryDegrees(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
 
 

@@ -306,13 +306,17 @@ def build_state_particles(
 ) -> StateParticleFilter:
     """Return the particle filter that draws the whole state; check its arguments, which are those of `particle_filter`.
 
+    A particle filter needs p(z | x), the density of what is received given the state, to weigh its particles. The
+    claim, what its covariance is said to be, is "nominal": it is a sample's.
+
     Args:
         plant: the plant.
         sensor: its sensor.
         channel: from the sensor to the filter, without memory.
         particles: their number.
         seed: of the random numbers.
-        proposal: "optimal" draws with z, and needs Gaussian process noise; "prior" draws without.
+        proposal: "optimal" draws the next states given z, and needs Gaussian process noise; "prior" draws them from the
+            plant alone.
         resample: share of `particles` below which the effective number leads to resampling.
     """
     start, first_sensor = instance("plant", first(plant), AbstractPlant, "a plant"), first(sensor)
@@ -324,7 +328,7 @@ def build_state_particles(
     if proposal == "optimal":
         for step in unstack(plant):
             _check_gaussian(step)
-    # The density of z given x, for each step that sensor or channel has of its own.
+    # p(z | x): one density if sensor and channel are the same at all steps, else one for each step.
     steps = steps_covered((sensor, channel)) or 1
     densities = [
         find_received_density([sensor_of_step], [channel_of_step])  # one mode

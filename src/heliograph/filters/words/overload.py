@@ -138,8 +138,9 @@ def _describe_system(
 ) -> tuple[LinearSystem | None, list[tuple[np.ndarray, np.ndarray]]]:
     """Return plant, sensor and links as a linear system, and mean and variance of y - c at each of `horizon` steps.
 
-    y is the sensor's signal before any data, with inputs zero, and c the centre of the codewords. Without `links`
-    (None) there is no system.
+    A codeword counts quantisation steps of y - c, where y is the sensor's signal and c the centre of the codewords'
+    range; y far from c overloads the quantizer. Mean and variance are unconditional, before any data, inputs zero.
+    `links` has the moments of each step's link; without them (None) there is no system.
     """
     start = at(plant, k=0)
     initial_mean, initial_covariance = np.asarray(start.initial_mean), np.asarray(start.initial_covariance)
@@ -149,9 +150,10 @@ def _describe_system(
         motion, sensing, link = _find_models_of_step(plant, sensor, links, k)
         # E x+ = A E x + b, P+ = A P A' + Q; E(y - c) = C E x + shift, Cov y = C P C' + Cov v.
         mean, P = motion.matrix @ mean + motion.shift, motion.matrix @ P @ motion.matrix.T + motion.covariance
+        # `sensing.shift` includes -c, so that the y of the code is E(y - c); CPC = C P C'.
         y, CPC = sensing.matrix @ mean + sensing.shift, sensing.matrix @ P @ sensing.matrix.T
         signals.append((y, np.diag(CPC + sensing.covariance)))
-        if link is not None:
+        if link is not None:  # E[(y - c)(y - c)'], of the rounded signal that is sent
             second_moment = CPC + sensing.covariance + sensing.rounding + np.outer(y, y)
             steps.append(_describe_step(motion, sensing, link, y, second_moment))
     stacked = Steps(*(np.array(field) for field in zip(*steps, strict=True))) if steps else None

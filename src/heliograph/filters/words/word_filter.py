@@ -149,6 +149,9 @@ class WordFilter(AbstractGaussianStateFilter):
     def condition_by_leading_bits(self, i: int, words: "ReceivedWords", prior: SignalPrior, leading: int) -> WordEffect:
         """Return the effect of the received codeword on y_i in two cases: its leading bits arrived as sent, or not.
 
+        A codeword holds the quantised y_i in `self.bits` bits, and bits may flip on the way. The filter treats the two
+        cases apart, since a flip of a high bit moves the value far.
+
         Args:
             i: component of y.
             words: what was received; `words.pairs` has for each combination of error rates the likelihoods of a sent 0
@@ -165,7 +168,8 @@ class WordFilter(AbstractGaussianStateFilter):
         equals_received = jnp.stack([1 - received_bit, received_bit], axis=-1)
         leading_is_right = jnp.where((bits >= self.bits - leading)[:, None], equals_received, 1.0)
         right_pairs = [pair * leading_is_right for pair in pairs]
-        # P(received, not right) = P(received) - P(received, right): weights 1 and -1 of the same sums.
+        # P(received, not right) = P(received) - P(received, right): weights 1 and -1 of the same sums over `pairs` and
+        # then `right_pairs`; P(received, right) has the weights 0 and 1.
         if_right = jnp.append(0 * words.weights, words.weights)
         if_wrong = jnp.append(words.weights, -words.weights)
         return find_effect_of_bits(

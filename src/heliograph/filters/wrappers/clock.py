@@ -212,8 +212,9 @@ def clock_filter(
 ) -> ClockFilter:
     """Return the filter of plant and clocks, as `with_clocks` makes them, that detects when a clock cannot be observed.
 
-    While the last steps of the trajectory leave an offset unobservable it is not corrected, only considered: its
-    variance counts in every update (Schmidt).
+    Each clock of a node has an unknown offset, a state, by which its measurements are dated wrongly; how well that
+    shows depends on the trajectory. While its last steps leave an offset unobservable, the offset is not corrected,
+    only considered: its variance counts in every update (Schmidt). Correcting it would make the variance too small.
 
     Args:
         plant: the plant with its clocks' offsets and drifts among the states.
@@ -223,7 +224,7 @@ def clock_filter(
         transform: moments of h; `PolynomialMoments(2)` by default, those of a product of Gaussians, which are exact
             where h is linear in the plant's states.
 
-    Claim: "nominal".
+    Claim (what the covariance is said to be): "nominal".
 
     Raises:
         ValueError: names that are no clocks of the plant, uncertain probabilities, parts that do not fit.

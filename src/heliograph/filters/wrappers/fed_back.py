@@ -158,17 +158,19 @@ def fed_back_filter(
 ) -> FedBackFilter:
     """Filter whose prediction is fed back to the sensor, which sends y less that prediction: z = G (y - r) + n.
 
-    A node that has this filter is simulated so. z is what arrives: the filter does not add r to it.
+    y is the sensor's measurement, r its prediction by the filter, G and n the channel's gain and noise. The difference
+    needs less power than y. A node that has this filter is simulated so. z is what arrives: the filter adds no r to it.
 
     Args:
         plant: the plant; a linear plant and sensor need no transform.
         sensor: its sensor, without angles.
         channel: from the sensor to the filter; the feedback is lossless.
-        transform: moments of a nonlinear function; `Cubature()` by default.
-        update: as for `cubature_filter`; `Polytope()` by default.
+        transform: how moments of a nonlinear function are found; `Cubature()` by default.
+        update: how the correction handles gains that are known only up to a set; `Polytope()` by default.
 
-    Claim: "exact" for a linear plant and sensor, however random the gains: with E[y - r] = 0 and
-    E (y - r)(y - r)' = C P C' + R the best gain is K = P C' M' (M S M' + Sigma(S))^-1. Else "nominal".
+    Claim (what the covariance is said to be): "exact" for a linear plant and sensor, however random the gains. Then
+    y - r has mean 0 and covariance S = C P C' + R, and with M = E[G], Sigma(S) = Cov of (G - M) (y - r) + n, the best
+    gain is K = P C' M' (M S M' + Sigma(S))^-1. Else "nominal".
 
     Raises:
         ValueError: parts that do not fit, angles.
@@ -179,6 +181,7 @@ def fed_back_filter(
     chosen, rule = Cubature() if transform is None else transform, Polytope() if update is None else update
     base = make_base_gaussian_filter("filter that is fed back", plant, sensor, channel, chosen, rule)
     refuse_angles("filter that is fed back", plant, sensor)
+    # Exact: linear, the channel's moments known, no memory of the channel that a filter could use, the standard update.
     described = stack_over_time(base.channel)
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
     claim = lower_claim_by_noise("exact" if exact else "nominal", plant, sensor, channel)

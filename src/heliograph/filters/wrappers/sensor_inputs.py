@@ -101,8 +101,9 @@ def build_filter_of_inputs(
 ) -> FilterOfInputs:
     """Build the filter of a plant, of a sensor that depends on the plant's inputs, and of a channel.
 
-    `make` builds the filter of a sensor without inputs. It is called once, with the sensor under typical inputs; the
-    result then gets the sensor under each step's inputs in its place.
+    Such a sensor is z = h(x, u) + v, as a rate that a control input sets. `make` builds the filter of a sensor without
+    inputs. It is called once, with the sensor under example inputs; at each step the filter made gets the sensor under
+    that step's inputs in its place.
 
     Raises:
         ValueError: inputs that the plant does not have; a link that is late, behind which a measurement is one of
@@ -119,5 +120,6 @@ def build_filter_of_inputs(
     if not hasattr(base, "sensor"):
         first(sensor).refuse_inputs(f"a {type(base).__name__}")
     filter = FilterOfInputs(base=base, plant=plant, sensor=sensor, **make_sizes(base.claim, base, base.received))
+    # The premise, the models under which the filter's claim holds, has the sensor with its inputs.
     premise = base.premise
     return with_premise(filter, premise and premise.replaced(sensor=sensor))

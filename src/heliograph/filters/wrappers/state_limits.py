@@ -165,8 +165,10 @@ class LimitedFilter(AbstractSizedFilter):
     def _condition_with_log_probability(self, state: PyTree) -> tuple[jax.Array, PyTree]:
         """Return the log probability that the plant's state lies within the limits, and the filter's state given that.
 
-        A filter's state is one that holds another filter's state, particles, a Gaussian, or a mixture of Gaussians.
+        Limits are known bounds of the plant's states, such as a level that is not negative; estimates are conditioned
+        on them. `state` is one of four: one that holds another filter's state, particles, a Gaussian, or a mixture.
         """
+        # States that hold another one, of a filter of sensor inputs or of a gate, and particles.
         if isinstance(state, StateUnderInputs):
             log_mass, inner = self._condition_with_log_probability(state.base)
             return log_mass, state._replace(base=inner)
@@ -175,6 +177,7 @@ class LimitedFilter(AbstractSizedFilter):
             return log_mass, state._replace(believed=inner)
         if isinstance(state, particles.StateParticles):
             return self._condition_particles(state)
+        # A Gaussian (mean (n,)) is truncated as a mixture (mean (K, n)) with K = 1.
         held_state = self._hold_means(state)
         x = Gaussian(*map(jnp.asarray, gaussian_of(held_state)))
         if x.mean.ndim == 1:

@@ -247,14 +247,18 @@ def _spoil_state(state: PyTree, is_refused: jax.Array) -> PyTree:
 def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: FilterMaker) -> ToldFilter:
     """Return the filter behind a channel that delivers, beside z, numbers that give the law of its gain and noise.
 
+    Such numbers, reported with each message, may be its gain or its noise variance. At each message the filter corrects
+    with the link's law given its numbers.
+
     Args:
         plant: the plant.
         sensor: its sensor.
         channel: a channel that delivers numbers after z; it may vary over time.
         make: builds a filter from a plant, a sensor and a link of known law.
 
-    Claim (what the covariance is): that of the filter for typical numbers; "nominal" if the numbers depend on the
-    state, or if they leave something random that is not drawn anew with each message.
+    Claim (what the covariance is said to be): that of the filter for typical numbers, the ones assumed where none came;
+    "nominal" if the numbers depend on the state, or if they leave something random that is not drawn anew with each
+    message.
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.
@@ -275,6 +279,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         numbers=numbers,
         **make_sizes(claim, base, len(values) + len(numbers)),
     )
+    # The premise: the models under which the claim holds. Here they are the channel and sensor given.
     premise = base.premise
     return with_premise(filter, premise and premise.replaced(sensor=sensor, channel=channel))
 

@@ -221,19 +221,27 @@ def _score_stack_parts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it.
 
+    A channel is a stack of independent parts, one after another in z. In each part the random gain has finitely many
+    values ("combinations" a of its components' gains, with probabilities), so z has a mixture of Gaussians as its law.
     The transform of a component is its probability integral transform, P(less than what came); NaN where none came.
-    y, spread: mean (steps, p) and covariance (steps, p, p) of the signal before each step; z: measurements (steps, m).
+
+    Args:
+        y: mean (steps, p) of the sensor's signal before each step.
+        spread: its covariance (steps, p, p).
+        z: measurements (steps, m), NaN where a component did not arrive.
+        parts: gains (a, outputs, p), offsets, noises and probabilities of each part's combinations.
     """
     log_density, transforms, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
+        # log_weight[..., j] = log(P(a) p(components before j | a)); error: standardised, given a and those before.
         log_weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
         # The transform is sum_a P(a | components before) Phi(error of it in combination a of gains).
         for j in range(stop - start):
             weight = np.exp(log_weight[..., j] - logsumexp(log_weight[..., j], axis=1, keepdims=True))
             below = np.sum(weight * ndtr(error[..., j]), axis=1)
             transforms.append(np.where(np.isnan(z[:, start + j]), np.nan, below))
-        # The part's log-density, and the signal given it, for the next part.
+        # The part's log-density log sum_a P(a) p(part | a), and the signal's moments given this part, for the next one.
         of_part = logsumexp(log_weight[..., -1], axis=1)
         log_density += of_part
         if i + 1 < len(parts):

@@ -137,6 +137,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     Raises:
         ValueError: what is no fates, a share outside [0, 1).
     """
+    # Known fates, of which the first `cut` are fitted to, and log-probabilities of the later ones under each law.
     parts = check_fates(fates)
     share = float(scalar("held-out share", held_out, 0.0, 1.0))
     if share == 1.0:
@@ -144,6 +145,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     known = find_trials(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
     held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
+    # Laws fitted to all packets; those that are significant, and of these the best, also among what a channel can have.
     laws = _fit_laws(parts, intervals=True)
     significant = _find_significant_laws(laws, parts)
     best = _choose_law(significant, held_out_scores)

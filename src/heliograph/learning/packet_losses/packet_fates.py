@@ -76,11 +76,15 @@ def fates_of_sequence(
     Args:
         sequence: sequence numbers in the order of arrival (packets,).
         sent: times of sending (packets,), in any unit; none by default.
-        jump: leap ahead that means a restart; 200 by default.
+        jump: least jump ahead that means a restart; 200 by default.
+
+    Returns:
+        For each stretch the fates of its packets, from the first to the last that arrived: 0 arrived, 1 lost.
 
     Raises:
         ValueError: no packet, numbers that are not whole, times of another length.
     """
+    # Numbers have to be whole, and no larger than doubles hold exactly.
     check_count("jump", jump, 2)
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):

@@ -74,15 +74,16 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
 def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: int, side: int) -> float:
     """Return the share i at which its profile crosses a level, below (side -1) or above (1) the share of the maximum.
 
-    The profile at a logit is the log-likelihood, largest over all other logits. 0 or 1 is returned where it stays above
-    the level on that side.
+    The profile at a logit is the log-likelihood, largest over all other logits. The crossing is an end of a confidence
+    interval of the share, a probability 1 / (1 + exp(-logit)). 0 or 1 is returned where the profile stays above the
+    level up to the end of the domain, -END or END, on that side.
 
     Args:
         function: log-likelihood of the logits and its gradient.
         top: the logits of the maximum (p,).
         level: log-likelihood to which the profile falls.
         i: index of the share.
-        side: -1 or 1.
+        side: -1 to search below the maximum, 1 to search above it.
     """
     others = np.delete(np.arange(len(top)), i)  # indices of the other logits
     start_of_others = top[others]  # the other logits at the last point above the level: the next search begins there

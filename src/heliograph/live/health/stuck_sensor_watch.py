@@ -76,16 +76,20 @@ class RepeatWatch:
         return None if refuses else RepeatWatch.for_sensor(node.sensor, node.channel, node.received)
 
     def extend_runs(self, values: Sequence[float], before: Repeats | None = None) -> Repeats:
-        """Return the runs that end with these readings, NaN where none arrived, after those `before`, if any.
+        """Return the runs of equal readings that end with these `values`, NaN where none arrived.
 
-        Its `found` has one more where a run has become too long with this reading.
+        A sensor that repeats a value for longer than its noise allows is stuck. `before` has the runs up to the
+        reading before; None at the first one. In the result `found` is one more where a run has become too long with
+        this reading.
         """
         m, before = len(values), before or FIRST
-        # The fields of `Repeats`, a list each with one entry for each component, to be changed in place. They are empty
-        # before the first reading.
+        # The fields of `Repeats`, as lists with an entry for each component; empty before the first reading. newest:
+        # last value; lengths: of its run; steps: least difference of two successive readings that differ; readings and
+        # equal: how many came, and how many equalled the one before; found: runs that became too long.
         newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
         least_steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
         equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
+        # For each component: the reading continues its run or begins a new one; then whether the run is now too long.
         for i, value in enumerate(values):
             if value != value:  # NaN: nothing arrived, and the run goes on
                 continue
@@ -97,7 +101,7 @@ class RepeatWatch:
                     least_steps[i] = min(least_steps[i], abs(value - newest[i]))
                 newest[i], lengths[i] = value, 1
             readings[i] += 1
-            # Found once, when its length reaches what is too long. Shorter than LEAST none is: most end here.
+            # A run is counted once, when its length reaches the least that is too long, which is LEAST or more.
             if lengths[i] >= LEAST:
                 too_long = self._find_least_count_too_long(i, lengths[i], least_steps[i], readings[i], equal[i])
                 found[i] += lengths[i] == too_long

@@ -135,7 +135,9 @@ def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarra
 def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     """Return the plant `name` from what `pack_plant` returned, with its rows in new slots of the fleet's table.
 
-    A row is the state at one time. The base is the first row that can still be followed by late events.
+    The bytes hold the rows of live data that late events may still change, with the filters' states after each, and a
+    head: times, counts of messages and what is known of clocks. The base, the first row, is the newest one that is
+    final; later rows are stepped from it. A slot is a row of the fleet's table of filter states.
     """
     parts = PlantParts.from_bytes(data, fleet.pool.table.shape[1])
     head, rows = parts.head, _make_rows_with_events(parts, fleet)

@@ -143,7 +143,9 @@ def with_premise(made: B, premise: Premise | None) -> B:
 def believes(make: Callable[P, B]) -> Callable[P, B]:
     """Let the filter that a function makes keep the models for which it is made: plant, sensor, channel and so on.
 
-    In a network a claim holds where these are the node's own. Without a channel, the sensor is received as it is.
+    A filter's claim says what its covariance is (exact, upper bound, nominal); its premise is the models for which that
+    is so. In a network the claim holds where these are the node's own. Without a channel, the sensor's outputs are
+    received as they are.
 
     Args:
         make: a function that makes a filter for a plant, a sensor and a channel.

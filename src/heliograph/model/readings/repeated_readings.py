@@ -89,13 +89,14 @@ def bound_probability_of_equal_readings(
 ) -> Float[np.ndarray, " outputs"]:
     """Bound the probability that a reading equals the one before it, whatever the sensor measures, of each output.
 
-    A reading y = h(x) + v is reported as the nearest multiple of its resolution q, and equals the one before where v
-    lies in one certain interval of length q. Under a density that falls from its centre no interval of length q has a
-    larger probability than the one about the centre: erf(q / sqrt(8 r)) for Gaussian noise of variance r. That of a
-    mixture is at most the mean over its branches.
+    With this bound a run of equal readings can be found too long for chance: the sensor is stuck. A reading y = h(x) +
+    v is reported as the nearest multiple of its resolution q, and equals the one before where v lies in one certain
+    interval of length q. Under a density that falls from its centre no interval of length q has a larger probability
+    than the one about the centre: erf(q / sqrt(8 r)) for Gaussian noise of variance r. That of a mixture is at most the
+    mean over its branches (the Gaussians of the mixture).
 
     Args:
-        noise: the law of v.
+        noise: the law of v, which may hold the resolution (`RoundedNoise`), or be of independent outputs.
         steps: the resolution of each output that declares none; by default each has to.
 
     Raises:

@@ -73,6 +73,7 @@ def find_clock_set_back(time: np.ndarray) -> int | None:
 def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
     """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
 
+    A stamp is the time that the sender's clock showed. A clock that was not set shows a date that is years off.
     Messages are cut into stretches where the stamp jumps by more than a year. A stretch is of an unset clock in two
     cases, if all its stamps are more than a year outside of all others:
 
@@ -81,8 +82,8 @@ def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, 
       of this century.
 
     Args:
-        time: the stamps.
-        year: a year in their unit (default nanoseconds).
+        time: the stamps (events,).
+        year: a year in the unit of the stamps (default: in nanoseconds).
     """
     # Stretches of messages, as arrays of their indices, between which the stamp jumps by more than a year.
     stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > year) + 1)

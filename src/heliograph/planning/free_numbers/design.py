@@ -36,6 +36,17 @@ class LagrangeConditions(NamedTuple):
 def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     """Return the design of a network that is a function of free numbers: the best of several descents.
 
+    The free numbers, such as gains or powers, are chosen so that the filters' error is least under limits of power, or
+    that the power is least with which a target error is met. The problem is not convex, so there are several starts.
+
+    Args:
+        task: the free numbers with their domains, the error (`criterion`), the budget of powers, and the target error,
+            starts and seed.
+        build: makes the network, from the free numbers as keyword arguments.
+
+    Returns:
+        The numbers found, the powers of each transmitter, the error, and what Lagrange's conditions say of it.
+
     Raises:
         ValueError: no start from which a budget or a target error is met, a network that does not fit the error.
     """
@@ -63,7 +74,8 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
     )
-    # A watt more at every step falls on one transmitter: the price is the largest worth, times the steps.
+    # price: the error that a watt more at every step takes away, given to one transmitter: the largest worth, times
+    # the steps.
     return PowerDesign(
         problem=task,
         powers=dict(zip(problem.names, found.powers.T, strict=True)),
@@ -140,6 +152,11 @@ def evaluate_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorL
     """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
 
     The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
+
+    Args:
+        problem: the function of the free numbers that is minimised, their ranges and units.
+        limits: upper limits of powers, and the target error where there is one (then the power is minimised).
+        x: values of the free numbers.
     """
     # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
     programme, z = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit

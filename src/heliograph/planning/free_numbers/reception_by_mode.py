@@ -248,8 +248,9 @@ def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
 def _find_observed_modes(name: str, channel: AbstractRandomAffine) -> _ObservedModes:
     """Return the modes of a channel that its receiver observes, their Markov chain, and what arrives in each.
 
-    Of a channel without memory a mode is a set of outputs that arrive, drawn anew at each step (`forgets`). Of one with
-    memory a mode is that of its Markov chains, which it delivers to the receiver.
+    If the channel has no memory, a mode is a set of outputs that arrive together, drawn anew at each step (`forgets`).
+    If it has memory, a mode is the joint state of its Markov chains, which it delivers to the receiver; then everything
+    arrives. `name` names the channel in errors.
     """
     if not memories(channel):
         cases = channel.list_outcomes()

@@ -373,8 +373,8 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
     """Return the design of a task: the least error within its limits, or the least power that reaches a target.
 
     Args:
-        problem: what was to be designed, for the result.
-        task: the search of the free powers.
+        problem: the user's design problem, kept in the result.
+        task: paths of hops, which hops' powers are free, the powers of the others, and starts of the search.
         target: the target error; None for the least error.
         present: error of the network as it is.
     """

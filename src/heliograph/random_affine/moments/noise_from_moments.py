@@ -74,9 +74,10 @@ class NoiseMoments(AbstractNoise):
 def check_moments(moments: np.ndarray) -> None:
     """Raise ValueError unless some distribution on the line has E[n^k] = moments[k - 1].
 
-    Every even moment must reach what the lower ones imply: with V = (1, n, ..., n^(j-1)) and H = E[V V'],
-    E[n^2j] >= h' H^-1 h for h = E[V n^j]. For j = 2 and zero mean: m4 >= m2^2 + m3^2 / m2. Where H is singular
-    (finitely many atoms) h must lie in its range.
+    Users state the moments of a noise n, and mistyped ones belong to no law. Every even moment must reach what the
+    lower ones imply: with V = (1, n, ..., n^(j-1)) and H = E[V V'], E[n^2j] >= h' H^-1 h for h = E[V n^j]. For j = 2
+    and zero mean: m4 >= m2^2 + m3^2 / m2. Where H is singular (a law on finitely many points, its atoms) h must lie in
+    its range.
     """
     sequence = np.concatenate([[1.0], moments])
     # m[k] = E[n^k] in units of root(E[n^2])^k, so that one tolerance serves all orders; up to the first order whose

@@ -181,8 +181,8 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
 def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
     """Return the moments of z = G y + n of a channel of known law, which are their own bounds.
 
-    With M = E[(G, n)] these are the spread, Cov of the entries of (G, n); the shift of the mean under other laws, here
-    zero; and the power E[G y y' G'], which is the spread of G plus the square of E[G].
+    With M = E[(G, n)]: `spread`, covariance of the entries of (G, n); `shift`, what other laws' means would add, here
+    zero; `power`, E[G W G'] for W = E[y y'], which is the spread of G plus E[G] W E[G]'. Each maps W to a covariance.
     """
     # Maps in a sum or stack are independent. Their covariances give the spread without the channel's large moments.
     if isinstance(channel, Superposed | Stack):

@@ -105,10 +105,11 @@ def _choose_likeliest_error(
     """Return the likeliest of the errors of single outputs, and what innovations are without its effect.
 
     Args:
-        candidates: the likeliest error of each output.
+        candidates: for each output its likeliest constant error: `gain`, twice the log of its likelihood ratio to no
+            error, and `response`, the change of the innovations by an error of one.
         e: innovations, NaN where nothing arrived.
-        variance: their claimed variances.
-        white: innovations in units of the filter's claim, 0 where nothing arrived.
+        variance: their variances as the filter states them.
+        white: innovations whitened by the covariance that the filter states, 0 where nothing arrived.
     """
     arrived = ~np.isnan(e)
     best = max(candidates, key=lambda candidate: candidate.gain)

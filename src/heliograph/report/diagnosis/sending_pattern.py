@@ -41,10 +41,12 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
 def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
     """Return the pattern that random losses would make with the least probability; None if all are likely enough.
 
-    A pattern is a mask of the due rows (length,), which repeats. Of each length the smallest pattern is tried: rows in
-    which a message came. Probabilities are bounds, times the number of patterns that might have been found instead;
-    `least` is the logarithm of the least one so far, from CHANCE on.
+    A sender may be due in some rows only, as every third one; then the other rows are no losses. A pattern is a mask of
+    the due rows (length,), which repeats. Of each length the smallest pattern is tried: rows in which a message came.
+    Probabilities are bounds, times the number of patterns that might have been found instead; `least` is the logarithm
+    of the least one so far, from CHANCE on. `arrived`: whether a message came in each row (rows,).
     """
+    # Losses at random, in bursts: a law fitted to the intervals between arrivals.
     arrivals = np.flatnonzero(arrived)
     intervals = np.diff(arrivals)
     law = BurstLossLaw.fit_to_intervals(intervals)

@@ -169,14 +169,15 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
 def make_backtest_page(
     found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes], refit: int = 0
 ) -> Page:
-    """Return the page of a backtest.
+    """Return the page of a backtest: forecasts from past rows, scored by what came later.
 
     Args:
-        found: the scores.
+        found: the scores of each forecast number, by node, filter and horizon.
         network: the user's name of the network.
-        drawings: each figure as SVG.
-        refit: rows between fits of its free numbers; 0 by default, for none.
+        drawings: each figure as SVG, by name.
+        refit: rows between fits of the network's free numbers; 0 by default, for none.
     """
+    # Text at the head of the page, below the figure, and a sentence for each filter.
     verdicts = judge_forecasts_of_filters(found)
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "

@@ -13,10 +13,11 @@ from heliograph.simulation.results.record import Record
 def run_summary(health: Health) -> dict[str, Json]:
     """Return all numbers of the report of a run by name, as summary.json holds them.
 
-    Those of filters and outputs are by node and filter, those of links by node and component.
+    Numbers of filters and outputs are by node and filter, those of links by node and received component. A link's
+    numbers are of its losses. Overloads are the probabilities that a signal is beyond the range of its codewords.
 
     Args:
-        health: what `examine` returned.
+        health: what `examine` returned: tests of a run's filters, outputs and links, with their verdicts.
 
     Raises:
         ValueError: `health` is not what `examine` returns.

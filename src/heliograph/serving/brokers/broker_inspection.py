@@ -93,7 +93,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
     Args:
         address: the server.
         seconds: how long to listen.
-        topics: by name, to which what comes is added.
+        topics: statistics of each topic by its name, to which the messages are added.
 
     Raises:
         ValueError: no connection.

@@ -138,8 +138,9 @@ class LineReader:
     def _interpret_message(self, message: FileMessage | InputError, read: Read | None) -> list[Payload]:
         """Return what one message of a line or document says, as payloads for the service.
 
-        A message in another form than ours, or with a topic, goes to the translator of sources. One in our own form is
-        read as a message to a service if it is one, else as an event in a file.
+        A message in another form than heliograph's own, or with a topic, goes to the translator, which knows the
+        senders' forms. One in our own form is read as a message to a service if it is one, else as an event in a file.
+        A payload is a message, or the reason why it cannot be read.
 
         Args:
             message: the message, or why it could not be read.

@@ -61,8 +61,9 @@ class Reporting(NamedTuple):
 def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
     """Read from an OPC UA server by which rule it reports variables: deadband and sampling interval.
 
-    The interval is the attribute MinimumSamplingInterval; the deadband the property ExceptionDeviation of the variable
-    or of its historical configuration, in its unit or in percent of the EURange.
+    A server sends a variable only if it has moved by more than the deadband, so its silence tells something too. The
+    interval is the attribute MinimumSamplingInterval; the deadband the property ExceptionDeviation of the variable or
+    of its historical configuration, in its unit or in percent of the EURange.
 
     Args:
         url: address of the server, opc.tcp://host:port/path.

@@ -141,11 +141,12 @@ class Translator:
         The reason is an UnreadMessage where node and count of the reading are known, else a text.
 
         Args:
-            topic: where it came from.
-            payload: as the broker gave it.
+            topic: topic from which it came.
+            payload: JSON as the broker gave it, bytes or a text; or its content, if that was read already.
             arrival: when it came, None for now.
-            stored: the broker had kept it, so that it is left out where it has no time of its own.
-            repeatable: whether a copy of it may come again, so that its number is made from what it says.
+            stored: whether the broker had kept it from earlier. Then its arrival does not date it, and a reading
+                without a time of its own is left out, and counted.
+            repeatable: whether a copy of it may come again, so that its number is made from its contents.
             where: place that an error names.
         """
         results: list[Message | UnreadMessage | str] = []
@@ -198,18 +199,22 @@ class Translator:
             return why
 
     def _make_message(self, topic: str, reading: Reading, known: datetime | None, repeatable: bool) -> Message:
-        """Return the message of a reading, with a number if it has no count.
+        """Return a reading's message to the service; without a running count it gets a number as its `sequence`.
+
+        A message has a plant, a node, a number, a time and values. Numbers tell copies and losses.
 
         Args:
-            topic: where it came from, for errors.
-            reading: what the sources read.
-            known: when it arrived; None if it is not known, and is taken to be now.
+            topic: topic of the broker from which the reading came, for errors.
+            reading: plant, node, values, and if the sender gave them count and time.
+            known: when it arrived; None if that is not known: then it is taken to have arrived now.
             repeatable: whether a copy of it may come again.
         """
+        # Names that the service can hold.
         if len(reading.plant) > NAME or "\0" in reading.plant:
             expected = f"a name of at most {NAME} characters, without NUL"
             raise fail(f"{topic}, plant", expected, show_value(reading.plant))
         arrival = datetime.now(UTC) if known is None else known
+        # A copy of the node's last message, repeated by a gateway, gets the time of the original.
         nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000
         reading = self.sources.date_copy_as_original(reading, nanoseconds)
         time = self._date_reading(topic, reading, arrival, is_known=known is not None)

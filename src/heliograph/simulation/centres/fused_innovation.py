@@ -120,16 +120,20 @@ def _correct_in_turn(
     u: jax.Array,
     k: jax.Array,
 ) -> _CorrectedEstimate:
-    """Return x corrected by these nodes too, one after another, and with their innovations in the sums.
+    """Return the fused estimate x, corrected by these nodes' measurements too, with their innovations in the sums.
+
+    The nodes' filters correct x one after another. The sum of squares e' S^-1 e tests the fused estimate: if its
+    covariance is right, it is the number of values that arrived, on average.
 
     Args:
-        corrected: x and the sums over the nodes before.
-        filters: one of each node, stacked.
-        states: of the filters before the step; all that they hold beside x is predicted by each filter itself.
+        corrected: x, the sum of squares and the number of values, over the nodes before.
+        filters: one filter of each node, stacked.
+        states: states of the filters before the step; what they hold beside x, each filter predicts itself.
         received: measurements (node, received).
         u: inputs of the plant over the step.
         k: number of the step.
     """
+    # The scan goes over the filters' arrays; what is not an array is the same in all of them.
     numbers, static = eqx.partition(filters, eqx.is_array)
 
     def correct(before: _CorrectedEstimate, row: tuple[PyTree, PyTree, jax.Array]) -> tuple[_CorrectedEstimate, None]:

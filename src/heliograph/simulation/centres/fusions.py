@@ -159,9 +159,9 @@ class ReportFusion(Module):
         """Send the nodes' means as reports, and correct the centre's filter with those that arrive at step k.
 
         Args:
-            state: of reports in transit and of the centre's filter, before the step.
-            estimates: of the nodes' filters, for each stack of filters of one structure (filter, node, ...).
-            drawn: gains, offsets and delays of the uplinks at this step.
+            state: reports in transit and state of the centre's filter, before the step.
+            estimates: estimates of the nodes' filters, for each stack of filters of one structure (filter, node, ...).
+            drawn: gains, offsets and delays of the uplinks at this step: a report m arrives as gain m + offset.
             u: inputs of the plant over the step.
             k: number of the step.
 
@@ -309,11 +309,12 @@ def _build_centre(
 ) -> FusionCentre | LinearisedCentre:
     """Return the centre that fuses the estimates of the filter `name` of all nodes that have it.
 
-    `rules`: by name of the fusion; each needs the joint covariance of the nodes' errors, which the centre propagates.
+    The centre propagates the joint covariance of the nodes' errors, which its rules need, from models of all nodes.
+    `rules`: the fusion rules by name of the fusion.
     """
     places, claims = network.places, network.claims()[FUSED]
     nodes = network.nodes_with(name)
-    # In which stacks of filters (sources) the nodes' filters are, and the nodes of each stack.
+    # sources: (kind, number in the kind) of the filters' stacks; order: brings their nodes into the order of `nodes`.
     sources, order = find_source_filters(network, places, nodes, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     longest_measurement = max(network.nodes[node].received for node in nodes)

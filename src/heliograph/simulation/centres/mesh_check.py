@@ -211,10 +211,12 @@ def _check_detectability(what: str, name: str, fusion: Fusion, network: HasNodes
 def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Raise ValueError if a node's error grows whatever the rule, since messages about a mode are lost too often.
 
-    For each set of nodes that do not see the mode lambda, all edges into the set must not be lost too often together:
-    |lambda|^2 p < 1, p the product of their loss rates (of losses in bursts the chance of a bad state to stay). The set
-    of largest p about a node is the minimal cut between it and those that see the mode, of capacities -log p. Not
-    checked for more than CUTS nodes, where the plant varies, or where a loss rate is unknown.
+    A mode of the plant is an eigenvector of its matrix, with the eigenvalue lambda; it grows where |lambda| > 1. For
+    each set of nodes whose sensors do not see the mode, all edges (links between neighbours) into the set must not be
+    lost too often together: |lambda|^2 p < 1, p the product of their loss rates (of losses in bursts the chance of a
+    bad state to stay). The set of largest p about a node is the minimal cut between it and the nodes that see the mode,
+    with the capacity -log of its loss rate for each edge. Not checked for more than CUTS nodes, where the plant varies,
+    or where a loss rate is unknown. `what` names the fusion in errors.
     """
     link, names = fusion.link, graph.nodes
     if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
@@ -226,7 +228,7 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
     # edge that loses nothing.
     exact = np.array([-np.log(max(float(rate or 0.0), 1e-300)) for rate in rates])
     capacities = np.minimum(np.round(UNIT * exact), WIDEST).astype(np.int32)
-    # Of each unstable mode the least cut between the nodes that observe it and each other node.
+    # For each unstable mode: the least cut between the nodes that observe it and each other node.
     values, vectors = np.linalg.eig(np.asarray(first(network.plant).matrix))
     for value, vector in zip(values, vectors.T, strict=True):
         if abs(value) <= 1 + MODE:

@@ -151,7 +151,7 @@ def mesh_errors(
 def propagate_errors_over_time(
     mesh: Mesh, flags: np.ndarray, u: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the joint covariance (N, N), its diagonal blocks and what nodes claim of these (node, n, n), step by step.
+    """Yield the errors' joint covariance (N = nodes n), its diagonal blocks (node, n, n), and what nodes say these are.
 
     Args:
         mesh: the fusion between neighbours.
@@ -160,7 +160,7 @@ def propagate_errors_over_time(
     """
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-    # Before any data all nodes have the same error, x_0 - E x_0.
+    # Before any data all nodes have the same error, x_0 - E x_0: every block of the joint covariance J is Cov x_0.
     covariance, moments = start.covariance, start.plant
     _, initial_covariance = start.plant
     count, n = start.mean.shape
@@ -172,7 +172,7 @@ def propagate_errors_over_time(
             step = to_numpy(
                 _compute_step_when_all_is_measured(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k))
             )
-        joint = _propagate_joint(mesh, joint, step, arrived)
+        joint = _propagate_joint(mesh, joint, step, arrived)  # J+ = M J M' + F Q F' + sum_l W_l S_l W_l'
         covariance, moments = step.gains.covariance, step.plant
         diagonal_blocks = np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy()
         # Nodes that follow the joint covariance claim their part of it, the others the covariance of their rule.
@@ -228,13 +228,13 @@ def best_possible(
 ) -> Float[np.ndarray, "node n n"]:
     """Return a lower bound on the covariance of every node's error after the last step, which no linear rule can beat.
 
-    z_j(k - a) can be at node i only if a message carried it there since; a Riccati recursion from the plant's initial
-    covariance uses all that can be there, oldest first. Where all is Gaussian no rule at all is better.
+    Node j's measurement can be at node i only if messages carried it there since. A Riccati recursion from the plant's
+    initial covariance uses all that can be there, oldest first. If all laws are Gaussian, no rule at all is better.
 
     Args:
         network: the network.
         fusion: name of its fusion between neighbours.
-        arrived: as for `mesh_errors`.
+        arrived: which messages arrive (horizon, node, rounds, degree), or a number of steps at which all arrive.
         inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Raises:
@@ -251,8 +251,8 @@ def best_possible(
         for k, u_k in enumerate(u):
             steps.append(to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k))))
             moments = steps[-1].plant
-    # Riccati recursions of all nodes side by side, oldest measurement first, by roots: P- = A P A' + Q = V V' with
-    # V = (A P^1/2, Q^1/2), and P = (P-^-1 + S)^-1.
+    # Riccati recursions of all nodes side by side, oldest measurement first, for P = root root': the columns (A root,
+    # Q^1/2) are a root of P- = A P A' + Q, and P = (P-^-1 + S)^-1 with S = `information` of all that can be there.
     count = len(mesh.nodes)
     root = roots_of(np.asarray(start.covariance))
     for model, information in zip(steps, _sum_known_information(mesh, flags, steps), strict=True):

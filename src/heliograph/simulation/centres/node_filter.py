@@ -191,9 +191,10 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
 
 
 def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
-    """Return the mesh of which one node estimates, from its own measurement and its neighbours' messages.
+    """Return the mesh (a fusion between neighbours) in which one node alone estimates, for a filter of that node.
 
-    No message gets lost in it: one that did not arrive is given to the filter as a message of NaN.
+    It uses the node's own measurement and its neighbours' messages. No message gets lost in it: a message that did not
+    arrive is given to the filter as a message of NaN.
 
     Args:
         network: the network.
@@ -206,7 +207,7 @@ def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
     graph = graph_of(neighbours, nodes)
     i, count = nodes.index(node), 1 + len(neighbours[node])
     row = Graph(nodes, senders=graph.senders[i : i + 1, :count], present=np.ones((1, count), dtype=bool))
-    only_node = np.zeros(1, dtype=int)  # the one node that estimates stands first among the members
+    only_node = np.zeros(1, dtype=int)  # number of the one node that estimates: it is the first of the members
     # The members: the node and its neighbours. Each has a measurement model of its own, since they may differ in
     # structure; None without a sensor.
     names = (node, *neighbours[node])

@@ -142,11 +142,15 @@ class Uplinks(Module):
     ) -> UplinkDraws:
         """Return gains, offsets and delays of each step from a recording, with a leading axis of time.
 
+        They stand for the draws of a simulation: a report m arrives as gain m + offset after a delay. Here gains are 0,
+        and offsets are the recorded values.
+
         Args:
-            name: of the fusion.
-            nodes: names of its nodes.
-            reports: what arrived of each node's report by the step at which it was sent (steps, numbers), NaN where
-                lost, with delays where these are not fixed; None where none were recorded.
+            name: name of the fusion, for errors.
+            nodes: names of the nodes that report to it.
+            reports: for each node, the received values of its reports (steps, numbers), in the row of the step at which
+                a report was sent, NaN where it was lost; `SentReports` adds delays where they are not fixed. None if
+                no reports were recorded.
             steps: number of steps.
 
         Raises:
@@ -163,7 +167,7 @@ class Uplinks(Module):
         # The recorded values enter as offsets of links without gain.
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
-            sent, size = reports[node], self.received[i]
+            sent, size = reports[node], self.received[i]  # `size` numbers arrive of a report; the rest of a row is NaN
             if isinstance(sent, SentReports):
                 delay[:, i] = self._check_delay(f"delays of node {node!r}", sent.delay, steps, i)
                 sent = sent.values

@@ -44,10 +44,11 @@ def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
 def _doubt_unseen_states(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each filter that ends where no sensor shows a state that one showed at the start.
 
-    A state is shown where an output within n steps depends on it, as far as the filter looks (`_FilterView`). Where
-    none does, as beyond the end of a table, the gain of the state is by its correlations alone: what arrives says
-    nothing of where it is. Not judged: states with limits, which bring an estimate back; particles and mixtures; models
-    that vary over time or have modes; estimates that are no numbers.
+    A state is shown where an output within n steps depends on it, at the estimate: by the sensors' tangents, or by
+    their values within the filter's deviations (`_FilterView`). Where none does, as beyond the end of a table, what
+    arrives says nothing of where the state is, and the estimate cannot return. Not judged: states with limits, which
+    bring an estimate back; particles and mixtures; models that vary over time or have modes; estimates that are no
+    numbers.
     """
     plant = network.plant
     if not isinstance(plant, AbstractPlant) or isinstance(plant, ModalPlant):
@@ -98,11 +99,12 @@ def _find_unseen_states(
 def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each state with limits whose estimate lies at one of them in most rows.
 
-    The filter's Gaussian N(m, s^2) is cut off at the limits; it tells the mean and the deviation of what remains. If m
-    lies at a limit, a half Gaussian remains, of mean sqrt(2 / pi) s from the limit and deviation sqrt(1 - 2 / pi) s.
-    Their ratio is HELD; it is larger if m lies further inside. The ratio is exact for one limited state; with several
-    limited states it holds nearly (up to the share CLOSE). Limits nearer to each other than APART deviations are not
-    judged, since both cut.
+    Such an estimate says that the data pull the state out of its range, so that sensor, plant or limit may be wrong.
+    The filter's Gaussian N(m, s^2) is cut off at the limits, and its estimate is the mean and the deviation of the cut
+    Gaussian. If m lies at a limit, a half Gaussian remains, of mean sqrt(2 / pi) s from the limit and deviation
+    sqrt(1 - 2 / pi) s. Their ratio is HELD; it is larger if m lies further inside. The ratio is exact for one limited
+    state; with several limited states it holds nearly (up to the share CLOSE). Limits nearer to each other than APART
+    deviations are not judged, since both cut.
     """
     for node, label, filter, _ in _yield_filters_with_covariance(network):
         if not isinstance(filter, LimitedFilter):
@@ -111,6 +113,7 @@ def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
         for state, *limits in filter.limits:
             mean = np.asarray(estimate.mean)[:, state]
             deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, state, state], 0.0))
+            # At the limit: |mean - limit| / deviation of the cut Gaussian is at most the ratio of a half Gaussian.
             for limit in (end for end in limits if np.isfinite(end)):
                 is_at_limit = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
                 is_at_limit &= np.ptp(limits) > APART * deviation

@@ -112,14 +112,16 @@ def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return the outputs of `AllFilters.step` for all rows of a recording, as NumPy arrays.
 
-    With a smoother, the results are those of `NetworkSmoother.smooth_run`. Two entries are added: "measurements", z,
-    and "state", the filters' last states. They are computed in chunks side by side, by native code, or by XLA.
+    A row has the measurements of one time. With a smoother, the results are those of `NetworkSmoother.smooth_run`. Two
+    entries are added: "measurements", z, and "state", the filters' last states. There are three ways to compute the
+    same: chunks of rows side by side, native code row after row, or XLA.
 
     Args:
-        task: the filters, the smoother, inputs, which messages arrive between nodes, and where the rows begin.
-        z: measurements (steps, node, received) by group.
+        task: the filters, the smoother, inputs, which messages arrive between nodes, and the states before the rows.
+        z: measurements (steps, node, received) for each group of nodes of one structure.
         judged: True to leave out measurements that filters judge implausible.
     """
+    # Chunks side by side need linear filters, no fusion, no smoother and many rows; else `results` is None.
     results = None if judged else _filter_in_chunks(task, z)
     if results is not None:
         return results

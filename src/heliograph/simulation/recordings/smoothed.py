@@ -167,10 +167,18 @@ class SmoothingPlan(NamedTuple):
 def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothingPlan:
     """Return the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
 
+    A smoothed estimate uses data from after its own time too. In a network with relays, relays send filtered estimates
+    on, and only the receiver at the end is smoothed.
+
     Args:
         network: the network.
-        smoothing: which estimates are made.
+        smoothing: which estimates are made: of a fixed interval, lag or point.
         horizon: number of steps.
+
+    Returns:
+        The smoothed part as a network, the smoothing, the numbers of the part's kinds and groups in the whole network
+        (a group: nodes of one structure; a kind: filters of one structure in a group), and its claims: what the
+        smoothed covariances are said to be.
 
     Raises:
         ValueError: no filter, a filter or a fusion that cannot be smoothed, a horizon too short for the smoothing.
@@ -187,7 +195,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
     has_filters = any(node.filters for node in smoothed.nodes.values())
     if not has_filters and not smoothed.fused:
         raise fail("smoothing", "a filter at a node or the centre", "a network without filters")
-    # Claims of smoothed estimates and of their fusions.
+    # Claims of smoothed estimates, by node and filter, and of their fusions at the centre.
     claims: Claims = {
         name: {f: _find_claim_of_smoother(filter) for f, filter in node.filters.items()}
         for name, node in smoothed.nodes.items()
@@ -196,7 +204,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         claims[FUSED] = {
             name: _find_claim_of_fusion(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()
         }
-    # Where the part's nodes and filters stand in the whole network.
+    # Numbers of the part's groups of nodes and kinds of filters in the whole network.
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
     return SmoothingPlan(smoothed, smoothing, kinds, groups, claims)
@@ -315,8 +323,9 @@ def finish_result(
     """Return the result of a network's runs, with that of its smoothed part; warn of filters that are not consistent.
 
     Args:
-        reducer: by which the runs were reduced.
-        recorded: sums over the runs, and what was collected.
+        reducer: makes a result, such as error statistics, from sums over the runs.
+        recorded: sums by batch of runs; sums of numbers that all runs share (common), once; runs in each batch
+            (count); and arrays that were collected.
         network: the network.
         smoothing: its smoothed part; None where nothing was smoothed.
     """

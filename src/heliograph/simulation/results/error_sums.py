@@ -59,9 +59,10 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def of_step(self, step: PyTree) -> OfStep:
         """Return the numbers of one step of one run that are summed over runs, and flags of failures.
 
-        They are, for each estimate with error e and claimed covariance B: the products e_i e_j (i <= j), the normalised
-        error squared (NEES) e' B^-1 e, B_ij, and whether e or the NEES is no number; and what the nodes' quantizers
-        sent. The flags are also returned as `ever`, to count the runs in which they are true at some step.
+        They are, for each estimate with error e and the covariance B that the filter states: the products e_i e_j
+        (i <= j), the normalised error squared (NEES) e' B^-1 e, B_ij, and whether e or the NEES is no number; and what
+        the nodes' quantizers sent. Their means over runs show if B is right. The flags are also returned as `ever`, to
+        count the runs in which they are true at some step.
 
         `step`: the truth, estimates by kind (a stack of filters of one structure), and fused ones by name. All lie one
         after another along one axis (`part`). But covariances are a tuple with an array for each kind: if a filter's
@@ -93,7 +94,9 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> RunSums:
         """Return the sums over all runs, with filters whose covariance differs between runs first, the others last.
 
-        Each estimate has one index of the axis `part`. Filters of one structure (a kind) have consecutive indices.
+        Each estimate has one index of the axis `part`, and each entry (i <= j) of a symmetric matrix one of the axis
+        `pair`. Filters of one structure (a kind) have consecutive indices. "claimed" is the covariance that a filter
+        states; if it is the same in all runs, as with linear filters without losses, one copy is held.
 
         Args:
             sums: what was summed over runs: "pairs" (time, part, pair, batch), "nees" (time, part, batch), "failed"
@@ -277,7 +280,9 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
         raise fail("node and filter", f"one of {known}", show_value((node, name)))
     estimate = record.estimates[node][name]
-    # Sums as of a simulation in which this is the only estimate, a fused one. Run r belongs to batch r mod BATCHES.
+    # Sums over runs of errors' products, of normalised squares and of stated covariances, in BATCHES batches for
+    # standard errors: run r belongs to batch r mod BATCHES. Their form is that of a simulation with this one estimate,
+    # a fused one.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
     step: OfStep = over_runs(partial(_reduce_run, attitude=estimate.attitude), *arrays)
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))

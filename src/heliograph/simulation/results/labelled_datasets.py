@@ -221,10 +221,10 @@ class FilterLabels:
         """Return a dataset of fields, with names, times and units as coordinates.
 
         Args:
-            title: by which it is known again.
-            fields: arrays by name of the field, with the axes of FIELDS.
-            time: of the rows, numbers or dates.
-            units: by the state's name, and of "time".
+            title: a title, by which the dataset is known again.
+            fields: arrays by name of the field, such as "mean"; FIELDS names their axes and says what they are.
+            time: times of the rows, numbers or dates.
+            units: units by the state's name, and the unit of "time".
         """
         import xarray as xr
 

@@ -16,10 +16,11 @@ def warn_of_non_finite_numbers(record: Record, complete: Iterable[str] = (), sta
     Covariances are not judged here, which of many runs takes long; `Record.failures` does.
 
     Args:
-        record: the record.
+        record: estimates by node and filter, and the truth and measurements if they were simulated.
         complete: names of simulated nodes at which nothing is ever lost, so that a NaN is the sensor's.
-        stacklevel: as of `warnings.warn`, of the caller.
+        stacklevel: which caller a warning names, as for `warnings.warn`, counted from the caller of this function.
     """
+    # What was simulated; then each filter's means, and covariances where it states some (claim other than "none").
     simulated = {} if record.truth is None else {"the true state, which the plant makes": record.truth}
     for name in complete:
         simulated[f"measurements of node {name!r}, where nothing is lost"] = record.measurements[name]

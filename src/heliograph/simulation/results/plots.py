@@ -84,9 +84,10 @@ def draw_state(
     """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations, and the true state.
 
     Args:
-        panel: to draw on.
+        panel: the axes to draw on.
         time: times of the rows.
-        estimates: by name.
+        estimates: estimates by name, with means (..., time, n) and covariances (..., time, n, n); those whose claim is
+            "none" have no covariance, and get no band.
         run_and_state: index of the run (... without an axis of runs), and number of the state.
         sigmas: half-width of the bands.
         truth: the true state (time,), of which estimated angles are within half a turn; None where it is unknown.
@@ -99,6 +100,7 @@ def draw_state(
         mean = np.asarray(estimate.mean)[run][..., i]
         variance = np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
+        # The line is interrupted where an angle jumps by a full turn.
         drawn_time, mean, band = insert_gaps(time, find_wraps(mean, most), mean, sigmas * deviation)
         panel.plot(drawn_time, mean, color=choose_colour(number), label=quote_for_figure(name))
         if estimate.claim != "none":

@@ -123,7 +123,8 @@ def split_by_name(
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return arrays that are stacked over filters and nodes as one array for each node and filter, by their names.
 
-    Filters that differ in numbers alone, at nodes that do so (a group), are of one kind and are stacked.
+    Simulations stack filters of one structure, for speed: those that differ in numbers alone, at nodes that do so too
+    (a group), are of one kind, and have their arrays along one axis. Users ask by the names of node and filter.
 
     Args:
         network: the network; its `kinds` are (group, names of the filters) of each stack, and `mesh_kinds` those of

@@ -159,6 +159,10 @@ class ErrorStatistics:
     ) -> "WorstDirection":
         """Return the ratio in the batches held out, in the direction of largest error over claim in the others.
 
+        The ratio d' E[e e'] d / d' E[P] d compares errors e with the covariance P that the filter states (the claim),
+        at one step in one direction d. Chosen as the largest and judged on the same runs, it would be too large by
+        chance; so batches of runs are split, and some choose, others judge.
+
         Args:
             held_out: whether each batch is held out (batch,).
             outer: sums of e e' (batch, time, n, n).

@@ -207,18 +207,19 @@ def _transmit(
     """Measure x at one node and deliver through its channel: return the link after step k, and what is received.
 
     Args:
-        node: a row of its group.
-        link: before the step.
-        x: state of the plant, to which u led.
+        node: sensor, channel and sending rule of the node: one row of its `NodeGroup`.
+        link: states of channel, feedback, sender and sensor modes before the step.
+        x: state of the plant at step k.
         u: inputs of the plant over the step.
-        key: of the run.
+        key: key of the run; each draw gets its own from it, the step and what it is for.
         k: number of the step.
     """
-    # What the sensor reports of x, in the present modes of its memories.
+    # y = h(x) + v with the sensor in its present modes (states of Markov chains); then the modes move on.
     sensor = condition_on_memories(at(node.sensor, k), link.modes).under(node.inputs, u)
     modes = move_modes(node.sensor, link.modes, key, k, node.modes)
     y = measure(sensor, x, draw_key(key, k, node.checksums, SENSOR))
-    # Output that the last estimate fed back predicts; a sensor with feedback sends the difference from it.
+    # A filter's last estimate may be fed back to the sensor, which predicts its output r (`reference`) from it. A
+    # sensor with feedback sends y - r.
     reference: jax.Array | None = None
     if node.reference_filter is not None and link.feed_back is not None:
         reference = node.reference_filter.predict_reference(link.feed_back, u, k)
@@ -227,7 +228,7 @@ def _transmit(
     y, z, memory = _send_through_channel(node, link.memory, y, key, k)
     if node.trigger is None or link.sender is None:  # it always sends
         return LinkState(memory=memory, feed_back=link.feed_back, modes=modes), z
-    # The sender decides, by its own reference or the filter's prediction.
+    # The sender sends or not by how far y is from a reference: its own, or the filter's prediction r.
     sender = link.sender
     if node.trigger.reference == "prediction" and reference is not None:
         sender = sender._replace(reference=reference)
