@@ -346,11 +346,18 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
 def _compile_scan(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
     """Return the code of a scan in a tree (begin, step, fixed, rows) with these leaves, or None and why there is none.
 
-    Of arrays the leaves have shapes and types, of rows those of one row.
+    A scan is state = begin(fixed), then (state, output) = step(fixed, state, row) for each row. The code depends on
+    structure and shapes alone, so that it is cached by them: a leaf that is an array stands here as an `_ArrayOfRun`,
+    its shape and type (of the rows' arrays those of one row), and `differs` marks the arrays of rows.
+
+    Args:
+        structure: JAX's structure of the tree (begin, step, fixed, rows).
+        leaves: its leaves: an `_ArrayOfRun` for each array, all others themselves.
+        most: passed on to `compile_scan`.
     """
 
     def begin(fixed: Any) -> PyTree:
-        """Return the state before the first row; what `begin` is given has no row in it."""
+        """Return the state before the first row; the rows' places in the tree hold None, since `begin` sees none."""
         function, _, tree, _ = _put_in_tree(structure, leaves, [*fixed, *[None] * len(of_rows)])
         return function(tree)
 
@@ -360,6 +367,7 @@ def _compile_scan(structure: Any, leaves: tuple[Any, ...], most: int | None) -> 
         after: tuple[PyTree, PyTree] = function(trees[0], state, trees[1])
         return after
 
+    # The arrays of rows come last in the tree, so `[*fixed, *row]` are the values of all arrays in order.
     arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
     of_rows = [array for array in arrays if array.differs]
     fixed = [array for array in arrays if not array.differs]

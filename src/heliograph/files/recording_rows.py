@@ -56,6 +56,7 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
     """
     if find_backwards_row(cells.time) is None:
         return cells, [], 0
+    # Decide which rows are refused, by the rule for continuous time or for time in steps. Dates compare as integers.
     dated = cells.time.dtype.kind == "M"
     stamps = cells.time.astype(np.int64) if dated else cells.time
     is_continuous = TIME_STEP in network.inputs
@@ -72,6 +73,7 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
         for number, time in zip(cells.numbers[is_refused].tolist(), cells.time[is_refused], strict=True)
     ]
     kept = cells.select(~is_refused)
+    # Of the other rows, count those after a later one, and sort all by time; rows of equal times keep their order.
     latest_so_far = np.maximum.accumulate(kept.time)
     behind = int(np.count_nonzero(kept.time < latest_so_far))
     return kept.select(np.argsort(kept.time, kind="stable")), refused, behind

@@ -54,6 +54,7 @@ def gilbert_elliott(
         ValueError: probabilities outside [0, 1], both zero, or channels of different shapes.
     Source: Gilbert (1960), Elliott (1963).
     """
+    # A Markov chain of the two states with the transition matrix [[1 - p, p], [q, 1 - q]]: p fails, q recovers.
     p, q = scalar("fail", fail, 0.0, 1.0), scalar("recover", recover, 0.0, 1.0)
     xp = library(p, q)
     transition = xp.stack([xp.stack([1 - p, p]), xp.stack([q, 1 - q])])

@@ -291,12 +291,13 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
 def check_states(name: str, filter: object, network: HasNodes) -> None:
     """Raise ValueError unless a filter has as many states and inputs as the plant, and the plant's attitudes.
 
-    An attitude is three states that are a rotation. A filter corrects it by a rotation, where it adds to other states.
+    An attitude is three states that are the vector of a rotation. A filter corrects an attitude by composing rotations,
+    and other states by adding, so filter and plant must agree which states are attitudes.
 
     Args:
-        name: of the filter or fusion, for errors.
-        filter: a filter, or a fusion, which has no states of its own.
-        network: with the plant.
+        name: name of the filter or fusion, for errors.
+        filter: a filter, or a fusion, which has no states of its own: only its attitudes are compared.
+        network: the network with the plant.
     """
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
@@ -310,6 +311,7 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
                     f"the plant's {len(of_plant_names)} {kind} {list(of_plant_names)}",
                     f"{len(of_filter_names)} {list(of_filter_names)}",
                 )
+    # Numbers of the states that are attitudes, for the plant and for the filter.
     of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
     if of_plant != of_filter:
         expected, got = ([network.states[i] for i in places] for places in (of_plant, of_filter))

@@ -295,16 +295,16 @@ def _locate_rows(
 ) -> list[PrefetchedRows]:
     """Write the addresses of the rows that a loop prefetches; return them with their sizes and lines per iteration.
 
-    In the LLVM text %first is the block's first run, and WIDTH the number of runs of a block, which is chosen only when
-    code is generated. `width` is the most that it can be: it gives the number of cache lines.
+    A block is some runs (evaluations of one program), computed side by side; a buffer's row is its numbers of one run.
+    In the LLVM text %first is the block's first run, and WIDTH the runs of a block, chosen when code is generated.
 
     Args:
         writer: writer of the block function.
         names: LLVM name of the address of each buffer's memory.
         inputs: buffers whose rows for the next block are read.
         outputs: buffers whose rows for this block are written.
-        width: the most runs of a block.
-        loop: the loop.
+        width: the most runs of a block, which gives the number of cache lines.
+        loop: each of its iterations prefetches an equal share of the cache lines.
     """
     first_of_next, prefetched = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
     for buffer in (*inputs, *outputs):

@@ -143,8 +143,10 @@ def cross_covariances(
 ) -> CrossCovariances:
     """Compute how the errors of the filters of this name are correlated after `horizon` steps of complete data.
 
-    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i H_i, for all pairs at once and whatever the gains;
-    errors of a filter's model enter too.
+    Errors of two nodes are correlated since both follow the same plant: with the plant's A and Q, the gain K_i and the
+    output matrix H_i of node i, and S_ij the covariance of two nodes' noises, P_ij+ = F_i (A P_ij A' + Q) F_j' +
+    K_i S_ij K_j', F_i = I - K_i H_i. It holds for any gains K_i, and where a filter's model is wrong, the error that
+    this causes is in P_ij too. The result holds the covariances of all pairs as factors.
 
     Args:
         network: a network of linear filters.
@@ -159,6 +161,7 @@ def cross_covariances(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     instance("network", network, Network, "a Network")
+    # The errors of nodes are followed for a fusion with matrix weights, so one is made of the filters of this name.
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _plan_network_filters(alone, horizon, inputs)

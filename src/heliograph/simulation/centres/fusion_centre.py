@@ -117,10 +117,12 @@ class FusionCentre(Module):
     ) -> SourceFactors:
         """Return the factors of the errors' joint covariance after all steps.
 
+        Errors are correlated, since all nodes follow the same plant. Factors are a root of their joint covariance.
+
         Args:
             start: the filters' states and the factors before the first step.
-            compute_matrices: of (states, u, k), the matrices of the filters' step k in the order of the nodes.
-            step_filters: of (states, u, k), the filters' states after step k.
+            compute_matrices: (states, u, k) -> the matrices of the filters' step k in the order of the nodes.
+            step_filters: (states, u, k) -> the filters' states after step k.
             u: inputs of the plant (step, inputs), one row for each step.
         """
 
@@ -157,7 +159,7 @@ class FusionCentre(Module):
         """Propagate the moments of all nodes' errors over step k, and fuse the nodes' estimates by every rule.
 
         A source is a stack of filters of one structure. `self.order` brings their nodes, one source after another, into
-        the order of the nodes.
+        the order of the nodes. Returned are the next state, and the fused estimates by name of the fusion.
 
         Args:
             state: moments of the errors, and states of the rules, before the step.
@@ -165,9 +167,6 @@ class FusionCentre(Module):
             means_by_source: their estimates after it (node, n).
             u: inputs of the plant over the step.
             k: number of the step.
-
-        Returns:
-            The next state, and the fused estimates by name of the fusion.
         """
         error_step = self.step_errors(state.errors, self.gather_matrices(matrices_by_source), u, k)
         reports = jnp.concatenate(means_by_source)[self.order]  # the nodes' estimates (node, n)
