@@ -111,8 +111,9 @@ def make_lossless_links(nodes: int, n: int) -> ReportModel:
 def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
     """Return the centre's state (x, e_1, ..., e_nodes, past reports) before the first report.
 
-    Filters start at known means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does. Nothing has
-    been sent: past reports are zeros.
+    A report is the estimate that a node sends to the centre, and may arrive some steps late. Filters start at known
+    means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does: x and all e_i share one root of
+    Cov x_0. Nothing has been sent: past reports are zeros.
 
     Args:
         errors: mean and covariance of (x, e_1, ..., e_nodes) at the start.

@@ -225,6 +225,10 @@ class HorizonProblem:
     ):
         """Compile the problem of all steps, whose unknowns are theirs and the level squared, which is minimised.
 
+        An H-infinity filter bounds the error's energy by level^2 times the energy of all disturbances. Each step
+        demands a linear matrix inequality between the weight P before it and the weight after it (the matrix of a
+        quadratic function of the error); the least level for which all hold is sought (a semidefinite programme).
+
         Args:
             steps: each step's matrices in scaled coordinates.
             layouts: where each unknown of a step stands in the part of the vector that belongs to the step.

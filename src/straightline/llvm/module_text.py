@@ -326,12 +326,12 @@ def _add_to_sums(
 ) -> None:
     """Make the writer's stores to these outputs add to sums over runs.
 
-    Run r belongs to batch r mod batches. A row has a sum for each batch and some more (`row_length_of_sums`). The first
-    of each `width` consecutive runs, the most that a vector has, adds to the sum of its batch, and the others to those
-    behind it, also beyond the last batch. So sums have the same bits however many runs a vector has.
+    Run r belongs to batch r mod batches, and a row has batches + width - 1 sums. Runs are taken in groups of `width`:
+    the first run of a group adds to the sum of its batch, and the others to the places behind it, also beyond the last
+    batch. So numbers are added in the same order, and sums have the same bits, however many runs a vector has.
 
     Args:
-        writer: of the function of blocks, at the beginning of a block.
+        writer: writer of the function that computes a block of runs, one in each lane of a vector; at its beginning.
         summed: how many batches there are.
         names: of the buffers' addresses.
         number: the input with each run's number.
@@ -344,10 +344,10 @@ def _add_to_sums(
     address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {first_of_width}")
     run = writer.add(f"load i32, ptr {address}, align 4")
     batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
-    # The place of this vector's first lane.
+    # The place in the row of this vector's first lane: batch + (first run of the block - first of the `width` runs).
     behind = writer.add(f"sub i64 %first, {first_of_width}")
     place = writer.add(f"add i64 {batch}, {behind}")
-    # Lanes beyond the last run repeat it, and do not count: those whose number is not below the runs that are left.
+    # Lanes beyond the last run do not count: those whose number is not below the runs that are left.
     runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
     writer.lanes_with_run = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:

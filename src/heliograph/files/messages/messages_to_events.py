@@ -179,10 +179,13 @@ def _read_table_of_own_format(
 def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicReader | None, strict: bool) -> EventTable:
     """Return the events of messages, which are either all of topics of the sources, or all in our own form.
 
+    Our own form is a message with the fields that this package defines (node, count, time, values), which needs no
+    sources. An event is what one message says: a node's values with the time of measuring and of arrival.
+
     Args:
         path: the file, the folder or the store's table.
-        network: the network.
-        sources: its sources; None of messages in our own form.
+        network: the network, whose nodes and outputs the messages name.
+        sources: reads messages by the sources of their topic; None if all messages are in our own form.
         strict: whether the first message that cannot be read is an error.
 
     Raises:
@@ -243,22 +246,28 @@ def _append_message(
 ) -> None:
     """Append the events of a message; what cannot be read is refused alone.
 
+    A source says how the values of a node are read from messages of a topic. An event is what one message says: a
+    node's values with the time of measuring and of arrival.
+
     Args:
         path: the file, the folder or the store's table.
-        message: the message.
-        sources: the sources, which note words of devices and what was left out.
-        events: where the events go.
+        message: the message: topic, content, time of arrival and place in the file.
+        sources: reads messages by the sources of their topic; it also notes whether devices are online.
+        events: the table to which events are appended; it counts what was refused.
         strict: whether a message that cannot be read is an error.
     """
+    # A message without a topic has the topic of its table or file.
     topic = message.topic
     if topic is None:
         topic = path.topic if isinstance(path, StoreTable) else find_topic_of_file(path, sources)
     try:
+        # The status of a device, online or offline, is no event.
         if sources.take_device_word(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
         content = decode_message_content(message) if sources.of(topic) else None
         arrival = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
+        # A message may be of several nodes. What cannot be read of one is noted, so that it does not count as lost.
         for reading in sources.read(topic, content, message.where):
             if isinstance(reading, Unread):
                 events.refuse(reading.error, strict)

@@ -132,6 +132,8 @@ def _escape_name(name: str, signs: str) -> str:
 def _send_request(address: StoreAddress, method: str, target: str, body: bytes | None = None) -> bytes:
     """Return the body of a server's answer to one request.
 
+    A request has a connection of its own, by HTTPS for an address "influxs", and is given up after SECONDS seconds.
+
     Args:
         address: the server.
         method: "GET" or "POST".

@@ -162,9 +162,12 @@ class Words(Module):
     ) -> Float[np.ndarray, "messages outputs"]:
         """Return the dithers that a sender draws for messages of these numbers, which its receiver draws again.
 
-        With h = crc32(node) 2^32 + component, s = h 0x9e3779b97f4a7c15 + (number + 1) 0xbf58476d1ce4e5b9 (modulo 2^64)
-        mixed by splitmix64, and u the highest 53 bits as a fraction: d = D (u - 1/2). So a lost message shifts no
-        other, and no two senders or components share theirs.
+        A dither d is a random number that is added before rounding, and subtracted by the receiver, so that the error
+        of rounding does not depend on the signal. It is a function of node, component and number of the message: with
+        h = crc32(node) 2^32 + component, s = h 0x9e3779b97f4a7c15 + (number + 1) 0xbf58476d1ce4e5b9 (modulo 2^64) is
+        mixed twice as by splitmix64, and u is the highest 53 bits as a fraction. Then d = D (u - 1/2) with the
+        quantiser's step D. So a lost message does not shift the dithers of others, and no two senders or components
+        share theirs.
 
         Args:
             node: name of the sender's node.

@@ -169,10 +169,12 @@ def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) 
 def _check_detectability(what: str, name: str, fusion: Fusion, network: HasNodes) -> None:
     """Raise ValueError if neither a node nor one upstream of it observes an unstable mode; warn of decaying modes.
 
-    Mode lambda is observed where rank [lambda I - A; H of all upstream and itself] = n. Not checked where plant,
-    sensors or channels vary over time. `what`: the fusion of this `name`, for errors.
+    A mode is an eigenvalue lambda of the plant's A (n, n). Nodes upstream of a node are those whose messages reach it,
+    also through others. The node observes the mode by its own H and theirs if rank [lambda I - A; all these H] = n (the
+    test of Hautus); an unstable mode that it does not observe makes its error grow without bound. Nothing is checked
+    where plant, sensors or channels vary over time. `what` names the fusion `name` in errors.
     """
-    # Models that do not vary.
+    # Only models that do not vary over time.
     names = network.mesh_nodes(name)
     nodes = [network.nodes[node] for node in names]
     observations = [(node.sensor, node.channel) for node in nodes if isinstance(node, Node)]
