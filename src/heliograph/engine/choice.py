@@ -146,7 +146,8 @@ def scan_rows(
 ) -> tuple[PyTree, PyTree]:
     """Step over rows of data in double precision; return the last state and the outputs of all rows, as NumPy arrays.
 
-    Native code serves any number of rows, so that a recording of another length compiles nothing.
+    Native code is made by this package's own compiler, and serves any number of rows: a recording of another length
+    compiles nothing. XLA, JAX's compiler, is used for steps that native code does not support.
 
     Args:
         begin: a function that returns the state before the first row from `fixed`.
@@ -161,6 +162,7 @@ def scan_rows(
     """
     engine, count = read_forced_engine(), len(jax.tree.leaves(rows)[0])
     with jax.enable_x64(True):
+        # Native code first, unless XLA is forced. The flags say which of the four trees differ from row to row.
         if engine != "xla" and count:
             choice = _find_code(_compile_scan, (begin, step, fixed, rows), (False, False, False, True), most=None)
             why = choice.why or choice.code.generate_code(count)

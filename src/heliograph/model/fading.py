@@ -69,8 +69,9 @@ def markov_fading(
 ) -> Modes:
     """Return a link whose gain moves as a Markov chain: numbers, with one `noise`, or a channel for each mode.
 
-    `transition` is P(next j | now i), started in its stationary law, or a chain. Links of one `name`, or of
-    chains of one name, move together.
+    A mode is a state of the chain. `transition` has P(next mode j | mode i now) at row i and column j, and starts in
+    its stationary law; or it is a `MarkovChain`. Links of one `name`, or of chains of one name, are in the same mode at
+    each step.
 
     Args:
         gains: numbers (modes,), or a channel for each mode.

@@ -316,10 +316,11 @@ def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Ve
 def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
     """Return the links of a node's sum, as arrays of the design, and the sum in which all amplitudes are 1.
 
-    Each link sends one output y_i of the sensor with a random gain g_i; an amplitude of 1 sends y_i as it is.
+    Each link sends one output y_i of the sensor with a random gain g_i, and the receiver gets the sum of all links. An
+    amplitude, which the design chooses, multiplies y_i before it is sent; 1 sends y_i as it is.
 
     Args:
-        node: with a linear sensor behind a sum of links.
+        node: a node with a linear sensor behind a sum of links.
         second: E (y, 1)(y, 1)' of the sensor's outputs.
 
     Raises:

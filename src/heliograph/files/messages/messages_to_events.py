@@ -289,14 +289,18 @@ def _append_reading(
 ) -> None:
     """Append the event of one reading of a message, unless only the arrival of a stored message would date it.
 
+    A reading has the values of one node in a message, and its time of measuring, if the message says it; else the time
+    of arrival dates the event.
+
     Args:
-        topic: of the message.
+        topic: topic of the message.
         message: the message.
         content: its payload, decoded.
         reading: what one source read in it.
-        arrival: when the message arrived, in nanoseconds since 1970; None where it does not say it: when measured.
-        sources: the sources.
-        events: where the event goes.
+        arrival: when the message arrived, in nanoseconds since 1970; None if the message does not say it: then the time
+            of measuring stands for it.
+        sources: the sources, which note clocks and senders of messages.
+        events: the table to which the event is appended.
 
     Raises:
         ValueError: neither a time nor an arrival.

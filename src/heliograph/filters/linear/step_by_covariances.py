@@ -119,11 +119,12 @@ def step_by_covariances(
 ) -> StepMoments:
     """Return the state's moments after a step of the filter, with the values of `factored`.
 
-    Derivatives are those of the Kalman filter's formulas in covariances. So each number is
-    `take_derivatives_of(formula, value)`: the value by factors, the derivative by the formula.
+    Factors of covariances (P = L D L') give the more exact values, but have no derivative where a covariance is zero.
+    So each number is `take_derivatives_of(formula, value)`: the value is that by factors, and derivatives are those of
+    the Kalman filter's formula in covariances.
 
     Args:
-        matrices: of the step.
+        matrices: matrices of the step: x+ = F x + b + w, Cov w = Q, and z = H x + c + v, Cov v = R.
         before: mean and covariance of the state before the step.
         z: measurement (m,), NaN for what did not arrive.
         factored: results of the same step by factors; they count as constants, without derivatives.

@@ -214,12 +214,14 @@ def _make_measurement_model(
 ) -> StackedMeasurementModel:
     """Return what is received of zeta = x~ 1{mode}: the output matrix, the mean output, and the noise in each mode.
 
-    In mode j, z = H y~ + n with y~ = (y, 1) = C~ x~ + v~: the noise has the covariance T_j(E[y~ y~' 1{j}]) +
-    P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j(Y) = E[(H - Hbar_j) Y (H - Hbar_j)' | j], and the rounding of z.
+    x~ = (x - c, 1) is the plant's state about its mean c before any data, with a 1, and zeta stacks x~ 1{mode = j} over
+    the modes j of the link. In mode j, z = H y~ + n with y~ = (y, 1) = C~ x~ + v~; H is random with mean Hbar_j. The
+    noise has the covariance T_j(E[y~ y~' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), with
+    T_j(Y) = E[(H - Hbar_j) Y (H - Hbar_j)' | j], and the rounding of z.
 
     Args:
         state: estimate of zeta and moments of each mode.
-        sensor: C~ and R~ = Cov v~.
+        sensor: the linear sensor, which gives C~ and R~ = Cov v~.
         size: squares of the numbers that are summed in y, for rounding (p,).
         gains: Hbar_j (M, m, p + 1).
         gain_spread: the tensor of T_j (M, m, m, p + 1, p + 1).

@@ -229,9 +229,11 @@ def _measure_spans(parts: Fates) -> np.ndarray:
 def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
     """Return the Markov law of order 1 that is most likely given that each stretch was cut where packets arrived.
 
-    The law's `counts` are equivalent ones. After either fate they are n p and n (1 - p), with p the most likely
-    probability and n = 1 / (p (1 - p) Var(logit p)), the number of plain trials that have this variance (at most the
-    number of packets counted).
+    A stretch of packets begins and ends with one that arrived, since nothing outside is known; plain counts of losses
+    would be biased by that. So the law's two probabilities maximise the likelihood given both ends. Its `counts` are
+    then n p and n (1 - p) after an arrival, and after a loss, with p the most likely probability and
+    n = 1 / (p (1 - p) Var(logit p)), the number of plain trials that have this variance (at most the number of packets
+    counted).
 
     Args:
         counts: (arrived, lost) after an arrival and after a loss (2, 2).

@@ -20,8 +20,9 @@ from heliograph.random_affine.shaped_noise import Shaped
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
     """Return plant, sensor and channel of the state (x_k, y_k, y_{k-1}, ..., y_{k-D}), and so without a delay.
 
-    The sensor reads all these outputs without noise, and the channel takes them and has the law of the delayed one. So
-    any filter of linear plants can be made for the three. Before the first step zeros were sent.
+    A channel that delivers late, by up to D steps, needs the past outputs y of the sensor, so they become states. The
+    new sensor reads all these outputs without noise, and the new channel takes them and delivers one by the law of the
+    delay. So any filter of linear plants can be made for the three. Before the first step zeros were sent.
 
     The state y_{k+1} = C x_{k+1} + v_{k+1} contains the sensor's noise. So if one y is received twice, it brings the
     same noise twice, and is used as one measurement. With past x as states instead, its noise would count as two

@@ -59,8 +59,10 @@ class Words(Module):
     ):
         """Check and hold the lowest and highest word, the bits of a word, and the kind of dither.
 
-        If the distance D of two words (`resolution`) is given in place of `bits`, the bits are the fewest with which
-        words low, low + D, ... reach `high`. The highest word is then low + (2^bits - 1) D, and may be above `high`.
+        A word (codeword) is a quantised value: 2^bits of them lie at equal distances D from `low` to `high`, which are
+        numbers or arrays of one number for each output. If D (`resolution`) is given in place of `bits`, the bits are
+        the fewest with which words low, low + D, ... reach `high`. The highest word is then low + (2^bits - 1) D, and
+        may be above `high`. A dither is a random number that is added before rounding.
         """
         self.low, self.high = (np.asarray(_read_range_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):

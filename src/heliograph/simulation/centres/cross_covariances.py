@@ -87,9 +87,14 @@ class CrossCovariances:
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
         """Return the moments at relays that forward the matrix-weighted estimate of their nodes.
 
-        An error W e is a linear map of the nodes' errors, so its sources are W shared, and the rest has covariance
-        W independent W' as long as no two relays receive the same node. Known means of the errors are subtracted. Apply
-        it level by level for a deeper tree; its root is `matrix_weights` of the last level.
+        The nodes' errors are e_i = shared_i s + a_i, with sources s of covariance I that all have in common and a_i
+        independent, of covariance independent_i. A relay fuses the estimates of its nodes with weights W, so its error
+        W e has the sources W shared and the independent covariance W independent W', as long as no two relays receive
+        the same node. Known means of the errors are subtracted. Apply it level by level for a deeper tree of relays;
+        its root is `matrix_weights` of the last level.
+
+        Args:
+            relays: names of the nodes that each relay receives, by name of the relay.
 
         Raises:
             ValueError: no relays, a relay without nodes, unknown nodes, a node that two relays receive.

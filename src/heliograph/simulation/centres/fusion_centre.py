@@ -164,7 +164,7 @@ class FusionCentre(Module):
         Args:
             state: moments of the errors, and states of the rules, before the step.
             matrices_by_source: matrices of the filters in the step, with a leading axis of nodes.
-            means_by_source: their estimates after it (node, n).
+            means_by_source: estimates of the nodes' filters after the step (node, n), for each source.
             u: inputs of the plant over the step.
             k: number of the step.
         """
@@ -211,18 +211,19 @@ NodeModels = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, 
 def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: NodeModels, shared: bool) -> Claim:
     """Return the claim of fusion by a rule that knows how errors are correlated: "exact", "upper" or "nominal".
 
-    "upper" where noise is known by bounds; "nominal" where probabilities are uncertain or gains depend on data.
+    The claim says what the fused covariance is: "upper" (a bound) where noise is known by bounds, "nominal" (neither)
+    where probabilities are uncertain or gains depend on data.
 
     Args:
-        rule: its name, for errors.
-        plant: that all nodes estimate.
+        rule: name of the rule, for errors.
+        plant: the plant that all nodes estimate.
         nodes: sensor, channel and filter of each node.
         shared: whether the nodes receive parts of one channel.
 
     Raises:
         ValueError: naming the knowledge that is missing.
     """
-    # What a channel remembers would be part of the errors' joint state.
+    # A channel's memory would have to be part of the errors' joint state, which it is not: refused.
     for name, (_, channel, _) in nodes.items():
         if first(channel).remembers:
             expected = f"fusion by {rule}: node {name!r}"

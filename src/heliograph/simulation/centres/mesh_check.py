@@ -142,12 +142,13 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
 def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Raise ValueError for links, delays and quantizers with which the covariances of the nodes would not hold.
 
-    `build_edges` refuses links that it cannot draw. A late or quantized estimate has an error of its own: covariance
-    intersection needs a bound on it alone, but rules by the joint covariance would have to follow it, which they do
-    not. Exchanges in several rounds and events are of present estimates that arrive as they are. A quantizer's error
-    must have a bound that no loss can break.
+    Nodes of this fusion send their estimates to neighbours. A late or quantized estimate has an error of its own.
+    Covariance intersection needs only a bound on that error, but rules that use the joint covariance of all errors
+    would have to follow it, which they do not. Several rounds of exchange in a step, and sending on events, are
+    implemented for present estimates that arrive unchanged. A quantizer's error must have a bound that no loss can
+    break. `build_edges` refuses links that it cannot draw.
 
-    `what`: the fusion, for errors.
+    `what`: the fusion, for errors. `graph`: which nodes send to which.
     """
     longest_delay, kind = build_edges(fusion, graph).past, type(fusion.rule).__name__
     if not longest_delay and fusion.quantizer is None:

@@ -219,7 +219,7 @@ def _judge_link(
     rows_with_values = int(np.sum(classes >= 0))
     if rows_with_values < FEWEST:
         return None, rows_with_values
-    # The variances as declared: where the innovations fit them, all scales are 1.
+    # The variances as declared. Where the innovations do not contradict them, all scales are 1.
     tests = examine_innovations(declared, filter, classes)
     if not tests.contradicts:
         ones = np.ones(declared.classes)
