@@ -70,7 +70,7 @@ def run_campaign(
     themselves. The store's bytes depend on the campaign alone: neither on the workers, nor on how often and where it
     was interrupted. A chunk that fails is tried three times, then reported; one that takes longer than the campaign's
     `timeout` is reported at once; the others continue. A chunk whose files do not agree with their checksums is
-    computed again. Without worker processes there is no timeout, so that a debugger can be used.
+    computed again. With 0 `workers` there is no timeout, so that a debugger can be used.
 
     Args:
         campaign: the campaign, from `load_campaign`.

@@ -123,10 +123,12 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
+    # Cov x_0 = R diag(weights) R'. The rows of R serve x and every e_i alike; those of past reports are zeros.
     start = columns_of(errors.state_covariance)
     root_of_x_and_errors = jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1))
     root = jnp.pad(root_of_x_and_errors, (padding, (0, 0)))
     mean = jnp.pad(errors.mean.reshape(-1), padding)
+    # Models of the reports sent 0, 1, ... `delays` steps ago: no gain, no noise.
     ages_and_nodes = (delays + 1, nodes)
     past = PastReports(
         gain=jnp.zeros((*ages_and_nodes, received, n)),

@@ -97,7 +97,7 @@ def the_things_stack(
         scale: factor of the values (default 1).
         offset: added after scaling (default 0).
         radio: "rssi" (dBm), "snr" (dB) or both, as the first gateway in the message received it: numbers of these names
-            that are told of the values (`hg.model.told`). None for neither.
+            that come with each message and set the law of its noise or gain (`hg.model.told`). None for neither.
 
     Raises:
         ValueError: what `json_field` refuses.
@@ -127,7 +127,7 @@ def chirpstack(
         scale: factor of the values (default 1).
         offset: added after scaling (default 0).
         radio: "rssi" (dBm), "snr" (dB) or both, as the first gateway in the message received it: numbers of these names
-            that are told of the values (`hg.model.told`). None for neither.
+            that come with each message and set the law of its noise or gain (`hg.model.told`). None for neither.
 
     Raises:
         ValueError: what `json_field` refuses.

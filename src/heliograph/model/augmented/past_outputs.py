@@ -41,7 +41,8 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
     augmented: AnyPlant = at_each_step(partial(_append_delay_line, past=first(channel).past), plant, sensor)
     n, states = len(first(plant).states), first(augmented).states
-    outputs = len(states) - n  # y_k, ..., y_{k-D}, read without noise
+    # The new sensor has the matrix (0, I) for the state (x, y_k, ..., y_{k-D}), and no noise.
+    outputs = len(states) - n
     read_outputs = LinearSensor(np.eye(len(states))[n:], np.zeros((outputs, outputs)), states[n:])
     return augmented, read_outputs, place_on_delay_line(channel)
 

@@ -224,6 +224,7 @@ def _judge_link(
     if not tests.contradicts:
         ones = np.ones(declared.classes)
         return _make_judgement(declared, classes, (tests, tests), (ones, ones, ones), bias=None), rows_with_values
+    # Scales of the classes; a bias too if the innovations are still correlated.
     refit = refit_scales(declared)
     tests_of_refit = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if tests_of_refit.p_value < LEVEL else None

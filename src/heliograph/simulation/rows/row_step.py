@@ -352,4 +352,5 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
         stepped: jax.Array = jax.lax.fori_loop(0, iterations, step_rows, jnp.zeros((width, columns)))
         return stepped
 
+    # `in_haste`: options of XLA that compile quickly, to slower code.
     return jax.jit(run, compiler_options=in_haste() if is_long else understood())
