@@ -84,7 +84,8 @@ class EstimateWriter:
         """
         if not rows:
             return []
-        # The template fits rows whose numbers are finite, variances not negative, and which used all that had arrived.
+        # The template fits rows whose numbers are finite, whose variances are not negative, and whose filters used all
+        # that had arrived (reason 0). The three lists hold columns of `outputs`.
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
         # The texts of all numbers at once, row after row, in the order in which a line has them.

@@ -333,7 +333,7 @@ def _add_to_sums(
     Args:
         writer: writer of the function that computes a block of runs, one in each lane of a vector; at its beginning.
         summed: how many batches there are.
-        names: of the buffers' addresses.
+        names: LLVM name of each buffer's address.
         number: the input with each run's number.
         outputs: the buffers with rows of sums.
         width: the most runs of a vector, a power of two.

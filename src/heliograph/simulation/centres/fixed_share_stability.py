@@ -107,7 +107,8 @@ def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMap
     `arrives`: p_ij of each message (node, degree). `maps`: the step of the errors.
     """
     nodes, n = maps.without_messages.shape[:2]
-    # E[M]: e_j enters by p_ij of_sender_ij, e_i by without_messages_i + sum_j p_ij of_receiver_ij.
+    # E[M]: e_j enters by p_ij of_sender_ij, e_i by without_messages_i + sum_j p_ij of_receiver_ij. Column 0 of the axis
+    # `degree` is the node itself.
     probability = arrives[:, :, None, None]
     mean_step = probability * maps.of_sender
     mean_step[:, 0] = maps.without_messages + (probability * maps.of_receiver)[:, 1:].sum(axis=1)
