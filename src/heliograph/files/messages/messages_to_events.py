@@ -193,6 +193,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicRead
     """
     events = None if sources is None else EventTable(network, sources.step_seconds)
     is_rows = isinstance(path, StoreTable) or is_table_file(path)
+    # `own` collects messages in our own form, `events` those of topics; only one of them may get any.
     own = OwnMessageCollector(network, path, table=is_rows, ignore_unknown=False)
     broken = ""
     for message in _yield_messages(path, sources):

@@ -72,7 +72,7 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
     cells = [_convert_cells(column) for column in columns.values()]
     times = _convert_cells(np.sort(columns[TIME]))
     try:
-        # One transaction: an error takes all of it back.
+        # One transaction, which an error takes back as a whole: make the table, delete this plant's rows, copy the new.
         with psycopg.connect(address.url) as connection:
             make = sql.SQL("CREATE TABLE IF NOT EXISTS {} (plant text NOT NULL, {})")
             connection.execute(make.format(table, sql.SQL(", ").join(typed)))

@@ -346,7 +346,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
         horizon: number of steps.
 
     Claim: what the covariance is said to be is as for `polynomial_filter` at degree 2, "exact" if all laws are known,
-        else "nominal". The error is never larger than that of the quadratic filter, whose measurements are among these.
+    else "nominal". The error is never larger than that of the quadratic filter, whose measurements are among these.
 
     Raises:
         ValueError: what `polynomial_filter` refuses; a channel with memory.
