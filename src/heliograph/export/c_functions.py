@@ -81,6 +81,7 @@ def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[
         return [_join_function(heads[0], body)]
     predict = [*_generate_inputs_check(program), *_generate_part_statements(program, 0, prefix), "    return 0;"]
     correct = [*_generate_measurement_check(program), *_generate_part_statements(program, 1, prefix), "    return 0;"]
+    # `step` works on a copy of the state, so that the state stays as it was if anything is refused.
     step = [
         f"    {prefix}_state after = *state;",
         f"    int refused = {prefix}_predict(&after, u);",

@@ -144,7 +144,7 @@ class ParticleFilter(AbstractSizedFilter):
         signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, initial_power))(
             state.gaussian
         )
-        # Each particle is corrected in its own mode: w_i becomes proportional to w_i p(z | mode_i).
+        # Each particle is corrected in its own mode: w_i becomes proportional to w_i p(z | mode_i, Gaussian_i).
         corrected, weight, innovation = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )

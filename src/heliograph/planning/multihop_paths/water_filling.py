@@ -58,6 +58,7 @@ def water_filling(
     def slopes_at(powers: Powers) -> ErrorSlopes:
         return ErrorSlopes(*sensitivity(powers))
 
+    # `best` are the powers with the least gap so far.
     best = p = start
     least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
     slopes = slopes_at(p)
