@@ -146,7 +146,7 @@ def scan_rows(
 ) -> tuple[PyTree, PyTree]:
     """Step over rows of data in double precision; return the last state and the outputs of all rows, as NumPy arrays.
 
-    Native code is made by this package's own compiler, and serves any number of rows: a recording of another length
+    Native code is made by the compiler `straightline`, and serves any number of rows: a recording of another length
     compiles nothing. XLA, JAX's compiler, is used for steps that native code does not support.
 
     Args:

@@ -282,10 +282,10 @@ def find_effect_of_bits(
 ) -> WordEffect:
     """Return what a received codeword says of y: its log probability, the shift of the mean, the ratio of variances.
 
-    A codeword is the number of the quantisation step in which the sender's signal y lay, sent as bits that may have
-    been flipped. The law of y given the received bits is a sum over the codewords that may have been sent, in one of
-    three ways: all codewords if they have at most TABLE (6) bits; else those near the prior's mean, if a step is at
-    least FINE (a quarter) of a deviation; else groups of neighbouring codewords, which then are too many to sum singly.
+    A codeword is the number of the quantised value of the sender's signal y, sent as bits that may have been flipped.
+    The law of y given the received bits is a sum over the codewords that may have been sent, in one of three ways: all
+    codewords if they have at most TABLE (6) bits; else those near the prior's mean, if a step is at least FINE (a
+    quarter) of a deviation; else groups of neighbouring codewords, since single ones would be too many.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.

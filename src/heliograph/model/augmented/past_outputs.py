@@ -29,9 +29,9 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     independent ones, and the claimed covariance would be too small.
 
     Args:
-        plant: linear.
-        sensor: linear.
-        channel: one that delivers late, by up to D steps.
+        plant: a linear plant, n states.
+        sensor: a linear sensor.
+        channel: a channel that delivers late, by up to D steps.
 
     Raises:
         ValueError: a plant or sensor that is not linear or has angles, parts that do not fit, process noise that

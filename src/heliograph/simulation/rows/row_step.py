@@ -134,7 +134,7 @@ class RowStep:
         _, output_shapes = _trace_step(self._layout, self._shapes).out_info
         self.outputs = make_flat_layout(output_shapes)
         self.columns = find_filter_columns(network, self.outputs)
-        # Native code (by this package's compiler) with the network's numbers filled in; None if it cannot compile this.
+        # Native code (by `straightline`) with the network's numbers filled in; None if that cannot compile the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
         self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), differs_by_run=(False, True))
