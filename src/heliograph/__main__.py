@@ -19,9 +19,10 @@ RARELY = 50_000, 20, 100  # what is imported and traced stays: the collector wou
 def command() -> None:
     """Run the command and end the process with its exit code.
 
-    The process ends without the interpreter's own end, which would wait for threads, and free what threads of the
-    compilers still use.
+    The process ends by `os._exit`, since the interpreter's own end would wait for threads, and free memory that threads
+    of the compilers still use. So functions registered with `atexit` are called here, and output is flushed.
     """
+    # While modules are imported there is nothing to undo, so a signal ends the process at once.
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda number, _: os._exit(128 + number))  # while it is imported nothing is to undo

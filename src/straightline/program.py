@@ -258,7 +258,9 @@ def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
 def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
 
-    The input buffers are among them. From each item that differs, all items that are computed from it are found.
+    A program is evaluated for many runs side by side; what is equal in all of them needs to be computed once only. A
+    node is a number that is computed, a buffer is memory, a guard is code that runs under a condition. The input
+    buffers are in the result. From each item that differs, all items that are computed from it are found.
     """
 
     @cache
@@ -273,14 +275,14 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
             if b.owner is not None and getattr(b.owner, "length", None) is None
         ]
 
-    # For each item, those that differ if it does.
+    # followers[a]: the items that differ if a does, since they are computed from it.
     followers: defaultdict[Any, list[Any]] = defaultdict(list)
     for item in items:
         for source in item.args if needs_arguments_alone(item) else _list_sources(item, list_owners):
             followers[source].append(item)
         if isinstance(item, Store):  # a number that differs makes the memory differ that it is stored in
             followers[item].append(item.buffer.owner[0])
-    # From the inputs on, all that follows; each item is visited once.
+    # Walk from the inputs to all followers; each item is visited once, as its list is popped.
     differing: set[Any] = set(inputs)
     to_visit = list(differing)
     while to_visit:

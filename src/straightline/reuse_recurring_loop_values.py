@@ -67,9 +67,12 @@ def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any,
 def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | None:
     """Return the numbers S of a loop's body that may repeat, with C and the tests on which they depend.
 
-    C is the largest set of carried numbers such that S, all that follows from C, from tests of the iteration's data and
-    from what the loop does not change, has the next values of C. Return None if S has no more than DEAR nodes. Sets of
-    nodes are the keys of a dict, which keeps an order. `needed` are the items that the outputs need.
+    Some numbers that a loop carries, such as a filter's covariance, settle to a value or a cycle; all that follows from
+    them then repeats, and need not be computed again. S is all that follows from a set C of carried numbers, from tests
+    of the iteration's data (such as whether a measurement arrived), and from what the loop does not change. C is the
+    largest set of carried numbers whose next values are in S. Return None if S has no more than DEAR (100) nodes, which
+    is not worth it. Sets of nodes are the keys of a dict, which keeps an order. `needed` are the items that the outputs
+    need.
     """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]
@@ -78,6 +81,7 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | Non
     tests = {n for n in data_nodes if n.type == "bool" and all(a.type != "bool" for a in n.args)}
     # The largest set C: begin with all carried numbers, and drop those whose next value does not follow from C.
     carried = [k for k, parameter in enumerate(loop.parameters) if parameter in needed]
+    # Each pass of `while`: S (`computed`) by one walk through the body, in order, from the tests and C.
     operations = [(n, _list_nodes_of_body(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
     while True:
         known, computed = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
@@ -206,9 +210,11 @@ def _rewrite_loop(
 ) -> None:
     """Rewrite a loop so that an iteration computes the recurring numbers only if no stored row is known to have them.
 
-    The body becomes: the tests of the data; the choice of the iteration's row of the ring, a memory of RING rows; a
-    guarded block that computes the recurring numbers and stores them in that row; and the rest, which loads them from
-    it. The loop carries in addition the row of the last iteration, and the period of the cycle, 0 if none is known.
+    Recurring numbers are numbers of the body that may have the same values in later iterations. The ring is a memory of
+    their values in RING earlier iterations, one row each. The body becomes: the tests of the data; the choice of the
+    iteration's row of the ring; a guarded block (which runs under a condition) that computes the recurring numbers and
+    stores them in that row; and the rest, which loads them from it. The loop carries in addition the row of the last
+    iteration, and the period of the cycle in which rows repeat, 0 if none is known.
 
     Args:
         graph: the program.
@@ -224,7 +230,7 @@ def _rewrite_loop(
     rest = [x for x in body.items if x not in recurring.nodes and x not in recurring.test_nodes]
     body.items, body.seen, graph.current = [*recurring.test_nodes], {}, body
     test_ring, value_ring = (RingBuffer(graph, [n.type for n in nodes], loop) for nodes in (recurring.tests, stored))
-    # Before the first iteration it is as if the ring were full, so that row 0 is next.
+    # The last row before the first iteration is RING - 1, so that row 0 is next.
     last_row, period = _carry_integer(graph, loop, RING - 1), _carry_integer(graph, loop, 0)
     turn = _choose_ring_row(graph, recurring.tests, test_ring, last_row, period)
     closes_cycle = _move_to_guarded_block(graph, loop, recurring, stored, turn, (test_ring, value_ring))

@@ -66,10 +66,11 @@ def run_campaign(
 ) -> CampaignRun:
     """Compute what a campaign's results folder lacks: results.zarr, summary.csv, and failures.json if a chunk failed.
 
-    The store's bytes depend on the campaign alone: neither on the workers, nor on how often and where it was
-    interrupted. A chunk that fails is tried three times, then reported; one that takes longer than the campaign's
+    A campaign simulates many settings of a model; the runs of a setting are divided into chunks, which are computed by
+    themselves. The store's bytes depend on the campaign alone: neither on the workers, nor on how often and where it
+    was interrupted. A chunk that fails is tried three times, then reported; one that takes longer than the campaign's
     `timeout` is reported at once; the others continue. A chunk whose files do not agree with their checksums is
-    computed again. In this process there is no timeout, so that a debugger can be used.
+    computed again. With 0 `workers` there is no timeout, so that a debugger can be used.
 
     Args:
         campaign: the campaign, from `load_campaign`.

@@ -272,7 +272,11 @@ def _refuse_replacing_inputs(
 
 
 def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant]", report: Path) -> None:
-    """Examine the records of all plants and write the report, a page for each plant and one of all."""
+    """Examine the records of all plants and write the report, a page for each plant and one of all.
+
+    A record holds the measurements and estimates of a run, and a diagnosis says how plausible both are. `plants` are
+    the plants with their records and forecasts, `name` is that of the network, and `report` the folder to write.
+    """
     from dataclasses import replace
 
     from heliograph.report.diagnosis.recording_diagnosis import Health, examine
@@ -304,5 +308,6 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
         (of_only_plant,) = health.values()
         return make_run_results(of_only_plant, name)
 
+    # Progress is counted in filters of plants: each is examined by itself.
     count = len(plants) * sum(map(len, network.claims().values()))
     write_results(report, count, examine_plants, results_of)

@@ -44,18 +44,21 @@ def run_in_blocks(
 ) -> PrintedLines | None:
     """Filter a long table of rows of time, and write the estimates to a table.
 
+    Blocks of rows are read, filtered and written one after another, so that memory does not grow with the table.
+
     Args:
         network: the network.
-        module: its file's names.
+        module: names and values of the file of Python that the network stands in; "sources" may be one.
         measurements: the file.
         out: where the estimates go.
-        others: the options that are given and need all rows.
+        others: options that the user gave and that need all rows at once.
         options: how the file is read.
         advance: called with the progress.
 
     Returns:
-        What is to be said of the run. None, and nothing is written, where the table is not long or has no rows of
-        time, and where all its rows have to be held at once; the latter is said on the standard error.
+        Lines to print about the run. None if nothing was written, and the caller must read all rows at once: the table
+        is not long, or has messages instead of rows of time, or an option needs all rows, which is then said on the
+        standard error.
 
     Raises:
         ValueError: what cannot be read; very many rows that are out of order.

@@ -147,7 +147,8 @@ def scan_rows(
 ) -> tuple[PyTree, PyTree]:
     """Step over rows of data in double precision; return the last state and the outputs of all rows, as NumPy arrays.
 
-    Native code serves any number of rows, so that a recording of another length compiles nothing.
+    Native code is made by the compiler `straightline`, and serves any number of rows: a recording of another length
+    compiles nothing. XLA, JAX's compiler, is used for steps that native code does not support.
 
     Args:
         begin: a function that returns the state before the first row from `fixed`.
@@ -162,6 +163,7 @@ def scan_rows(
     """
     engine, count = read_forced_engine(), len(jax.tree.leaves(rows)[0])
     with jax.enable_x64(True):
+        # Native code first, unless XLA is forced. The flags say which of the four trees differ from row to row.
         if engine != "xla" and count:
             choice = _find_code(_compile_scan, (begin, step, fixed, rows), (False, False, False, True), most=None)
             why = choice.why or choice.code.generate_code(count)
@@ -350,11 +352,18 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
 def _compile_scan(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
     """Return the code of a scan in a tree (begin, step, fixed, rows) with these leaves, or None and why there is none.
 
-    Of arrays the leaves have shapes and types, of rows those of one row.
+    A scan is state = begin(fixed), then (state, output) = step(fixed, state, row) for each row. The code depends on
+    structure and shapes alone, so that it is cached by them: a leaf that is an array stands here as an `_ArrayOfRun`,
+    its shape and type (of the rows' arrays those of one row), and `differs` marks the arrays of rows.
+
+    Args:
+        structure: JAX's structure of the tree (begin, step, fixed, rows).
+        leaves: its leaves: an `_ArrayOfRun` for each array, all others themselves.
+        most: passed on to `compile_scan`.
     """
 
     def begin(fixed: Any) -> PyTree:
-        """Return the state before the first row; what `begin` is given has no row in it."""
+        """Return the state before the first row; the rows' places in the tree hold None, since `begin` sees none."""
         function, _, tree, _ = _put_in_tree(structure, leaves, [*fixed, *[None] * len(of_rows)])
         return function(tree)
 
@@ -364,6 +373,7 @@ def _compile_scan(structure: Any, leaves: tuple[Any, ...], most: int | None) -> 
         after: tuple[PyTree, PyTree] = function(trees[0], state, trees[1])
         return after
 
+    # The arrays of rows come last in the tree, so `[*fixed, *row]` are the values of all arrays in order.
     arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
     of_rows = [array for array in arrays if array.differs]
     fixed = [array for array in arrays if not array.differs]

@@ -61,9 +61,14 @@ def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
 def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
     """Return the text of the functions of C that move the state, in the order of `list_signatures`.
 
-    That is `step` alone, or, of a program in two parts, `start_at` (if the state can be set), `predict`, `correct` and
-    `step`, which calls `predict` and `correct`. Each returns 0, or the number of a reason to refuse, and writes the
-    state only where nothing is refused.
+    A program whose step is one part gives `step` alone. A program in two parts gives `start_at` (if the state can be
+    set), `predict`, `correct`, and `step`, which calls the two. Each function of C returns 0, or the number of a reason
+    to refuse its arguments, and writes the state only if it refuses nothing.
+
+    Args:
+        program: the filter's step, translated to statements of C, with the members of its state.
+        prefix: with which all names in C begin.
+        real: type of the numbers in C.
     """
     heads = list_signatures(program, prefix, real)
     if len(program.parts) == 1:
@@ -76,6 +81,7 @@ def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[
         return [_join_function(heads[0], body)]
     predict = [*_generate_inputs_check(program), *_generate_part_statements(program, 0, prefix), "    return 0;"]
     correct = [*_generate_measurement_check(program), *_generate_part_statements(program, 1, prefix), "    return 0;"]
+    # `step` works on a copy of the state, so that the state stays as it was if anything is refused.
     step = [
         f"    {prefix}_state after = *state;",
         f"    int refused = {prefix}_predict(&after, u);",

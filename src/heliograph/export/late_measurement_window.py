@@ -149,13 +149,14 @@ typedef struct {{
 def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int) -> list[str]:
     """Return lines for the header on the window: what a late measurement is, what it costs, what is refused.
 
-    A row is a step that the window holds. A late measurement has all rows from its own on run again, at most all
-    `places`; where that is refused they are run once more without it, hence twice the time.
+    The window is memory of the exported C code: the last steps of the filter, with their states, data and inputs, one
+    row each. A late measurement is put into its row, and all rows from there on are run again, at most all `places`. If
+    one of them is refused they are run once more without it, hence twice the time.
 
     Args:
-        window: how many steps it holds, and whether time counts steps or is an input.
-        prefix: of all names.
-        bytes_held: of the window in C.
+        window: how many rows it holds, and whether time counts steps or is an input.
+        prefix: with which all names in C begin.
+        bytes_held: size of the window in C, in bytes.
     """
     late = f"{prefix}_window_late"
     # How late: in steps, or as an age where the time step is an input.

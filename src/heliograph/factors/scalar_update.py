@@ -208,6 +208,11 @@ def _update_by_rows_in_loop(
 ) -> Measured:
     """Compute `update_by_rows` in a loop, which is a shorter program than `_update_by_rows_one_by_one`.
 
+    A Kalman update by m scalar measurements, one after another. The state is x = mean + L xi with Cov xi = diag(d), and
+    measurement i has the slope f_i: z_i = E z_i + f_i' xi + v_i. `root` (n + m, n) has the n rows of L and the m slopes
+    below, `means` (n + m,) the state's mean and the innovations times -1, since one formula updates both; `variance`
+    (m,) has the variances of v, and `rounding_variance` (m,) those up to which slopes are rounding.
+
     Each iteration measures row n, the first one below the state's n rows, and then moves it to the end. So the row to
     measure always has the index n, and after the last iteration all rows are in their first order again.
     """
@@ -220,6 +225,7 @@ def _update_by_rows_in_loop(
         slopes are rounding, -1 for the first row.
         """
         root, d, means, rounding_variance = carry
+        # Gain K of all rows, S = f diag(d) f' + noise, and the rows and d given this measurement.
         rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, rounding_variance[0])
         innovation = -means[n]
         # The first row has no rounding from earlier rows, only that of its own products.

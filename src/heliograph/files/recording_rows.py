@@ -44,18 +44,19 @@ def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
 def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[RecordingRows, list[InputError], int]:
     """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
 
-    Where time is continuous a time that is more than a year outside of all others was not set: its row is refused, and
-    the others are put in the order of their times. Where each row is a step, rows are refused until times do not go
-    backwards, as few as possible. Rows stay as they are where half of them or more would be refused, and beside a
+    If time is continuous, a time that is more than a year outside of all others was not set: its row is refused, and
+    the other rows are put in the order of their times. If each row is a step, as few rows as possible are refused so
+    that times do not go backwards. All rows stay as they are if half of them or more would be refused, or if there is a
     column `dt`, whose numbers belong to the order of the rows.
 
     Args:
-        cells: the rows.
+        cells: the rows of a table: times, numbers of the rows, measurements and inputs.
         network: the network that they belong to.
         source: name of the table, for errors.
     """
     if find_backwards_row(cells.time) is None:
         return cells, [], 0
+    # Decide which rows are refused, by the rule for continuous time or for time in steps. Dates compare as integers.
     dated = cells.time.dtype.kind == "M"
     stamps = cells.time.astype(np.int64) if dated else cells.time
     is_continuous = TIME_STEP in network.inputs
@@ -72,6 +73,7 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
         for number, time in zip(cells.numbers[is_refused].tolist(), cells.time[is_refused], strict=True)
     ]
     kept = cells.select(~is_refused)
+    # Of the other rows, count those after a later one, and sort all by time; rows of equal times keep their order.
     latest_so_far = np.maximum.accumulate(kept.time)
     behind = int(np.count_nonzero(kept.time < latest_so_far))
     return kept.select(np.argsort(kept.time, kind="stable")), refused, behind

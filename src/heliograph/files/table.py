@@ -198,13 +198,16 @@ def read_row_blocks(
     block: BlockSize = USUAL_BLOCK,
     progress: Progress | None = None,
 ) -> Iterator[TableRows]:
-    """Yield the rows of a file in parts, of those of its columns that are among `only`.
+    """Yield the rows of a file in parts, with only the columns that are named in `only`.
+
+    Parts bound the memory that a long file needs. The extension of its name says how the file is read: as CSV, as
+    Parquet, or by a package that offers this extension.
 
     Args:
         path: the file.
         only: the columns that are read; None for all.
         strict: whether a row that cannot be read is an error, or is refused alone.
-        block: how much is read at a time; of a format of somebody else's making all of it.
+        block: how much is read at a time; a format that another package reads is read as a whole.
         progress: called with how much of the file is read, and of how much (default none).
 
     Raises:

@@ -221,6 +221,7 @@ def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, w
         variance: their variances under the filter's model (time,).
         weight: of each in the update (time,); below HALF it counts as down-weighted.
     """
+    # Innovations e, weights w and normalised squares e^2 / variance of the steps at which something arrived.
     arrived = np.isfinite(value)
     e, w, squares = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
     is_down_weighted, count = w < HALF, len(e)
@@ -230,12 +231,13 @@ def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, w
             expected=len(value), received=0, down_weighted=0, share=wilson(0, 0), independent=0.0,
             weight=nan, bias=nan, bias_low=nan, bias_high=nan, squared=nan,
         )  # fmt: skip
-    # The median lies with 95 % between the quantiles 1/2 -+ 1.96 / (2 sqrt N). N is the number of independent values
-    # that say as much; it is found by the correlation of ranks, as outliers would dominate that of the values.
+    # The median lies with probability 95 % between the quantiles 1/2 -+ 1.96 / (2 sqrt N), for N independent values.
+    # Innovations are correlated in time, so N is the number of independent values that tell the median as well. It is
+    # found by the correlation of ranks, since outliers would dominate the correlation of the values.
     ranks = np.argsort(np.argsort(e)).astype(float)
     reach = NORMAL / (2 * np.sqrt(count_independent(ranks)))
     low, median, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
-    # The number of independent values again, for the share that was down-weighted.
+    # The number of independent values for the down-weighted share: by the correlation of being down-weighted.
     down = int(np.sum(is_down_weighted))
     independent = count_independent(is_down_weighted.astype(float))
     return InnovationSummary(

@@ -19,21 +19,25 @@ def truncate_gaussians(
 ) -> tuple[jax.Array, Gaussian]:
     """Truncate Gaussians to where d'x = centre + row xi is above the first end, and below the second if there is one.
 
-    With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
-    and has the variance v S; x given d'x stays. Returns log P(d'x in the interval) (K,), -inf where d'x has no variance
-    and lies outside, and the Gaussians of the same moments.
+    Each of the K Gaussians is x = m + L xi, where xi has the independent variances `x.variances`; so d'x has the mean
+    `centre` and the coefficients `row` = d'L. Let S be the variance of d'x, and mu and v the mean and variance of a
+    standard normal number cut to the same interval. Then the mean of d'x moves by sqrt(S) mu, its variance becomes v S,
+    and the law of x given d'x stays. Returns log P(d'x in the interval) (K,), -inf where d'x has no variance and lies
+    outside, and the Gaussians with the moments of the cut laws.
 
     Shapes: x (K, n), centre (K,), row (K, n), ends (K,) each.
     """
-    # Without variance d'x lies inside or it does not.
+    # S = row diag(variances) row'. Where it is only rounding (`certain`), d'x lies inside or outside for certain; the
+    # deviation is 1 there, so that nothing is divided by zero.
     variance = jnp.sum(row**2 * x.variances, axis=1)
     certain = variance <= CERTAIN * (centre**2 + sum(end**2 for end in ends))
     deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
     inside = (ends[0] <= centre) & (centre <= ends[-1] if len(ends) > 1 else True)
-    # Moments of a standard normal number between the two, or beyond one.
+    # log mass, mu and v of a standard normal number between both standardised ends (end - centre) / sqrt(S), or above
+    # the only one.
     moments = (truncated_normal if len(ends) > 1 else upper_tail)(*((end - centre) / deviation for end in ends))
     log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
-    # Moments of the part inside, where it has any probability.
+    # Cut only where the part inside has a probability above 0; elsewhere shift 0 and ratio 1 leave x as it is.
     changes = jnp.isfinite(log_mass) & ~certain
     shift = deviation * jnp.where(changes, moments.mean, 0.0)
     ratio = jnp.where(changes, moments.variance, 1.0)

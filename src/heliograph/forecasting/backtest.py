@@ -252,8 +252,8 @@ def _score_filter(
     """Return the scores of one filter: of each number that it receives, and each state whose truth is known.
 
     Args:
-        segments: (row, filter as it is from there on), more than one if it is refitted.
-        record: of the run that is scored.
+        segments: (row, filter as it is from that row on); several if the filter is fitted anew on the way.
+        record: the recorded run whose values are compared with forecasts.
         u: inputs (rows, inputs).
         ahead: horizons, in rows.
         first: first row from which a forecast counts.
@@ -262,7 +262,7 @@ def _score_filter(
     filter, node = target.predictor.filter, target.node
     if filter.claim == "none":  # no covariance, so no forecast of a law
         return []
-    # Forecasts from each row, and what came.
+    # Forecasts from each row, at each horizon, of states and received numbers; beside them the values that came.
     z = select_measurements(target, record)
     states, received = _roll_segments(segments, z, u, ahead)
     angles = filter.angles_used() or FilterAngles((), ())

@@ -54,13 +54,15 @@ class RowsAhead(NamedTuple):
 def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> RowsAhead:
     """Return the rows of inputs over which a filter predicts from an origin to each horizon.
 
-    Where time counts steps there is a row a step; where the plant has an input dt, a row from each horizon to the next.
+    Where time counts steps there is one row for each step. Where the plant has an input dt (time is continuous), there
+    is one row for each horizon, with dt from the horizon before.
 
     Args:
-        origin: where the data end.
-        names: of the plant's inputs.
-        horizons: how far ahead.
-        inputs: those of the rows ahead but dt; "held" for those of the last row; None of a plant without others.
+        origin: where the data end: the last state, with the time and the inputs of its step.
+        names: names of the plant's inputs.
+        horizons: how far ahead: numbers of steps, times, or dates.
+        inputs: inputs of the rows ahead without dt; "held" repeats those of the last row; None for a plant that has no
+            inputs but dt.
 
     Raises:
         ValueError: a horizon that is not after the one before, or not after the data; inputs that are not those of the
@@ -71,13 +73,14 @@ def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, in
     if np.any(np.diff(distances, prepend=0.0) <= 0):
         raise fail("horizons", "times after the data, each later than the one before", show_value(horizons))
     time = _place_on_clock(origin, distances, is_continuous)
-    # A row for each horizon, with dt from the one before; else one for each step up to the last.
+    # A row for each horizon if time is continuous, else one for each step up to the last horizon.
     count = len(distances) if is_continuous else int(distances[-1])
     others = [name for name in names if name != TIME_STEP]
     u, source = _complete_inputs(origin, names, others, inputs, count)
     if is_continuous:
         u = np.insert(u, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=-1)
         return RowsAhead(u, rows=np.arange(count), steps=distances, time=time, inputs=source)
+    # Step 1 ahead is row 0, so the horizon at step h is row h - 1.
     steps = distances.astype(int)
     return RowsAhead(u, rows=steps - 1, steps=steps, time=time, inputs=source)
 

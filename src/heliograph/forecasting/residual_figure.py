@@ -51,14 +51,15 @@ def draw_residuals(
 ) -> "Figure":
     """Return a figure with a row of three panels for each output, the first twenty of them.
 
-    They are residuals over time, autocorrelations by lag, and residuals in order beside the quantiles of a normal law.
+    The panels are residuals over time, autocorrelations by lag, and sorted residuals against the quantiles of a normal
+    law. Residuals are innovations over their claimed deviations: white and normal of variance 1 if all is right.
 
     Args:
-        names: of the outputs.
+        names: names of the outputs.
         values: residuals (steps, m).
-        autocorrelation: over the first lags (lags, m).
-        band: half-width of the interval of 95 % of one of them (m,).
-        time: of the rows (steps,).
+        autocorrelation: autocorrelations over the first lags, from lag 1 (lags, m).
+        band: half-width (m,) of the interval that holds 95 % of the autocorrelations of white residuals.
+        time: times of the rows (steps,).
     """
     from matplotlib.figure import Figure
 
@@ -66,6 +67,7 @@ def draw_residuals(
     figure = Figure(figsize=(WIDTH, HEIGHT_OF_TITLES + HEIGHT_OF_ROW * count), layout="constrained")
     grid = figure.subplots(count, 3, squeeze=False, width_ratios=[2, 1, 1])
     lags = np.arange(1, len(autocorrelation) + 1)
+    # Dotted lines at -+2 deviations and grey bands hold about 95 % of the points if the model is right.
     for i, (over_time, by_lag, in_order) in enumerate(grid):
         over_time.plot(time, values[:, i], ".", markersize=3, color=COLOURS[0])
         for level in (-TWO_DEVIATIONS, 0, TWO_DEVIATIONS):

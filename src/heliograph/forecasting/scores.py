@@ -126,10 +126,11 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     """Return the mean of the values (rows,) that are not NaN, and its standard error; both NaN if there are none.
 
     Forecasts from neighbouring rows share what happens in between, so errors at horizon h are correlated over at least
-    h - 1 rows. With deviations d from the mean and Bartlett's weights W over max(h - 1, 1.3 sqrt(n)) lags, d' W d / n^2
-    is the squared error. It is too small in short recordings, since d are deviations from the mean of these very
-    values: by E[d' W d] / 1' S 1 for errors that overlap, correlated by S = 1 - lag / h. That factor is taken off. One
-    value says nothing of its error, which is NaN. BANDWIDTH: 1.3.
+    h - 1 rows. Let d be the n values' deviations from their mean, and W the matrix of Bartlett's weights, which fall
+    linearly to 0 over max(h - 1, 1.3 sqrt(n)) lags (BANDWIDTH: 1.3). Then d' W d / n^2 estimates the squared standard
+    error. It is too small in short recordings, since d are deviations from the mean of these very values. For errors
+    that overlap, with the correlation matrix S of entries max(1 - lag / h, 0), it is too small by the factor
+    E[d' W d] / 1' S 1, where 1 is the vector of ones; so it is divided by that. A single value has the error NaN.
 
     Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
     """
@@ -142,12 +143,14 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
         return ScoreMean(mean, float("nan"))
     lags = min(max(horizon - 1, int(BANDWIDTH * n**0.5)), len(values) - 1)
     bartlett, overlap, one = _fall_over_lags(lags + 1), _fall_over_lags(horizon), came.astype(float)
-    # tr(M W M S), M = I - 1 1' / n, of rows that came.
+    # E[d' W d] = tr(M W M S) with M = I - 1 1' / n over the rows that are not NaN, which `one` marks by ones:
+    # tr(W S) + (1' W 1) (1' S 1) / n^2 - 2 / n 1' W S 1.
     weights_of_rows, overlaps_of_rows = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
     shortest = min(len(bartlett), len(overlap))
     expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])
     total_overlap = one @ overlaps_of_rows
     expected += (one @ weights_of_rows) * total_overlap / n**2 - 2 / n * (weights_of_rows * one) @ overlaps_of_rows
+    # d' W d (1' S 1) / E[d' W d]; over n^2 it is the squared standard error.
     d = np.where(came, values - mean, 0.0)
     total = d @ _weigh_neighbours(d, bartlett) * total_overlap / expected
     return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / n))

@@ -111,8 +111,9 @@ def make_lossless_links(nodes: int, n: int) -> ReportModel:
 def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
     """Return the centre's state (x, e_1, ..., e_nodes, past reports) before the first report.
 
-    Filters start at known means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does. Nothing has
-    been sent: past reports are zeros.
+    A report is the estimate that a node sends to the centre, and may arrive some steps late. Filters start at known
+    means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does: x and all e_i share one root of
+    Cov x_0. Nothing has been sent: past reports are zeros.
 
     Args:
         errors: mean and covariance of (x, e_1, ..., e_nodes) at the start.
@@ -122,10 +123,12 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
+    # Cov x_0 = R diag(weights) R'. The rows of R serve x and every e_i alike; those of past reports are zeros.
     start = columns_of(errors.state_covariance)
     root_of_x_and_errors = jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1))
     root = jnp.pad(root_of_x_and_errors, (padding, (0, 0)))
     mean = jnp.pad(errors.mean.reshape(-1), padding)
+    # Models of the reports sent 0, 1, ... `delays` steps ago: no gain, no noise.
     ages_and_nodes = (delays + 1, nodes)
     past = PastReports(
         gain=jnp.zeros((*ages_and_nodes, received, n)),

@@ -18,9 +18,12 @@ def known_channel_design(
 ) -> HInfinityDesign:
     """Design gains at a given level for a channel whose gains are certain: a Riccati recursion.
 
-    The error e+ = E eta - K U eta depends on eta = (e, f~, h~, v, rho) and the gain K. Let
-    Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and S = diag(Q, lambda_f~, lambda_h~, level^2)^-1. The best gain is
-    K* = E S U' (U S U')^-1. It makes P2+^-1 = E S E' - K* U S E' the smallest over all gains.
+    The filter's error e follows e+ = E eta - K U eta, with eta = (e, f~, h~, v, rho), the innovation U eta and the gain
+    K. Here f~ = f(x) - f(xhat), |f~| <= a |e|, and h~ likewise with b, are the unknown functions of plant and sensor; v
+    and rho are disturbances. P2 is the weight of the error before the step, P2+ after it, and M e what the level
+    bounds. With multipliers lambda of the bounds on f~ and h~, let Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and
+    S = diag(Q, lambda_f~, lambda_h~, level^2)^-1. The best gain is K* = E S U' (U S U')^-1. It makes
+    P2+^-1 = E S E' - K* U S E' the smallest over all gains.
 
     Args:
         system: the system, from `growth_system`, whose channel has no random gain.

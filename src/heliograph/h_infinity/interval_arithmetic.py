@@ -95,7 +95,9 @@ def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
 def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
     """Return the interval that holds an operation's result on intervals x of its arguments.
 
-    `continuous`: refuse a comparison or sign whose outcome the intervals leave open.
+    `equation` is an operation of a traced JAX program (a jaxpr equation: primitive and parameters). An interval has
+    arrays of lower and upper ends; of truth values, False and True where both are possible. If `continuous`, a
+    comparison or sign whose outcome the intervals leave open is refused, since the function may jump there.
 
     Raises:
         NoIntervalError: an operation that is not known here, or that is refused.
@@ -120,7 +122,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
             return _bound_contraction(x[0], x[1], params["dimension_numbers"])
         case "iota":
             return point_interval(equation.primitive.bind(**params))
-        # What may be true in a part of the interval alone is not decided.
+        # A comparison that is true in only a part of the intervals has the ends False and True: not decided.
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _check_decided(_compare(name, *x), continuous)
         case "sign":

@@ -227,7 +227,11 @@ class HorizonProblem:
         weight: Float[np.ndarray, "w w"],
         initial: Float[np.ndarray, "w w"] | None = None,
     ):
-        """Compile the problem of all steps, whose unknowns are theirs and the level squared, which is minimised.
+        """Compile the problem of all steps, with their unknowns and the level squared, which is minimised.
+
+        An H-infinity filter bounds the error's energy by level^2 times the energy of all disturbances. Each step
+        demands a linear matrix inequality between the weight P before it and the weight after it (the matrix of a
+        quadratic function of the error); the least level for which all hold is sought (a semidefinite programme).
 
         Args:
             steps: each step's matrices in scaled coordinates.
@@ -248,6 +252,7 @@ class HorizonProblem:
         if initial is None:
             weight_forms, weight_constant = largest_initial, np.zeros_like(weight)
         else:
+            # level^2 W - P_0 >= 0, but for a margin.
             self._require_semidefinite(largest_initial, -initial)
             weight_forms, weight_constant = dict[int, np.ndarray](), initial
         start: np.ndarray | None = weight if initial is None else initial

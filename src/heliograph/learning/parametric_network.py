@@ -72,6 +72,7 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
         raise fail("name of a free number", "a text", show_value(name))
     what = "free number" if name is None else name
     value = array(f"start of {what}", start, (None,) * rank(f"start of {what}", start))
+    # Inside of a fit a reader notes the number, and answers with the value that is tried; outside there is none.
     reader = _reader.get()
     return (value if value.ndim else float(value)) if reader is None else reader.answer_free(value, name, kind)
 

@@ -244,15 +244,15 @@ def _lift_steps(
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
     """Lift each step to monomials; return the steps, and the rounding errors of both noises' variances over time.
 
+    The lifted state has all monomials of x up to the degree: X+ = F X + f + w, Z = H X+ + h + v. The covariances of its
+    noises depend on the moments of x before any data, so these are followed too. Once they are steady, all later steps
+    equal the last, to rounding. The roundings are (time, monomials of x) and (time, monomials of z).
+
     Args:
         routes: the maps of each step, x -> x+ and x+ -> z.
-        degree: of the monomials.
-        moments: of x_0, up to twice the degree.
-        varies: of the plant, and of the measurement, whether it differs between steps.
-
-    Returns:
-        Steps, and (time, monomials of x) and (time, monomials of z) for process and received noise. Where nothing
-        varies and the moments of the state are steady, all later steps equal the last, to rounding.
+        degree: largest degree of the monomials.
+        moments: moments of x_0 up to twice the degree (M,).
+        varies: whether the plant differs between steps, and whether the measurement does.
     """
     plant_varies, measurement_varies = varies
     steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
@@ -272,8 +272,8 @@ def _lift_steps(
         moments = plant_lift.push_moments(moments)
         check_finite_moments(moments, k, 2 * degree)
         noise, rounding_of_noise = measurement_lift.mean_conditional_covariance(moments)
-        transition, drift = split_homogeneous(plant_lift.matrix)
-        output, offset = split_homogeneous(measurement_lift.matrix)
+        transition, drift = split_homogeneous(plant_lift.matrix)  # F and f of [[F, f], [0, 1]]
+        output, offset = split_homogeneous(measurement_lift.matrix)  # H and h
         steps.append(Steps(transition, drift, process, output, offset, noise))
         roundings.append((rounding_of_process, rounding_of_noise))
     over_time = Steps(*(repeat_last_step(values, len(routes)) for values in zip(*steps, strict=True)))
@@ -326,8 +326,8 @@ class LiftedMap:
     ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
         """Return E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
 
-        `moments` are those of y up to twice the degree. Entry (i, j) needs only those up to `highest_degree`[i, j]: in
-        the difference higher ones cancel, so they are set to 0. Else they would cost digits where y is large.
+        `moments` are those of y up to twice the degree. Entry (i, j) needs those up to `highest_degree`[i, j]: higher
+        ones cancel in the difference, and would cost digits, so they are set to 0.
         """
         n, m, shape = self.route.inputs + 1, self.route.outputs + 1, self.highest_degree.shape
         K, covariance, rounding = self.matrix, np.zeros(shape), np.zeros(len(self.highest_degree))

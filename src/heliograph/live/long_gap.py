@@ -104,17 +104,18 @@ def _pass_silent_steps(
 ) -> Float[np.ndarray, " state"]:
     """Return the state after `count` steps of silence: a few probes, and the rest at once by what these show.
 
-    A probe is PROBED real steps in a row. If one changes no number, the state stays. If an affine map predicts it, the
-    map is applied for all later steps. Else the probes are extrapolated. A state holds factors L, D of
-    covariances at `places`; states are compared and extrapolated with L D L' there, since P' = F P F' + Q is affine in
-    P and not in its factors.
+    Silence is a gap without data, in which a filter only predicts. It may last millions of steps, so a few are really
+    computed. A probe is PROBED (256) real steps in a row. If a probe changes no number, the state stays. If an affine
+    map of the state predicts a probe, the map is applied for all later steps. Else the probes are extrapolated. A state
+    holds factors L, D of covariances at `places`; states are compared and extrapolated with L D L' there, since
+    P' = F P F' + Q is affine in P and not in its factors.
 
     Args:
-        step: the silent step, of states with factors.
-        state: state before the gap.
-        at: number of the step that led to it.
-        count: number of steps.
-        places: of the factors in a state.
+        step: computes one step of silence, of states with factors.
+        state: state before the gap: means, factors and all else of the filters, in one array.
+        at: number of the step that led to `state`.
+        count: number of steps of silence.
+        places: where the factors of covariances stand in a state.
     """
     after_probes = [state]  # the states after 0, 1, 2, ... probes
 

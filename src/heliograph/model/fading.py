@@ -54,6 +54,7 @@ def gilbert_elliott(
         ValueError: probabilities outside [0, 1], both zero, or channels of different shapes.
     Source: Gilbert (1960), Elliott (1963).
     """
+    # A Markov chain of the two states with the transition matrix [[1 - p, p], [q, 1 - q]]: p fails, q recovers.
     p, q = scalar("fail", fail, 0.0, 1.0), scalar("recover", recover, 0.0, 1.0)
     xp = library(p, q)
     transition = xp.stack([xp.stack([1 - p, p]), xp.stack([q, 1 - q])])
@@ -68,8 +69,9 @@ def markov_fading(
 ) -> Modes:
     """Return a link whose gain moves as a Markov chain: numbers, with one `noise`, or a channel for each mode.
 
-    `transition` is P(next j | now i), started in its stationary law, or a chain. Links of one `name`, or of
-    chains of one name, move together.
+    A mode is a state of the chain. `transition` has P(next mode j | mode i now) at row i and column j, and starts in
+    its stationary law; or it is a `MarkovChain`. Links of one `name`, or of chains of one name, are in the same mode at
+    each step.
 
     Args:
         gains: numbers (modes,), or a channel for each mode.

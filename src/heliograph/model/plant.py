@@ -297,6 +297,7 @@ class LinearPlant(AbstractPlant):
         limits: "StateLimitsLike" = (),
     ):
         """Check and hold x+ = A x + B u + w: A, B and the noise, which may depend on u, and the law of x_0."""
+        # E x_0; Cov x_0, or a `DiffuseStart` if states start unknown; and the law of x_0 about its mean.
         self.initial_mean, spread, self.deviation = _read_initial_law(initial_mean, initial_covariance, unknown=True)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")

@@ -111,9 +111,10 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
     """Return initial mean and initial law of several plants' joint state, the arguments of the joint plant.
 
-    If all starts are known, x_0 = center + d: the joint law is that of the independent deviations d, and the center is
-    E[x_0] - E[d], since a law may have a mean of its own. If the start of some states is unknown (a diffuse prior),
-    the law is their names with the covariance of the other states.
+    The joint state stacks the states of the plants. If all starts are known, x_0 = center + d: the joint law is that of
+    the independent deviations d of the plants, and the center is E[x_0] - E[d], since a law may have a mean of its own.
+    If the start of some states is unknown (a diffuse prior), the law is a `DiffuseStart`: the names of these states,
+    with the block-diagonal covariance of all others.
 
     Raises:
         ValueError: some start is unknown, and another plant's law of x_0 is not Gaussian.
@@ -123,10 +124,12 @@ def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
         laws = [plant.deviation or Gaussian(covariance) for plant, covariance in zip(parts, covariances, strict=True)]
         centers = [plant.initial_mean - law.mean for plant, law in zip(parts, laws, strict=True)]
         return library(*centers).concatenate(centers), Independent(laws)
+    # A diffuse prior is Gaussian, so the other plants' laws of x_0 must be Gaussian too: `deviation` holds other laws.
     for plant in parts:
         if plant.deviation is not None:
             expected = "a Gaussian one (a covariance) beside a start that nobody knows"
             raise fail("law of x_0 of a joined plant", expected, type(plant.deviation).__name__)
+    # Names of the states that start unknown, and the covariance of each plant's other states.
     unknown_states, known_covariances = list[str](), []
     for plant, covariance in zip(parts, covariances, strict=True):
         if isinstance(covariance, UnknownStart):

@@ -93,7 +93,8 @@ class Components:
 
         Args:
             time: numbers or dates (steps,); 0, 1, ... by default.
-            coverage: probability of the band.
+            coverage: probability with which the band holds the combination, under the claimed covariance; BAND by
+                default.
 
         Raises:
             ValueError: times of another number, a coverage that is no probability between 0 and 1.

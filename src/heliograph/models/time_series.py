@@ -85,12 +85,12 @@ def trend(
 ) -> Component:
     """Return a trend: a level that grows by a slope, both of which wander: the local linear trend.
 
-    level+ = level + slope + w, slope+ = slope + s. States: "level" and "slope", with "NAME_" before them where the
-    name is another than "trend".
+    level+ = level + slope + w, slope+ = slope + s with white noises w and s. Its states are "level" and "slope", with
+    "NAME_" before them where the name is another than "trend"; the series observes the level.
 
     Args:
-        level_variance: of w; 0 for a smooth trend.
-        slope_variance: of s; 0 for a straight one.
+        level_variance: variance of w; 0 for a smooth trend.
+        slope_variance: variance of s; 0 for a slope that does not change.
         initial_mean: level and slope before the first step; 0 by default.
         initial_variance: of both, or `hg.diffuse`; 1e8 by default.
         name: of the component; "trend" by default.

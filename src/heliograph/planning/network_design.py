@@ -99,6 +99,12 @@ def design(
 def _design_powers(problem: DesignProblem) -> PowerDesign:
     """Return the design of powers of a network of independent paths or a sum of links, or of paths from arrays.
 
+    A design chooses the powers of transmitters, at each time, that minimise the error of the estimate within a budget
+    of power, or the least power with which the error meets a target. A path is a chain of hops (amplifying
+    transmitters) from one sensor output to the receiver; in a sum of links, all links add up in one received number.
+    `problem` has the network (or the paths), the error to minimise, the budget or the target, and which transmitters
+    are free.
+
     Raises:
         ValueError: neither a budget nor a target error; paths that were made for another error.
     """
@@ -116,7 +122,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         _check_paths(network, problem)
         paths, present_powers = network, np.zeros(network.kappa.shape)
         states = tuple(f"x{i}" for i in range(network.rows.shape[-1]))
-    # Which of them are free, and their limits.
+    # Which transmitters are free, and the limits of their powers; without a budget there are none.
     free = find_free_transmitters(paths.names, problem.free)
     if problem.budget is None:
         limits = make_unlimited(error.steps, int(free.sum()))

@@ -31,9 +31,9 @@ T = TypeVar("T")
 def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "steps"]], error: Error) -> Network:
     """Return the network whose transmitters send these powers, with the best linear filters behind them.
 
-    Every node has the filter "best" behind its channel, and with several nodes "best" is also that of all that they
-    receive together. Codes of sensors stay. A node's limits of plausible measurements stay only where its powers are
-    unchanged: other powers change the scale of what is received.
+    Every node has the filter "best" behind its channel. With several nodes the network also has a fused filter "best",
+    which uses all measurements that they receive together. Error codes of sensors stay. A node's limits of plausible
+    measurements stay only where its powers are unchanged: other powers change the scale of what is received.
 
     Args:
         network: the network as it is.
@@ -51,7 +51,8 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     powers = _check_powers(powers, nodes, error.steps)
-    # E (x, 1)(x, 1)' of the state at each step, from which E (y, 1)(y, 1)' of what is sent follows.
+    # E (x, 1)(x, 1)' of the state at each step, in the steady state or over the horizon. It gives E (y, 1)(y, 1)' of
+    # what is sent, and so the gain of a transmitter that has a certain power.
     if error.horizon is None:
         seconds = [steady_moment_with_one(plant)] * error.period
     else:

@@ -183,11 +183,14 @@ def _list_cases(
 ) -> Iterator[_SensorCase]:
     """Yield the cases: all nodes first, then each node left out, each outage, each addition.
 
+    A case says which nodes' values a filter uses at which steps. Comparing its error with that of the case "all" shows
+    what a sensor is worth.
+
     Args:
-        names: of the network's nodes.
+        names: names of the network's nodes.
         added: names of nodes that are tried beside them.
         steps: length of a run.
-        without: nodes that are left out, each by itself; None for each of several.
+        without: nodes that are left out, each in a case of its own; None: every node, if there are several.
         outages: for how many steps at the end a node is out, by its name.
     """
     each_of_several = names if len(names) > 1 else []  # without a single one nothing would be received
@@ -196,7 +199,8 @@ def _list_cases(
         for name in asked:
             if name not in names:
                 raise fail(what, f"some of the nodes {', '.join(names)}", repr(name))
-    # Which values are used (steps, nodes), additions last: those of the network's nodes, not those of additions.
+    # Case "all": a mask (steps, nodes) with the additions in the last columns. The network's nodes are used at each
+    # step, and additions are not.
     base = np.tile(np.isin([*names, *added], names), (steps, 1))
     yield _SensorCase("all", base)
     for name in left_out:

@@ -239,12 +239,15 @@ class ScaledProgramme:
     ) -> Float[np.ndarray, "k k"]:
         """Return the Hessian of the Lagrangian value - m' room at z, by differences of its gradients.
 
+        The value is the objective, and room(z) the unused part of each limit, negative where a limit is exceeded. Entry
+        (i, j) is d^2 / (dz_i dz_j) times scale_i scale_j, so that sizes of variables do not matter.
+
         Args:
             z: the point.
-            multipliers: m, of the active limits.
-            active: which limits are.
-            index: the k variables by which it is differentiated.
-            scale: size of each of them, in units of which the Hessian is.
+            multipliers: m, the multipliers of the active limits.
+            active: flags of the limits that are active, which means reached at the solution.
+            index: numbers of the k variables by which the Lagrangian is differentiated.
+            scale: size of each of these variables (k,).
         """
 
         def lagrangian_gradient(point: Vector) -> Vector:

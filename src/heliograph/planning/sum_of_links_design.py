@@ -316,10 +316,11 @@ def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Ve
 def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
     """Return the links of a node's sum, as arrays of the design, and the sum in which all amplitudes are 1.
 
-    Each link sends one output y_i of the sensor with a random gain g_i; an amplitude of 1 sends y_i as it is.
+    Each link sends one output y_i of the sensor with a random gain g_i, and the receiver gets the sum of all links. An
+    amplitude, which the design chooses, multiplies y_i before it is sent; 1 sends y_i as it is.
 
     Args:
-        node: with a linear sensor behind a sum of links.
+        node: a node with a linear sensor behind a sum of links.
         second: E (y, 1)(y, 1)' of the sensor's outputs.
 
     Raises:
@@ -338,11 +339,12 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
     mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
     variance = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
     floor = sum(float(link.nominal.center[0, 0, -1, -1]) for link in moments) + float(channel.noise.covariance[0, 0])
-    # D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with the noise R of the outputs that are sent, t_i = E y_i^2.
+    # The links' noise: D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with R the noise of the outputs that are sent
+    # (`sensor_noise`) and t_i = E y_i^2 (`power`).
     outputs = [of_link[0] for of_link in channel.places]
     power = np.array(list(compute_sent_powers(unit, second).values()))
     sensor_noise = np.asarray(sensor.noise.covariance)[np.ix_(outputs, outputs)]
-    # Present amplitudes: sizes from powers, signs from mean gains, beside those of unit amplitudes.
+    # Present amplitudes: sizes and signs from powers and mean gains, each compared with that of an amplitude of 1.
     sizes = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
     present_gains = np.array([float(second_order(link).mean_gain[0, 0]) for link in channel.maps])
     signs = np.sign(present_gains) * np.sign(mean)

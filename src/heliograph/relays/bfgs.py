@@ -42,7 +42,8 @@ def bfgs(
     inverse_hessian = _DenseInverseHessian(gradient) if memory is None else _LimitedInverseHessian(memory)
     steps_without_gain = 0
     for _ in range(iterations):
-        # Quasi-Newton direction, shortened until the value decreases; then the update.
+        # Quasi-Newton direction -H g, shortened until the value decreases; then the update of H, the inverse Hessian,
+        # by the step and the change of the gradient g.
         direction = -inverse_hessian.times(gradient)
         trial = _backtrack(function, x, value, direction, float(direction @ gradient))
         if trial is None:

@@ -318,8 +318,9 @@ def _sweep_backward(
 ) -> Float[jax.Array, "time d d"]:
     """Return the gradient Lam_k of the cost by the moments after each step, found from the last step to the first.
 
-    Later steps are taken with the gains that are best for their Lam and for the moments that the given gains lead to.
-    `start` are the moments before the first step, and the cost is sum_k <cost_k, moments after step k>.
+    The moments are Cov(x, e_1 .. e_F), of the state and the filters' errors. Each step back takes the gains that are
+    best for its Lam and for the moments that the given `gains` lead to. `start` are the moments before the first step,
+    and the cost is sum_k <cost_k, moments after step k>, with <A, B> = sum A_ij B_ij.
     """
 
     def predict(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:

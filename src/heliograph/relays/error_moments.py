@@ -189,13 +189,14 @@ def propagate_error_moments(
 ) -> PropagatedMoments:
     """Propagate the covariance of eta = (x, e_1 ... e_F) over the steps; return it with gains and powers over time.
 
-    x (n,) is the plant's state and e_f the error of filter f; F filters receive R numbers.
+    x (n,) is the plant's state and e_f the error of filter f. The F filters, at relays and at the receiver, together
+    receive R numbers; a relay forwards its estimate, so errors of filters are coupled.
 
     Args:
-        steps: of the network.
-        start: the covariance before the first step.
-        gains: K of all filters as one block matrix (F n, R) for each step, of which columns of numbers that do not
-            arrive in the step's slot are not used; None for gains that minimise each filter's own next error.
+        steps: matrices of the relay network at each step.
+        start: covariance of eta before the first step.
+        gains: K of all filters as one block matrix (F n, R) for each step. Only columns of numbers that arrive in the
+            step (its time slot) are used. None for gains that minimise each filter's own next error.
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:

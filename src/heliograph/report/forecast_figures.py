@@ -33,12 +33,12 @@ def draw_forecasts(
     """Draw the filters' forecasts with their bands, following their estimates, and a vertical line where these end.
 
     Args:
-        panels: one for each state.
-        record: the record from whose last row they predict.
+        panels: one for each state, on which estimates are drawn already.
+        record: the record, from whose last row the filters predict.
         node: name of the node.
-        forecasts: by filter.
-        names: filters in the order of their colours.
-        sigmas: half width of a band in deviations.
+        forecasts: forecast of each filter, by its name; a filter may have none.
+        names: names of all filters, in the order of their colours.
+        sigmas: half width of a band, in claimed deviations.
     """
     for number, name in enumerate(names):
         if name not in forecasts:

@@ -74,6 +74,9 @@ class EstimateWriter:
     ) -> list[bytes]:
         """Return a line with the estimates of all filters for each row.
 
+        Most lines differ in numbers only, so they fill a template (text with places for numbers), which is faster than
+        writing JSON. A place is the number of a template's gap, and `self._order` has the column of `outputs` for each.
+
         Args:
             kind: "final" or "provisional".
             rows: plant and time of each row.
@@ -81,7 +84,8 @@ class EstimateWriter:
         """
         if not rows:
             return []
-        # The template fits rows whose numbers are finite, variances not negative, and which used all that had arrived.
+        # The template fits rows whose numbers are finite, whose variances are not negative, and whose filters used all
+        # that had arrived (reason 0). The three lists hold columns of `outputs`.
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
         # The texts of all numbers at once, row after row, in the order in which a line has them.
@@ -90,11 +94,11 @@ class EstimateWriter:
         by_place: list[Sequence[bytes | int]] = [texts[place::place_count] for place in range(place_count)]
         for place in self._whole:
             by_place[place] = outputs[:, self._order[place]].astype(int).tolist()
-        # Before them kind, plant and time of each row; then a line for each row by the template.
+        # Each line begins with the kind, plant and time of its row; then the template takes the texts of its places.
         names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
         head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
         lines = [self._template % of_row for of_row in zip(*head, *by_place, strict=True)]
-        # In place of those of rows that the template does not fit, lines that are written filter by filter.
+        # Rows that the template does not fit are written anew, filter by filter.
         for i in np.flatnonzero(~fits).tolist():
             estimates = self._write_estimates(outputs[i].tolist())
             lines[i] = HEAD % tuple(column[i] for column in head) + encode_line(estimates) + b"}"

@@ -50,10 +50,10 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
     """Return the transport for one part of the plants through the broker at this address.
 
     Args:
-        address: the broker; its `kind`, mqtt, nats or opc.tcp, selects the protocol; of any other the entry point of
-            that name in the group `heliograph.brokers`, called with these arguments, makes the transport.
-        part: the part of the plants whose messages are read; by default all.
-        translator: what reads the topics of others; None reads those of the service alone.
+        address: the broker. Its `kind` selects the protocol: mqtt, nats or opc.tcp. For any other kind, the entry point
+            of that name in the group `heliograph.brokers`, which another package offers, makes the transport.
+        part: the part of the plants whose messages are read, if several processes share them; by default all.
+        translator: reads messages on topics of other systems, in their formats; None: only topics of the service.
 
     Raises:
         ValueError: no address, part or translator; an OPC UA server without sources; a broker that no package offers.

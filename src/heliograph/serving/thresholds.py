@@ -75,12 +75,14 @@ def find_crossing_probabilities(
 ) -> dict[str, list[dict[str, float]]]:
     """Return by threshold the probabilities that it is crossed at each horizon, and by then, as they are published.
 
-    All are of the same paths.
+    DRAWS paths of the future are drawn from the last state, with the last inputs held. A probability is the share of
+    these paths, the same ones for all thresholds and horizons. Of each horizon are returned "then" (beyond the
+    threshold at that time), "by" (beyond it at any time up to then) and "by_error", the standard error of "by".
 
     Args:
-        source: where the forecast starts.
-        place: node and filter.
-        thresholds: the levels, at least one.
+        source: where the forecast starts: the last state, such as that of a live network.
+        place: names of the node and its filter.
+        thresholds: (name of a state or output, level, whether beyond is above it); at least one.
         horizons: how far ahead, in steps or in the unit of dt.
         whole: whether horizons are steps; every step up to the last is then looked at, else the horizons alone.
     """

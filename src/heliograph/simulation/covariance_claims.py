@@ -245,6 +245,7 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
 
     Keys are (node, name of the filter or fusion); those of the fusion centre come last, under FUSED in place of a node.
     """
+    # Filters of the nodes state their claims. A mesh is a fusion between neighbours, with one claim for all its nodes.
     claims = {
         (name, filter_name): filter.claim
         for name, node in network.nodes.items()

@@ -94,7 +94,12 @@ class Node(Module):
         stuck: "StuckLike" = None,
         timeout: float | None = None,
     ):
-        """Check that sensor, channel, trigger, encoder and filters fit, and find what the filters receive."""
+        """Check that sensor, channel, trigger, encoder and filters fit, and find what the filters receive.
+
+        A node is a sensor, the channel from it, and filters of what arrives. A trigger decides at the sensor whether a
+        measurement is sent; an encoder quantises it to codewords. `limits`, `invalid` (error codes) and `stuck` say
+        which readings are refused, and after `timeout` without one the node counts as silent.
+        """
         self.timeout = None if timeout is None else float(scalar("timeout", timeout, low=TINY))
         self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
@@ -102,7 +107,8 @@ class Node(Module):
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_sent(first(sensor), first(channel))
-        # A sender that decides, and one that sends words, add numbers beside the values: reasons, dithers.
+        # Numbers that arrive beside the values: a trigger's side information, and the dithers of codewords that the
+        # receiver subtracts.
         if trigger is not None:
             check_trigger(trigger, first(sensor), first(channel), self.filters)
         side_information = 0 if trigger is None else trigger.side_information(len(self.outputs))
@@ -117,7 +123,7 @@ class Node(Module):
         # A channel may deliver a flag of its mode beside the measurement: refused unless the filter's model has it too.
         for name, filter in self.filters.items():
             check_filter_flags(f"filter {name!r}", filter, [first(channel)])
-        # A sensor with feedback sends what the informed filter did not predict: no other filter could use that.
+        # A sensor with feedback sends its measurement less one filter's prediction: no other filter could use that.
         receiving = [name for name, filter in self.filters.items() if filter.received]
         if self.informed_by is not None and receiving != [self.informed_by]:
             expected = f"no filter with measurements besides {self.informed_by!r}"
@@ -291,12 +297,13 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
 def check_states(name: str, filter: object, network: HasNodes) -> None:
     """Raise ValueError unless a filter has as many states and inputs as the plant, and the plant's attitudes.
 
-    An attitude is three states that are a rotation. A filter corrects it by a rotation, where it adds to other states.
+    An attitude is three states that are the vector of a rotation. A filter corrects an attitude by composing rotations,
+    and other states by adding, so filter and plant must agree which states are attitudes.
 
     Args:
-        name: of the filter or fusion, for errors.
-        filter: a filter, or a fusion, which has no states of its own.
-        network: with the plant.
+        name: name of the filter or fusion, for errors.
+        filter: a filter, or a fusion, which has no states of its own: only its attitudes are compared.
+        network: the network with the plant.
     """
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
@@ -310,6 +317,7 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
                     f"the plant's {len(of_plant_names)} {kind} {list(of_plant_names)}",
                     f"{len(of_filter_names)} {list(of_filter_names)}",
                 )
+    # Numbers of the states that are attitudes, for the plant and for the filter.
     of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
     if of_plant != of_filter:
         expected, got = ([network.states[i] for i in places] for places in (of_plant, of_filter))

@@ -93,12 +93,15 @@ def smooth_settled_chunks(
 ) -> SmoothedChunk | None:
     """Smooth chunks as if the filter's covariances had settled in all of them; None where that is not possible.
 
-    It is not possible if the covariance of the smoothed law does not settle, or without native code.
+    A covariance has settled if complete rows change it no more, so that only means must be computed. Chunks are parts
+    of a long recording, which are smoothed side by side. It is not possible if the covariance of the smoothed law does
+    not settle, or without native code.
 
     Args:
         recursion: the filter over rows.
         settled: the filter's settled state, and its smoother step there.
-        begun: the states with which the chunks begin.
+        begun: the states with which the chunks begin, the numbers of their first rows, and `lengths.ahead`, the number
+            of rows in which a filter is supposed to forget its start.
         windows: the rows of each chunk and those after it, (chunks, rows, ...).
     """
     # The smoothed law with a settled covariance, found by repeating the settled smoother step.
@@ -108,6 +111,7 @@ def smooth_settled_chunks(
     smoothed = find_settled_state(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
     if smoothed is None:
         return None
+    # Filter and smooth the means of all chunks in one call of compiled code, and put the settled covariances to them.
     arguments = recursion, back, smoothed, means_of(begun.states), windows, begun.first
     differs_by_chunk = [False, False, False, True, True, True]  # means, rows and numbers of first rows
     choice = choose_code(_smooth_settled, arguments, differs_by_run=differs_by_chunk)

@@ -82,7 +82,8 @@ def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
     """Return the filter of the same model in other units: it estimates S xhat from Q z and U u.
 
     `filter` estimates xhat from measurements z and inputs u; S, Q and U are the diagonal matrices of the factors of
-    states, measurements and inputs in `units`.
+    states, measurements and inputs in `units`. A test compares both filters: only rounding may make them differ. Each
+    kind of filter stores its model in fields of its own, so each case rescales these.
 
     Raises:
         ValueError: a filter of an unknown kind.

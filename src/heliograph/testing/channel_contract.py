@@ -85,8 +85,11 @@ def _compare_modes(
 ) -> float:
     """Compare moments of two successive draws, each and jointly; return the largest difference in standard errors.
 
+    The test of a channel with memory: the moments that it declares, against means over samples that it draws. Monomials
+    of order i are all products of i of the numbers (z, 1), and mono(z) is their vector.
+
     Args:
-        modes: the channel's modes.
+        modes: the channel as a Markov chain of modes, with the moments of its map in each mode.
         points: the input y of the first draw, and of the second.
         now: what arrives of the first (sample, outputs).
         later: what arrives of the second (sample, outputs).
@@ -97,10 +100,12 @@ def _compare_modes(
     by_mode = {
         order: [modes.moments(order) @ evaluate_monomials(y, order) for y in points] for order in range(1, highest + 1)
     }
+    # Each draw by itself: E[mono(z)] = sum_a P(mode a) E[mono(z) | a], one transition later for the second draw.
     for order, (at_first, at_second) in by_mode.items():
         first, second = initial @ at_first, initial @ transition @ at_second
         worst = max(worst, _compare_means(f"order {order}, first draw", first, _evaluate_monomials(now, order)))
         worst = max(worst, _compare_means(f"order {order}, second draw", second, _evaluate_monomials(later, order)))
+    # Both together: E[mono_i(z1) mono_j(z2)'] = sum_ab P(a) P(b | a) E[mono_i(z1) | a] E[mono_j(z2) | b]'.
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
         expected = np.einsum("a,ab,am,bl->ml", initial, transition, by_mode[i][0], by_mode[j][1]).reshape(-1)
         seen = np.einsum("sm,sl->sml", _evaluate_monomials(now, i), _evaluate_monomials(later, j)).reshape(len(now), -1)

@@ -21,11 +21,12 @@ MISSING = 0.3  # share of the components that do not arrive
 def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, seed: int = 0) -> None:
     """Check the contract of a filter on random measurements, with the same inputs at each step.
 
-    Claim and sizes are stated, and a measurement or input of another size is refused. A step equals prediction and
-    correction; is deterministic; preserves the structure of the state; returns a finite mean and a symmetric positive
-    semidefinite covariance (NaN if it claims none), also if some or all components are missing; and does the same
-    inside vmap. An innovation is NaN where a component is missing; its log-likelihood is finite unless no covariance is
-    claimed, 0 if nothing arrived, and `log_likelihood` of a run is the sum.
+    The filter must state its sizes and its claim (what its covariance is said to be: exact, a bound, nominal or none),
+    and refuse a measurement or input of another size. A step must equal prediction and correction, be deterministic,
+    preserve the structure of the state, and do the same inside vmap. It must return a finite mean and a symmetric
+    positive semidefinite covariance (NaN if it claims none), also if some or all components are missing. An innovation
+    must be NaN where a component is missing. The log-likelihood must be finite unless no covariance is claimed, 0 if
+    nothing arrived, and in a run the sum over the steps.
 
     Args:
         filter: the filter to test.

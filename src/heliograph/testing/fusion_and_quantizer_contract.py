@@ -124,7 +124,9 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
 def _check_quantizer_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
     """Check a quantizer Q on random values (n,), each of which follows the last from the state that it left.
 
-    What is delivered has the stated error, Q(Q(x)) = Q(x) from the same state, and Q does the same under jit and vmap.
+    A quantizer rounds what a node sends, and states how large the error of each component may be; its state may change
+    from message to message. Checked are that the delivered value has the stated error, that Q(Q(x)) = Q(x) from the
+    same state, and that Q does the same under jit and vmap.
 
     Raises:
         AssertionError: naming the rule that is broken.

@@ -124,6 +124,8 @@ def _compare_runs(
 ) -> float:
     """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed.
 
+    Units are arbitrary, so the estimates must be the same but for their factors and for rounding.
+
     Some estimates come from a search that minimises a trace, a sum of squares of different units. By definition these
     end elsewhere in other units: they are compared, to SEARCHED, only where all states have one factor. All others are
     compared to DIGITS.

@@ -284,8 +284,8 @@ class FunctionWriter:
     def _write_loop(self, loop: Loop) -> None:
         """Write a loop as basic blocks: phi nodes for the numbers that it carries, the body, and the jump back.
 
-        A phi node stands at the beginning of an iteration. It has the initial number if control comes from before the
-        loop, and else that from the end of the body. A counted loop has at least one iteration.
+        A phi node stands at the beginning of an iteration: it takes the initial number if control comes from before the
+        loop, else the one from the end of the body. A counted loop has at least one iteration.
         """
         self.count += 1
         name, label_before = f"loop{self.count}", self.label
@@ -303,7 +303,7 @@ class FunctionWriter:
             for rows in self.prefetched_rows:
                 requests = write_prefetch_requests(rows, loop.length or 1, counter, WIDTH, self.add)
                 self.lines += [f"  {line}" for line in requests]
-        # Counted: body, then the latch. Conditional: the check is inside the body.
+        # Names of the carried numbers after an iteration (`following`) and after the loop (`finals`).
         if loop.condition is None:
             following = finals = self._write_counted_loop(loop, name, counter, carried)
         else:

@@ -295,16 +295,16 @@ def _locate_rows(
 ) -> list[PrefetchedRows]:
     """Write the addresses of the rows that a loop prefetches; return them with their sizes and lines per iteration.
 
-    In the LLVM text %first is the block's first run, and WIDTH the number of runs of a block, which is chosen only when
-    code is generated. `width` is the most that it can be: it gives the number of cache lines.
+    A block is some runs (evaluations of one program), computed side by side; a buffer's row is its numbers of one run.
+    In the LLVM text %first is the block's first run, and WIDTH the runs of a block, chosen when code is generated.
 
     Args:
         writer: writer of the block function.
         names: LLVM name of the address of each buffer's memory.
         inputs: buffers whose rows for the next block are read.
         outputs: buffers whose rows for this block are written.
-        width: the most runs of a block.
-        loop: the loop.
+        width: the most runs of a block, which gives the number of cache lines.
+        loop: each of its iterations prefetches an equal share of the cache lines.
     """
     first_of_next, prefetched = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
     for buffer in (*inputs, *outputs):
@@ -326,14 +326,14 @@ def _add_to_sums(
 ) -> None:
     """Make the writer's stores to these outputs add to sums over runs.
 
-    Run r belongs to batch r mod batches. A row has a sum for each batch and some more (`row_length_of_sums`). The first
-    of each `width` consecutive runs, the most that a vector has, adds to the sum of its batch, and the others to those
-    behind it, also beyond the last batch. So sums have the same bits however many runs a vector has.
+    Run r belongs to batch r mod batches, and a row has batches + width - 1 sums. Runs are taken in groups of `width`:
+    the first run of a group adds to the sum of its batch, and the others to the places behind it, also beyond the last
+    batch. So numbers are added in the same order, and sums have the same bits, however many runs a vector has.
 
     Args:
-        writer: of the function of blocks, at the beginning of a block.
+        writer: writer of the function that computes a block of runs, one in each lane of a vector; at its beginning.
         summed: how many batches there are.
-        names: of the buffers' addresses.
+        names: LLVM name of each buffer's address.
         number: the input with each run's number.
         outputs: the buffers with rows of sums.
         width: the most runs of a vector, a power of two.
@@ -344,10 +344,10 @@ def _add_to_sums(
     address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {first_of_width}")
     run = writer.add(f"load i32, ptr {address}, align 4")
     batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
-    # The place of this vector's first lane.
+    # The place in the row of this vector's first lane: batch + (first run of the block - first of the `width` runs).
     behind = writer.add(f"sub i64 %first, {first_of_width}")
     place = writer.add(f"add i64 {batch}, {behind}")
-    # Lanes beyond the last run repeat it, and do not count: those whose number is not below the runs that are left.
+    # Lanes beyond the last run do not count: those whose number is not below the runs that are left.
     runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
     writer.lanes_with_run = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:

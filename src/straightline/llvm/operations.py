@@ -141,7 +141,8 @@ def _write_integer_operation(node: Node, names: list[str], text: str, emit: Emit
         return emit(f"{INTEGER[op]} {first}, {names[1]}")
     if op == "neg":
         return emit(f"sub {text} zeroinitializer, {names[0]}")
-    # Of flags by or and and: LLVM's max and min of them end the process where it generates code in haste for AVX-512.
+    # The max of flags is "or", the min is "and". LLVM's own max and min of flags end the process where it generates
+    # code quickly, without optimising, for AVX-512.
     if type == "bool" and op in ("max", "min"):
         return emit(f"{'or' if op == 'max' else 'and'} {first}, {names[1]}")
     if op in ("max", "min"):

@@ -22,9 +22,10 @@ Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column
 def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute eigenvectors (n, n), in columns, and eigenvalues (n,), ascending; all NaN if an entry is not finite.
 
-    Jacobi's method: each rotation makes one off-diagonal entry zero; a sweep rotates each pair of rows once, and sweeps
-    end when the off-diagonal entries are below rounding. Pairs are in the order of a tournament: all turns of a sweep
-    rotate the same places, and the rows move on between turns, so that the program has one turn, of 6 n^2 operations.
+    `a` (n, n) is symmetric; (a + a') / 2 is decomposed. Jacobi's method: each rotation makes one off-diagonal entry
+    zero; a sweep rotates each pair of rows once, and sweeps end when the off-diagonal entries are below rounding. Pairs
+    are in the order of a tournament: a turn rotates disjoint pairs of rows, at places that are fixed, and the rows move
+    on to other places between turns. So all turns are the same program, of 6 n^2 operations.
 
     Source: Jacobi, Ueber ein leichtes Verfahren (1846); Golub and Van Loan, Matrix computations, section 8.5; Luk and
     Park, On parallel Jacobi orderings (1989), by which it converges as the order by rows does.

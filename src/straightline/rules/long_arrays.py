@@ -311,7 +311,9 @@ def _make_reduction_rule(name: str) -> Rule:
 def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) -> list[Value]:
     """Lower the reduction of a long array in a loop: each turn reduces one row along its own axes.
 
-    The reduced rows are stacked, or reduced further one after another where the operation's axes include the first.
+    Lowering translates an operation of JAX (`equation`, such as reduce_sum, of this `name`) to nodes, one for each
+    number of its result. A long array would need too many nodes, so a loop over its rows (axis 0) computes it: row by
+    row. The reduced rows are stacked, or reduced further one after another where the operation's axes include axis 0.
     """
     axes = equation.params["axes"]
     # The same operation within a row, and on two rows to one; both have a result of the shape of a reduced row. A row

@@ -112,13 +112,16 @@ def _yield_starts(
 ) -> Iterator[tuple[tuple[int, ...], Node]]:
     """Yield each place where the window of an index may start, and the node of whether it starts there.
 
+    A scatter writes windows of updates into an array, each at an index that is known only when the program runs. So for
+    every place where the window fits, a node (a number of the program) says whether the index means that place.
+
     Args:
         graph: the program.
-        equation: the scatter.
-        shape: of the array.
-        sizes: of a window, along each axis of the array.
-        row: where the index stands among all, along the leading axes of the indices.
-        index: its nodes, one for each axis of the array that an index selects.
+        equation: the scatter, an operation of JAX.
+        shape: shape of the array.
+        sizes: length of a window along each axis of the array.
+        row: place of the index among all indices, along their leading axes.
+        index: nodes of the index, one for each axis of the array that an index selects.
     """
     numbers, clips = equation.params["dimension_numbers"], _clips_indices(equation)
     nodes = dict(zip(numbers.scatter_dims_to_operand_dims, index.tolist(), strict=True))
@@ -136,8 +139,7 @@ def _yield_starts(
             last = shape[axis] - sizes[axis]
             if clips and last == 0:  # clipped to the one place there is, so that it starts here in any case
                 continue
-            # Where indices are clipped, the first place is meant by all indices up to it, and the last one by all from
-            # it on.
+            # Clipped indices: all up to the first place mean the first, and all from the last place on mean the last.
             comparison = "eq"
             if clips and start[axis] == 0:
                 comparison = "le"

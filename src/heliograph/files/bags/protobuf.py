@@ -141,8 +141,8 @@ class ProtobufSchema:
     def decode(self, data: bytes, name: str, depth: int = 0) -> dict[str, Any]:
         """Return a message as a dictionary by the names of its fields.
 
-        Enumerations are names; a `Timestamp` is its `sec` and `nsec`; bytes are None. What is absent has its default
-        where the schema knows no other meaning of that.
+        Values of enumerations become their names, a `Timestamp` a dictionary of `sec` and `nsec`, and bytes None. A
+        field that is absent gets its default, if the schema says that absence means the default (`implicit`).
 
         Args:
             data: the message.
@@ -157,6 +157,7 @@ class ProtobufSchema:
         fields = self.messages[name]
         content: dict[str, Any] = {f.name: [] if f.repeated else self._choose_default(f) for f in fields.values()
                                    if f.repeated or f.implicit}  # fmt: skip
+        # Repeated fields collect their values, which may be packed in one; of any other field the last value counts.
         for number, wire, value in read_fields(data):
             field = fields.get(number)
             if field is None:  # of a newer schema

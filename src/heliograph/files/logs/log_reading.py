@@ -78,7 +78,8 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
 
-    The logs in a folder are read one after another. Each message that is asked for must be in one of them.
+    A log is a vehicle's or bus's file of signals over time; sources say which signals are a node's values. The logs in
+    a folder are read one after another. Each message that is asked for must be in one of them.
 
     Args:
         path: the log, or the folder of logs.
@@ -93,6 +94,7 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
     place = str(path) if given.dbc is None else f"{path} by {given.dbc}"
+    # The units of the signals that are used, for the notes; it raises if a signal is missing.
     used = _find_signal_units(place, path, log, sources)
     yield from log.messages
     notes += log.notes

@@ -20,12 +20,13 @@ DATE = "time_utc_usec"
 def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """Return a ULog file as a log; a further instance of a topic is named with its number, "sensor_baro.1".
 
-    Times are since the device began to run; their date is that of the first fix of its satellite receiver.
+    ULog is the format of the flight controller PX4. Its times count from when the device began to run; their date is
+    found from the first fix of its satellite receiver.
 
     Args:
         path: the file.
-        sources: which say the date of the begin, where it is known otherwise.
-        wanted: whether a topic of a name is read.
+        sources: the user's sources; `sources.start` is the date at which the log began, None if it is not given.
+        wanted: says of the name of a topic whether its values are read.
 
     Raises:
         ValueError: no ULog file.
@@ -39,7 +40,8 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "a ULog file", error_text(error)) from None
     topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
-    # The units of a topic's fields, which a ULog file does not say; of the wanted ones their values over time.
+    # For each topic the units of its fields, "" since a ULog file does not say them; for wanted topics also the values
+    # of the fields over time.
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
         name: MessageSeries(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})

@@ -179,10 +179,13 @@ def _read_table_of_own_format(
 def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicReader | None, strict: bool) -> EventTable:
     """Return the events of messages, which are either all of topics of the sources, or all in our own form.
 
+    Our own form is a message with the fields that this package defines (node, count, time, values), which needs no
+    sources. An event is what one message says: a node's values with the time of measuring and of arrival.
+
     Args:
         path: the file, the folder or the store's table.
-        network: the network.
-        sources: its sources; None of messages in our own form.
+        network: the network, whose nodes and outputs the messages name.
+        sources: reads messages by the sources of their topic; None if all messages are in our own form.
         strict: whether the first message that cannot be read is an error.
 
     Raises:
@@ -190,6 +193,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicRead
     """
     events = None if sources is None else EventTable(network, sources.step_seconds)
     is_rows = isinstance(path, StoreTable) or is_table_file(path)
+    # `own` collects messages in our own form, `events` those of topics; only one of them may get any.
     own = OwnMessageCollector(network, path, table=is_rows, ignore_unknown=False)
     broken = ""
     for message in _yield_messages(path, sources):
@@ -243,22 +247,28 @@ def _append_message(
 ) -> None:
     """Append the events of a message; what cannot be read is refused alone.
 
+    A source says how the values of a node are read from messages of a topic. An event is what one message says: a
+    node's values with the time of measuring and of arrival.
+
     Args:
         path: the file, the folder or the store's table.
-        message: the message.
-        sources: the sources, which note words of devices and what was left out.
-        events: where the events go.
+        message: the message: topic, content, time of arrival and place in the file.
+        sources: reads messages by the sources of their topic; it also notes whether devices are online.
+        events: the table to which events are appended; it counts what was refused.
         strict: whether a message that cannot be read is an error.
     """
+    # A message without a topic has the topic of its table or file.
     topic = message.topic
     if topic is None:
         topic = path.topic if isinstance(path, StoreTable) else find_topic_of_file(path, sources)
     try:
+        # The status of a device, online or offline, is no event.
         if sources.take_device_word(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
         content = decode_message_content(message) if sources.of(topic) else None
         arrival = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
+        # A message may be of several nodes. What cannot be read of one is noted, so that it does not count as lost.
         for reading in sources.read(topic, content, message.where):
             if isinstance(reading, Unread):
                 events.refuse(reading.error, strict)
@@ -280,14 +290,18 @@ def _append_reading(
 ) -> None:
     """Append the event of one reading of a message, unless only the arrival of a stored message would date it.
 
+    A reading has the values of one node in a message, and its time of measuring, if the message says it; else the time
+    of arrival dates the event.
+
     Args:
-        topic: of the message.
+        topic: topic of the message.
         message: the message.
         content: its payload, decoded.
         reading: what one source read in it.
-        arrival: when the message arrived, in nanoseconds since 1970; None where it does not say it: when measured.
-        sources: the sources.
-        events: where the event goes.
+        arrival: when the message arrived, in nanoseconds since 1970; None if the message does not say it: then the time
+            of measuring stands for it.
+        sources: the sources, which note clocks and senders of messages.
+        events: the table to which the event is appended.
 
     Raises:
         ValueError: neither a time nor an arrival.

@@ -166,7 +166,9 @@ class HeliographMessageReader:
     def read(self, where: str, row: Mapping[str, Any]) -> list[tuple[Reading | Unread, Any]]:
         """Return the events of a message, its inputs first, each with its arrival, in the unit of times.
 
-        Where its values cannot be read, one `Unread` with node, count and time stands for the events.
+        A message in our own form has a node, a count, a time and values; the time of arrival, the plant and inputs that
+        were set may be in it too. An event is a `Reading` of a node's values, or of inputs. Where the values cannot be
+        read, one `Unread` with node, count and time stands for the events, so that the message does not count as lost.
 
         Args:
             where: place of the message, for errors.
@@ -187,7 +189,7 @@ class HeliographMessageReader:
         if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
             arrival, _ = self._read_time(row[ARRIVAL], where, ARRIVAL)
         plant = "" if row.get(PLANT) is None else convert_name(row[PLANT], f"{where}, column {PLANT!r}")
-        self.numbers = not dated
+        self.numbers = not dated  # whether times are numbers rather than dates
         try:
             values = _read_event_values(row, self.components[node], where, node in self._numbered)
         except InputError as error:

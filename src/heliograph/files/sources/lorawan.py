@@ -102,7 +102,7 @@ def the_things_stack(
         scale: factor of the values (default 1).
         offset: added after scaling (default 0).
         radio: "rssi" (dBm), "snr" (dB) or both, as the first gateway in the message received it: numbers of these names
-            that are told of the values (`hg.model.told`). None for neither.
+            that come with each message and set the law of its noise or gain (`hg.model.told`). None for neither.
 
     Raises:
         ValueError: what `json_field` refuses.
@@ -121,16 +121,18 @@ def chirpstack(
 ) -> "dict[str, Source]":
     """Return the sources of uplinks of ChirpStack v4, a plant for each device: `sources = {**this, ...}`.
 
-    Time, count and what is absent are as in `the_things_stack`.
+    ChirpStack is a server for LoRaWAN radio; an uplink is a message of a device. A source says how values are read from
+    messages of one topic. The time of measuring, the count of messages, and what is done about absent fields are as for
+    `the_things_stack`.
 
     Args:
-        path: dotted path within the decoded object, or several, as of `json_field`.
+        path: dotted path of a value within the decoded object of the message, or several paths, as for `json_field`.
         node: name of a node of the network; or the `Field` that names it.
         output: name of the output, one for each path; None for all of the node's.
         scale: factor of the values (default 1).
         offset: added after scaling (default 0).
         radio: "rssi" (dBm), "snr" (dB) or both, as the first gateway in the message received it: numbers of these names
-            that are told of the values (`hg.model.told`). None for neither.
+            that come with each message and set the law of its noise or gain (`hg.model.told`). None for neither.
 
     Raises:
         ValueError: what `json_field` refuses.

@@ -221,6 +221,7 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
     """
+    # A stamp (seconds and nanoseconds) first: its number is in nanoseconds already.
     stamp = None if isinstance(value, int | float | str) else _read_stamp(value, name)
     if stamp is not None:
         return _convert_number_to_nanoseconds(stamp, "ns", name)

@@ -256,8 +256,9 @@ class TopicReader:
     ) -> Reading | None:
         """Return plant, node, count and time of a message that could not be read, as a reading whose values are NaN.
 
-        It serves to count lost messages. So None without a readable plant, node and running count; but a message that
-        was refused by its flag or count (`error` is a RefusedError) is returned even without a count.
+        A message that came must not count as lost, so its running count is needed. Return None if plant, node or count
+        cannot be read; but a message that its flag or count refused (`error` is a RefusedError) is returned without a
+        count too. `mapped`: the source with its pattern of topics. `where`: place of the message, for errors.
         """
         sequence, is_count_absent = None, False
         try:

@@ -60,8 +60,14 @@ def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:
 def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str) -> None:
     """Write the rows of a table as points at `moments` (datetime64[ns]); numbers that are not finite are left out.
 
-    A point of the same moment and plant is replaced, so that an interrupted call can simply be repeated. Of several
-    rows of one moment only the last stays therefore, and a warning says how many do not.
+    InfluxDB replaces a point of the same moment and plant, so an interrupted call can simply be repeated. For the same
+    reason only the last of several rows of one moment stays, and a warning says how many rows are lost so.
+
+    Args:
+        address: the server, its database, and the table for estimates.
+        columns: values of each column by its name, (rows,) each.
+        moments: time of each row (rows,).
+        plant: name of the plant, by which its points are told from others'.
 
     Raises:
         ValueError: the server does not answer or refuses. The error says how many rows are written.
@@ -74,6 +80,7 @@ def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], momen
             "measurement has one point",
             stacklevel=2,
         )
+    # One request a batch of lines. `done` counts the rows that are written before an error.
     done = 0
     for body, rows in _batch_protocol_lines(address.table_for_estimates, columns, moments, plant):
         try:
@@ -124,6 +131,8 @@ def _escape_name(name: str, signs: str) -> str:
 
 def _send_request(address: StoreAddress, method: str, target: str, body: bytes | None = None) -> bytes:
     """Return the body of a server's answer to one request.
+
+    A request has a connection of its own, by HTTPS for an address "influxs", and is given up after SECONDS seconds.
 
     Args:
         address: the server.

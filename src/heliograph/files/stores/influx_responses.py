@@ -180,11 +180,11 @@ def _make_columns(
     """Return rows as the columns of one table.
 
     Args:
-        address: where they came from, for errors.
+        address: the store that the rows came from, for errors.
         names: names of the columns, which may repeat.
-        rows: the rows, by name.
-        read_time: makes nanoseconds since 1970 of a time.
-        sorts: whether rows are of several series, and are put in the order of time.
+        rows: the rows, each a mapping from the name of a column to its value.
+        read_time: converts a time as it stands in a row to nanoseconds since 1970.
+        sorts: whether rows are of several series, one after another, and must be put in the order of time.
     """
     if not rows:
         raise fail(str(address), "a query with rows", "none")

@@ -19,6 +19,9 @@ TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "bigi
 def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     """Return the database's name and the columns of a table, as lists, asked for in a transaction that only reads.
 
+    `address` names the server, the database, and either a statement (`query`) or a table, which is read in the order of
+    its column `time`. Times come in UTC.
+
     Raises:
         ValueError: the server is away or refuses; no rows; a name twice. One line.
     """
@@ -47,7 +50,9 @@ def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
 def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], plant: str) -> None:
     """Write rows to a table, which is made where there is none, in place of its rows of these times and this plant.
 
-    It has the columns `plant` (text) and `time` (timestamptz, or numbers), and those given: all or nothing is written.
+    The table has the columns `plant` (text) and `time` (timestamptz, or numbers), and the other `columns`. Rows of this
+    plant from the first to the last of the times are deleted first, so that a repeated call changes nothing. All or
+    nothing is written.
 
     Args:
         address: the store, and the table.
@@ -67,7 +72,7 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
     cells = [_convert_cells(column) for column in columns.values()]
     times = _convert_cells(np.sort(columns[TIME]))
     try:
-        # One transaction: an error takes all of it back.
+        # One transaction, which an error takes back as a whole: make the table, delete this plant's rows, copy the new.
         with psycopg.connect(address.url) as connection:
             make = sql.SQL("CREATE TABLE IF NOT EXISTS {} (plant text NOT NULL, {})")
             connection.execute(make.format(table, sql.SQL(", ").join(typed)))

@@ -98,8 +98,8 @@ def parse_store(url: str) -> StoreAddress:
     if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (is_influx and not host):
         raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
     store = f"store {parts.scheme}://{host or ''}/{database}"
+    # The options before the statement. A URL has one table or one statement, in a language that the server has.
     table, organisation = _read_options(store, parts.query, is_influx, asks=bool(language))
-    # One table or one statement, in a language that the server has.
     if language and not statement.strip():
         raise fail(store, ASKED, "both, or one without a value")
     if not is_influx and language not in ("", "query"):

@@ -193,6 +193,9 @@ def _weigh_residuals(
 ) -> WeighedResiduals:
     """Weigh the innovations: by the branches of the noise's law if given, else by a rule if given, else all by 1.
 
+    Branches are the Gaussian parts of a mixture, such as a usual part and one of outliers. A weight below 1 enlarges
+    the noise's variance of this component in the update, so that an outlier counts less.
+
     Args:
         predicted: prediction of z without its noise.
         e: innovations z - E z (m,), 0 where nothing arrived.
@@ -204,12 +207,14 @@ def _weigh_residuals(
         variance: variances (m,) of the noise in the model; the weight of branches is precision times these.
     """
     if scaled_law is not None:
-        # w = E[variance / r_j] over the branches j, of variance r_j and mean m_j. `branch_mean` is the mean of the m_j,
-        # weighted by precision; the residual is about it instead of about `center`.
+        # w = E[variance / r_j | z] over the branches j, of variance r_j and mean m_j. `branch_mean` is the mean of the
+        # m_j, weighted by precision. e = z - E z has `center` taken off already: e + center - branch_mean puts
+        # `branch_mean` in its place.
         weight, branch_mean = expected_branch_precision(predicted, e + center, variance, scaled_law)
         residual = jnp.where(arrived, e + center - branch_mean, 0.0)
         return WeighedResiduals(residual=residual, weight=weight, reported=weight, received=arrived)
     if rule is not None:
+        # The rule repeats weighing and correcting. A component of next to no weight counts as not received.
         weight, reported = rule.iterate(predicted, _make_independent_noise(noise), e, arrived)
         return WeighedResiduals(residual=e, weight=weight, reported=reported, received=arrived & (weight > SMALLEST))
     ones = jnp.ones_like(e)  # a filter that weighs nothing

@@ -205,6 +205,7 @@ def mean_gain_filter(
 
     Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
     """
+    # The channel that the filter assumes: its mean gain as a known one. `trusted=False` makes the claim "nominal".
     believed = mean_gain(without_memory(channel))
     return _make_gaussian_filter(
         plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False
@@ -238,7 +239,8 @@ def kalman_filter(
 ) -> GaussianFilter | DiffuseFilter:
     """Return the Kalman filter of a linear plant whose linear sensor is received directly.
 
-    P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
+    m- = A m + B u + E w, P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - E v) and
+    P = P- - K C P-, for x+ = A x + B u + w and z = C x + v with Cov w = Q and Cov v = R.
 
     Args:
         plant: a linear plant, n states.

@@ -55,9 +55,10 @@ class ScoreUpdate(NamedTuple):
 def update_by_score(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches) -> ScoreUpdate:
     """Return exact posterior moments, component after component, for a Gaussian prior and noise of Gaussian branches.
 
-    Component i is z_i = t_i + noise, with the innovation e = z_i - E t_i and V = Var t_i. Its noise has branches j of
-    probability p_j, mean m_j and variance r_j. With s_j = V + r_j, u_j = (e - m_j) / s_j and q_j, the posterior
-    probability of branch j, in proportion to p_j N(e; m_j, s_j):
+    The noise is a mixture of Gaussians (branches), such as usual errors and outliers. `before` has the prior of x and
+    the signal t, linear in x. Component i is z_i = t_i + noise, with the innovation e = z_i - E t_i and V = Var t_i.
+    Its noise has branches j of probability p_j, mean m_j and variance r_j. With s_j = V + r_j, u_j = (e - m_j) / s_j
+    and q_j, the posterior probability of branch j, in proportion to p_j N(e; m_j, s_j):
 
         score g = sum_j q_j u_j,  E[t_i | z_i] = E t_i + V g,
         Var[t_i | z_i] = V (sum_j q_j r_j / s_j + V Var_q u),
@@ -79,6 +80,7 @@ def update_by_score(before: PredictedMeasurement, z: jax.Array, law: NoiseBranch
         v = row**2 @ joint.variances  # V
         e = jnp.where(present[i], z[i] - joint.mean[n + i], 0.0)
         branches = law.log_share[i], law.mean[i], jnp.maximum(law.variance[i], law.least[i] - v)
+        # g, the posterior variance over V, sum_j q_j / s_j and the log density of e; then the weight at e = 0.
         score = _compute_score(e, v, *branches)
         weight_at_zero = _compute_score(jnp.zeros_like(e), v, *branches).weight
         weights.append(jnp.where(present[i], score.weight / weight_at_zero, jnp.nan))

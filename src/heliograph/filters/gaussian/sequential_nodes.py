@@ -115,10 +115,13 @@ def _join_innovations(innovations: Sequence[Innovation]) -> Innovation:
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     """Return the central filter made of single nodes' `filters`, in the order of the network's nodes.
 
-    Claim: "exact" if every part is, else "nominal".
+    The central filter has all nodes' measurements. At each step it predicts once, then the filter of each node corrects
+    the estimate by that node's measurement, one after another.
+
+    Claim: "exact" if the covariances of all nodes' filters are, else "nominal".
 
     Args:
-        filters: one for each node, of one plant.
+        filters: one Gaussian filter (cubature, extended, ...) for each node, of one plant.
 
     Raises:
         ValueError: no filters, or filters of different state dimensions.
@@ -128,16 +131,17 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     nodes = tuple(items("sequential filter", filters, "filters"))
     for filter in nodes:
         instance("sequential filter", filter, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
-    # All estimate the same plant.
+    # All must estimate the same plant: as many states and inputs, and the same states are angles.
     sizes = [(len(filter.states), len(filter.inputs)) for filter in nodes]
     if len(set(sizes)) != 1:
         raise fail("sequential filter", "filters of as many states and inputs each", sizes)
     angles = {filter.angles_used().states for filter in nodes}
     if len(angles) != 1:
         raise fail("sequential filter", "filters of one plant, whose angles are the same states", sorted(angles))
-    # A bound of one node is none after another one's: anything below "exact" is "nominal".
+    # A covariance that bounds the error after one node's correction need not do so after the next one's. So any claim
+    # weaker than "exact" becomes "nominal".
     claim: Claim = "exact" if weakest([filter.claim for filter in nodes]) == "exact" else "nominal"
     central = SequentialFilter(filters=nodes, **make_sizes(claim, nodes[0], sum(filter.received for filter in nodes)))
-    # What the claim is about is known if it is of every node.
+    # A premise is the model (plant, sensor, channel) under which a claim holds. The joint one needs that of every node.
     premises = [filter.premise for filter in nodes if filter.premise is not None]
     return with_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)

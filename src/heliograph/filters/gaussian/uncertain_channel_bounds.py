@@ -106,15 +106,18 @@ def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInn
 def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
     """Return the state after z by a bound for prior errors e with E[e yhat'] = 0 (`ZeroMean`).
 
-    Only y - yhat, of covariance Pyy, is then correlated with e, in an unknown way. For each beta > 0 the bound is P,
-    updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C' with C = Cov(x, y), the variance
-    of the state that the received components explain. Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta.
+    The measurement is z = G y + n, where the law of G is known only within a set. y = yhat + (y - yhat) has the
+    predicted mean yhat and the covariance Pyy; only y - yhat is correlated with e, in an unknown way. For each beta > 0
+    the bound is P, updated by a measurement with the noise Omega - M H P H' M' (M the mean gain, H the slopes of y by
+    x), plus beta C Pyy^+ C' with C = Cov(x, y), the variance of the state that the received components explain. Omega =
+    power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta bounds the covariance of z. At a second moment W of y, power(W)
+    bounds E[G W G'], spread(W) what random G and n add, and shift(W) what an unknown mean of G adds, over all laws.
 
     Args:
-        signal: moments of the state and of y, jointly.
-        channel: moments of G and n.
+        signal: joint moments of the state x and of y.
+        channel: bounds of the second moments of G and n.
         z: innovation, and which components arrived.
-        scalar: beta (1,), NaN for the one of least trace.
+        scalar: beta (1,), or NaN for the beta that gives the bound of least trace.
     """
     prior, present = signal.prior, z.present
     slopes, of_state, _ = _find_received_slopes_and_covariances(signal, channel, present)

@@ -103,15 +103,18 @@ def young_fixed_point_map(
 ) -> tuple[jax.Array, Slopes]:
     """Return the next log beta, and its derivatives, in the search of the beta that minimises the bound's trace.
 
-    beta_1 <- sqrt(tr(W S) / tr P) and beta_2 <- sqrt(tr(W S) / tr(W M)), with W = Omega^-1 C' C Omega^-1 of the last
-    beta. By d tr(W X) = -2 tr(Omega^-1 dOmega W X): in units of log beta_1, dOmega = -S / beta_1; of log beta_2,
-    dOmega = -S / beta_2 + beta_2 M.
+    A channel of uncertain law makes the covariance of an update uncertain too. Young's inequality bounds it for any two
+    scalars beta > 0, with Omega = base + (1 / beta_1 + 1 / beta_2) S + (1 + beta_2) M, a bound on the covariance of
+    what is received. The trace is least where beta_1 = sqrt(tr(W S) / tr P) and beta_2 = sqrt(tr(W S) / tr(W M)) with
+    W = Omega^-1 C' C Omega^-1, so the search repeats these with W of the last beta. By d tr(W X) =
+    -2 tr(Omega^-1 dOmega W X): for d log beta_1, dOmega = -S / beta_1; for d log beta_2, dOmega = -S / beta_2 +
+    beta_2 M.
 
     Args:
         t: log beta (2,).
-        base: what Omega of `young_omega` has beside S and M (m, m).
-        shift: S (m, m).
-        mean_part: M (m, m).
+        base: part of Omega that does not depend on beta, less M (m, m).
+        shift: S, bound of what an unknown shift of the mean gain adds (m, m).
+        mean_part: M (m, m), the part of Omega that grows with beta_2.
         cross_square: C' C of the cross-covariance C of state and measurement (m, m).
         trace: tr P of the prior.
     """
@@ -122,6 +125,7 @@ def young_fixed_point_map(
     shift_trace, mean_trace = jnp.trace(ws), jnp.trace(wm)
     by_first = [2 / beta[0] * jnp.vdot(s.T, x) for x in (ws, wm)]  # d tr W X / d log beta_1
     by_second = [2 / beta[1] * jnp.vdot(s.T, x) - 2 * beta[1] * jnp.vdot(m.T, x) for x in (ws, wm)]
+    # The next log beta_1 = log(tr(W S) / tr P) / 2, and the next log beta_2, with their derivatives.
     first, first_slopes = _half_log_ratio(shift_trace, [by_first[0], by_second[0]], trace, [None, None])
     second, second_slopes = _half_log_ratio(
         shift_trace, [by_first[0], by_second[0]], mean_trace, [by_first[1], by_second[1]]

@@ -335,8 +335,9 @@ class MemoryFilter(AbstractSizedFilter):
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
     """Return the quadratic filter whose products reach into the past through the linear filter's estimate.
 
-    Its measurement is z, the products of its components, and their products with the linear estimate, a linear function
-    of all earlier z.
+    Its measurement is z, the products of the components of z, and the products of z with the estimate of the linear
+    filter (LMMSE). That estimate is a linear function of all earlier z, so products with it bring in the past at little
+    cost.
 
     Args:
         plant: a linear plant without inputs, n states.
@@ -344,7 +345,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
         channel: from the sensor to the filter, without memory.
         horizon: number of steps.
 
-    Claim: as `polynomial_filter`; never worse than its quadratic filter.
+    Claim: what the covariance is said to be is as for `polynomial_filter` at degree 2, "exact" if all laws are known,
+    else "nominal". The error is never larger than that of the quadratic filter, whose measurements are among these.
 
     Raises:
         ValueError: what `polynomial_filter` refuses; a channel with memory.
@@ -354,7 +356,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
     claim = polynomial_claim(plant, sensor, channel, degree=2)
     centre, system = _lift_about_mean(plant, sensor, channel, degree=1, horizon=horizon)
-    # The linear filter's gains decide the moments of the products of its estimate with z.
+    # First the linear filter, whose gains decide the moments of the products of its estimate with z. Then the LMMSE
+    # filter of the system whose state is all products up to degree 2 of (x, linear estimate, z), about the mean of x.
     linear = lmmse(system, claim)
     centred_plant = plant if centre is None else centre_plant(plant)
     products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)

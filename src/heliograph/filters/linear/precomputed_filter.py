@@ -165,6 +165,8 @@ def plan_filter(
 def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
     """Return the filter with its gains and covariances of every step, recorded while it runs over data of zeros.
 
+    Its gains and covariances do not depend on data, so later runs compute only means, from these stored matrices.
+
     Args:
         filter: a filter in which only the mean depends on data.
         inputs: of each step (steps, inputs).

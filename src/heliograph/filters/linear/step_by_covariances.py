@@ -54,9 +54,10 @@ def find_model_matrices(
 ) -> tuple[ModelMatrices, MomentsBeforeData | None]:
     """Return the matrices of step k of a linear filter, and the state's moments before any data after the step.
 
-    x+ = F x + b + w with Cov w = Q, and z = H x + c + v with Cov v = R, as received behind the channel. Q and R are
-    computed from covariance matrices, not from the factors that noises also store: factors have no derivative where a
-    covariance is zero.
+    x+ = F x + b + w with Cov w = Q, and z = H x + c + v with Cov v = R, as received behind the channel. With the gain's
+    mean M, H = M C for a sensor y = C x + v_y, and R has the noise of the channel, and what a random gain adds. Q and R
+    are computed from covariance matrices, not from the factors that noises also store: factors have no derivative where
+    a covariance is zero.
 
     Args:
         filter: a linear filter, with a plant, a sensor and a channel z = G y + n.
@@ -65,7 +66,7 @@ def find_model_matrices(
         k: the step's number.
     """
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
-    law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
+    law, gain = sensor.noise, jnp.asarray(channel.mean_gain)  # law of the sensor's noise, and M = E[G]
     F, b, Q = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
     # `nominal` has the covariances of the entries of (G, n), that of n_i and n_j at [i, j, -1, -1]. `gain_spread` has
     # those of G alone, or of (G, n) if G and n are correlated; then n is counted below, with G.
@@ -118,11 +119,12 @@ def step_by_covariances(
 ) -> StepMoments:
     """Return the state's moments after a step of the filter, with the values of `factored`.
 
-    Derivatives are those of the Kalman filter's formulas in covariances. So each number is
-    `take_derivatives_of(formula, value)`: the value by factors, the derivative by the formula.
+    Factors of covariances (P = L D L') give the more exact values, but have no derivative where a covariance is zero.
+    So each number is `take_derivatives_of(formula, value)`: the value is that by factors, and derivatives are those of
+    the Kalman filter's formula in covariances.
 
     Args:
-        matrices: of the step.
+        matrices: matrices of the step: x+ = F x + b + w, Cov w = Q, and z = H x + c + v, Cov v = R.
         before: mean and covariance of the state before the step.
         z: measurement (m,), NaN for what did not arrive.
         factored: results of the same step by factors; they count as constants, without derivatives.

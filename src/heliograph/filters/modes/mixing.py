@@ -208,15 +208,15 @@ def mix_and_predict(
     """Return for each mixture the Gaussian (mixtures, n) of the mean and covariance of f(x, u) + w, x from the mixture.
 
     Args:
-        plant: f, and the law of w.
-        transform: of moments, for a nonlinear plant.
-        components: Gaussians that are mixed, one a component.
-        weight: [c, g], weight of component c in mixture g; columns need not sum to 1.
-        u: input.
-        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
+        plant: holds the transition f and the law of the process noise w.
+        transform: how moments pass a nonlinear function, such as cubature points; not used for a linear plant.
+        components: the Gaussians that are mixed (components, n), for example the posterior of each mode.
+        weight: weight[c, g] is the weight of component c in mixture g; columns need not sum to 1.
+        u: input of the plant.
+        initial_power: E[x_i^2] before any data (n,): the size of x, in proportion to which rounding is assumed.
     """
     shares = normalise_columns(weight)
-    # Through a nonlinear plant each mixture goes as one Gaussian.
+    # Nonlinear plant: first each mixture becomes one Gaussian of its moments, which then passes through f.
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, components), in_axes=1)(shares)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, initial_power))(mixtures)
@@ -227,7 +227,11 @@ def mix_and_predict(
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(components)
 
     def mix_moved(weights: jax.Array) -> Gaussian:
-        """Return one mixture of the moved components by these weights, with the process noise: A P A' mixed, plus Q."""
+        """Return the Gaussian of one mixture of the moved components, with process noise: Cov(mixture) + Q.
+
+        With the means m_c and covariances A P_c A' of the moved components and `weights` w_c: m = sum w_c m_c, and
+        Cov(mixture) = sum w_c (A P_c A' + (m_c - m) (m_c - m)').
+        """
         mean, covariance = moments_of_mixture(means, spreads, weights)
         return from_covariance_by_elimination(mean, covariance + noise)
 

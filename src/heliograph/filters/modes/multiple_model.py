@@ -1,6 +1,5 @@
 """Multiple-model filters for links with memory: modes weighted by likelihood, one Gaussian per mode or for all.
 
-Each uses the Markov chain, updates through each mode's map with a Gaussian update, and weights modes by likelihood.
 They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
@@ -348,7 +347,9 @@ def gpb1_filter(
 ) -> MultipleModelFilter:
     """Return the first-order generalised pseudo-Bayes filter behind links with memory: one Gaussian, and modes' law.
 
-    It makes M updates a step for M modes. The correlation of state and mode is not propagated.
+    A mode is a value of what the link remembers from step to step, such as good or bad. At each step the Gaussian is
+    corrected in each of the M modes, the modes are weighted by the likelihood of what arrived, and the M posteriors are
+    merged into one Gaussian of the same mean and covariance. The correlation of state and mode is lost so.
 
     Args:
         plant: the plant, n states.
@@ -387,7 +388,7 @@ def gpb2_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small, too. With almost no noise in plant and link squared errors were 17 times the claim.
+    many modes it is too small. With almost no noise in plant and link squared errors were 17 times the claim.
 
     Raises:
         ValueError: as for `imm_filter`.

@@ -132,19 +132,25 @@ class ParticleFilter(AbstractSizedFilter):
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Correct each particle with z, weight it by its likelihood, and resample if too few particles have weight.
 
-        Too few: the effective number 1 / sum w_i^2 is below half the number of particles.
+        A particle is a mode of the link (what it remembers, such as good or bad) with a Gaussian of the plant's state
+        in that mode. Too few: the effective number 1 / sum w_i^2 is below half the number of particles.
+
+        `state` holds the particles predicted to step k, and z (received,) is the measurement, NaN where none arrived.
+        Returned with the particles: the innovation of their mixture.
         """
+        # The models as they are at step k, and the moments of the signal y = h(x) for each particle's Gaussian.
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         initial_power = second_moments_at_start(self.plant)
         signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, initial_power))(
             state.gaussian
         )
-        # Each particle is corrected in its own mode.
+        # Each particle is corrected in its own mode: w_i becomes proportional to w_i p(z | mode_i, Gaussian_i).
         corrected, weight, innovation = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )
         corrected = corrected._replace(mean=align_angles(plant, corrected.mean, weight))
-        # Systematic resampling.
+        # Systematic resampling: one uniform number places as many equidistant points on the cumulated weights. The data
+        # are folded into the key, so a step draws anew without a counter. All particles weigh the same afterwards.
         key = fold_in_bits(state.key, z)
         resampled = resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
         too_few = effective_number(weight) < self.particles / 2

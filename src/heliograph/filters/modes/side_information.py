@@ -97,8 +97,10 @@ class SideInformationFilter(AbstractSizedFilter):
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
         """Predict s+ = F s, and the moments of q = (e, x~) in each mode.
 
-        s estimates zeta = (x~ 1{mode = 1}, ...), e = zeta - s, x~ = (x - c, 1), and F has the blocks F_ji = Pi_ij A~.
-        Where the mode goes from i to j, x~+ = A~ x~ + w~, zeta+ = u_j (x) x~+ and F zeta = Pi_i (x) A~ x~, so that
+        x~ = (x - c, 1) is the plant's state about c = E[x] before any data, with a 1. zeta stacks x~ 1{mode = j} over
+        the modes j of the link, s is its estimate, and e = zeta - s the error. F has the blocks F_ji = Pi_ij A~, with
+        A~ the plant's matrix for x~. Where the mode goes from i to j, x~+ = A~ x~ + w~, zeta+ = u_j (x) x~+ and
+        F zeta = Pi_i (x) A~ x~, so that
 
             e+ = F e + (u_j - Pi_i) (x) A~ x~ + u_j (x) w~
 
@@ -106,9 +108,10 @@ class SideInformationFilter(AbstractSizedFilter):
         """
         plant, channel = at(self.plant, k), at(self.channel, k)
         A, _, next_centre = centred_transition(plant, u, state.centre)  # A~
+        # E[q q' 1{mode = i}] = sum over columns of weight * column column'; a column has the parts of e and of x~.
         modes, (errors, x, weights) = len(self.initial), split_columns(state)
         transition = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))  # Pi
-        law = mode_probabilities(x, weights) @ transition
+        law = mode_probabilities(x, weights) @ transition  # P(next mode = j), (modes,)
         # Columns of F e and A~ x~ in each mode before the step, and of w~.
         moved_errors = jax.vmap(lambda e: multiply_by_transition(e, A, transition))(errors)
         moved_x = jax.vmap(lambda x: A @ x)(x)
@@ -211,12 +214,14 @@ def _make_measurement_model(
 ) -> StackedMeasurementModel:
     """Return what is received of zeta = x~ 1{mode}: the output matrix, the mean output, and the noise in each mode.
 
-    In mode j, z = H y~ + n with y~ = (y, 1) = C~ x~ + v~: the noise has the covariance T_j(E[y~ y~' 1{j}]) +
-    P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j(Y) = E[(H - Hbar_j) Y (H - Hbar_j)' | j], and the rounding of z.
+    x~ = (x - c, 1) is the plant's state about its mean c before any data, with a 1, and zeta stacks x~ 1{mode = j} over
+    the modes j of the link. In mode j, z = H y~ + n with y~ = (y, 1) = C~ x~ + v~; H is random with mean Hbar_j. The
+    noise has the covariance T_j(E[y~ y~' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), with
+    T_j(Y) = E[(H - Hbar_j) Y (H - Hbar_j)' | j], and the rounding of z.
 
     Args:
         state: estimate of zeta and moments of each mode.
-        sensor: C~ and R~ = Cov v~.
+        sensor: the linear sensor, which gives C~ and R~ = Cov v~.
         size: squares of the numbers that are summed in y, for rounding (p,).
         gains: Hbar_j (M, m, p + 1).
         gain_spread: the tensor of T_j (M, m, m, p + 1, p + 1).

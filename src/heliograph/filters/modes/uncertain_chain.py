@@ -94,9 +94,10 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
         """Predict zeta = (x~ 1{mode = 1}, ...) by the nominal chain, and a bound on its error's covariance Sigma.
 
-        x~ = (x - c, 1) with c = E[x] before any data. The nominal transition F has the blocks F_ji = Pi_ij A~. For
-        every chain within the radius of Pi, and with a scalar b > 0 of Young's inequality,
-        Sigma+ <= (1 + b) F Sigma F' + (1 + 1/b) D + W: D bounds what the error of Pi adds, W the noise's covariance.
+        x~ = (x - c, 1) with c = E[x] before any data, and A~ is the plant's matrix for x~. The mode is a Markov chain
+        with the nominal transition matrix Pi, each entry of which is known within a radius. The nominal transition F of
+        zeta has the blocks F_ji = Pi_ij A~. For every chain within the radius, and any b > 0 (Young's inequality),
+        Sigma+ <= (1 + b) F Sigma F' + (1 + 1/b) D + W: D bounds what the error of Pi adds, W is the noise's covariance.
         """
         zeta = state.gaussian
         transition, radius = self._chain_and_radius(state, k)  # Pi; at the first prediction I, with radius 0
@@ -109,6 +110,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         # Sigma = L diag(variances) L' becomes (1 + b) F L diag(variances) (F L)' + columns of (1 + 1/b) D + W.
         slopes, b, added_noise = self._transition_factors(state, u, k)
         predicted = from_columns(mean, join_columns(WeightedColumns(slopes, (1 + b) * zeta.variances), added_noise))
+        # The least and the greatest probability of each next mode, over all chains within the radius.
         low, high = _bound_next_law(transition, radius, state.low, state.high)
         return UncertainBelief(
             gaussian=predicted,

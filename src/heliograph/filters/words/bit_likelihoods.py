@@ -151,13 +151,14 @@ def _list_known_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractR
 def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
     """Return the likelihoods of the bits that went into a link, from those of the bits that came out.
 
-    Likelihood l(s) of a sent bit s by that of the received one, l'. A bit that may have been flipped:
-    l(s) = (1 - p) l'(s) + p l'(not s); one that was copied: the product over its copies; one that nobody received: 1.
-    Links in series are gone through from the last to the first.
+    A codeword is a number quantised to bits, and a link may flip, copy or lose its bits. With l'(r) the likelihood of a
+    received bit r, the likelihood l(s) of the sent bit s follows by the kind of link. A bit flipped with probability p:
+    l(s) = (1 - p) l'(s) + p l'(not s). A bit that was copied: the product over its copies. A bit that nobody received:
+    1. Links in series are gone through from the last to the first.
 
     Args:
-        link: of known error rates.
-        received: likelihoods at its outputs, (words, bits, 2).
+        link: a link of bits with known error rates.
+        received: likelihoods of 0 and 1 of each bit at its outputs, (words, bits, 2).
     """
     match link:
         case Flips():

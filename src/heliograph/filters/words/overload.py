@@ -240,16 +240,19 @@ def _find_tails(
 ) -> Float[np.ndarray, "beyond outputs"]:
     """Return P(|y - c + d| > a + (m - 1/2) D), m = 1, ..., BEYOND (40), for a Gaussian y - c and the dither d.
 
-    y is the signal, c the centre of the codewords, and [c - a, c + a] their range. The mean over d is a sum over nodes
-    of Gauss-Legendre quadrature.
+    A quantizer sends the signal y as a codeword, the nearest of values with the step D in the range [c - a, c + a]. A y
+    beyond the range (an overload) has a larger error than D / 2, and these probabilities say how far beyond it lies: in
+    multiples m of D. The encoder adds the dither d, a random number of the size of D, before it rounds. The probability
+    given d is normal, and its mean over d a sum over nodes of Gauss-Legendre quadrature.
 
     Args:
-        mean: of y - c (outputs,).
-        variance: of y - c (outputs,).
-        half: a.
-        step: D.
-        dither: kind of the encoder's dither.
+        mean: mean of y - c (outputs,).
+        variance: variance of y - c (outputs,).
+        half: a, half of the range (outputs,).
+        step: D, the step (outputs,).
+        dither: law of the encoder's dither: "none", "triangular", or else uniform.
     """
+    # a + (m - 1/2) D for each m (beyond, outputs).
     ends = half + (np.arange(1, BEYOND + 1)[:, None] - 0.5) * step
     deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
     # Nodes of d / D, and their probabilities. NODES lie in [-1, 1], with WEIGHTS that sum to 2.
@@ -260,6 +263,7 @@ def _find_tails(
         probabilities = np.concatenate([WEIGHTS, WEIGHTS]) / 2 * (1 - np.abs(nodes))
     else:  # uniform on [-1/2, 1/2]
         nodes, probabilities = NODES / 2, WEIGHTS / 2
+    # sum over nodes of P(node) (P(y - c + d > end) + P(y - c + d < -end)) with d = node D.
     total: np.ndarray = np.zeros_like(ends)
     for node, probability in zip(nodes, probabilities, strict=True):
         shifted_mean = mean + node * step

@@ -282,17 +282,18 @@ def find_effect_of_bits(
 ) -> WordEffect:
     """Return what a received codeword says of y: its log probability, the shift of the mean, the ratio of variances.
 
-    The law of y given the bits is a sum over the codewords that may have been sent, in one of three ways: all codewords
-    if they have at most TABLE (6) bits; else those near the prior's mean, if a step is at least FINE (a quarter) of a
-    deviation; else groups of neighbouring codewords.
+    A codeword is the number of the quantised value of the sender's signal y, sent as bits that may have been flipped.
+    The law of y given the received bits is a sum over the codewords that may have been sent, in one of three ways: all
+    codewords if they have at most TABLE (6) bits; else those near the prior's mean, if a step is at least FINE (a
+    quarter) of a deviation; else groups of neighbouring codewords, since single ones would be too many.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
         weights: probabilities of the combinations, (..., combinations) for several likelihoods at once.
         received: number of the received codeword.
-        grid: the codewords.
-        prior: of y.
-        dither: of the encoder.
+        grid: the codewords: the lowest value, the step between values, and the number of bits.
+        prior: mean and deviation of y before the codeword.
+        dither: kind of the random number that the encoder adds before rounding.
     """
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)

@@ -102,7 +102,12 @@ class ClockFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
-        """Correct with what arrived of z, leaving clocks that cannot be observed as they are."""
+        """Correct with what arrived of z, leaving clocks that cannot be observed as they are.
+
+        The state has the plant's states, and offset and drift of each node's clock. A filter linearised at changing
+        estimates would claim information on offsets that the data do not hold. So offset and drift of a clock that is
+        not observable get the gain 0: they keep mean and covariance, and the others are corrected in spite of them.
+        """
         base = self.base
         # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
@@ -161,6 +166,7 @@ class ClockFilter(AbstractWrapper):
     def _independent_shares(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
         """Return for each clock the share of its column in the observability matrix O that other states do not explain.
 
+        The offset of a node's clock is a state of the filter; it can be estimated only if it is observable.
         The rows of O = (C; C F; C F F; ...) are the derivatives of the outputs at the next n steps by the present
         state, along the motion without noise: C is that of the outputs and F that of a step. Column o belongs to the
         offset o. The share is 1 - r^2, with r^2 the squared length of its projection on the other columns over that of

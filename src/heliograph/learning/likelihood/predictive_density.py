@@ -289,8 +289,10 @@ def _correct_signal(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (t, p) and covariance (t, p, p) of the signal given this part's measurements too.
 
-    Each combination a of gains gives a Kalman update with mean m_a and covariance P_a. Their mixture has the mean
-    m = sum_a w_a m_a and the covariance sum_a w_a (P_a + (m_a - m) (m_a - m)').
+    The signal y is what enters the channel (p numbers), t counts time steps, and a part is some of the channel's
+    outputs, which arrives as z = gain y + offset + noise. Gain and noise are random and have finitely many
+    combinations. Each combination a gives a Kalman update with mean m_a and covariance P_a. Their mixture has the
+    mean m = sum_a w_a m_a and the covariance sum_a w_a (P_a + (m_a - m) (m_a - m)').
 
     Args:
         y: mean of the signal (t, p).
@@ -299,13 +301,15 @@ def _correct_signal(
         law: gain, offset and noise of each combination.
         weight: w, the probability of each combination given z (t, a).
     """
+    # Innovations z - gain y - offset of each combination (t, a, m). A component that did not arrive gets innovation,
+    # gain and noise 0, so it changes nothing. The update is by roots: covariance = root root'.
     present = ~np.isnan(z)[:, None, :, None]
     value = np.where(present[..., 0], z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     gain, noise = (np.where(present, rows, 0.0) for rows in (law.gain, roots_of(law.noise)))
     updated = observe_root(roots_of(spread)[:, None], gain, noise)
-    # m_a - y of each combination, and m - y.
+    # m_a - y = gain (innovation) of each combination, and m - y, their mean.
     moves = np.einsum("tapm,tam->tap", updated.gain, value)
     mean_move = np.einsum("ta,tap->tp", weight, moves)
-    # A further column m_a - m in the root of P_a adds (m_a - m) (m_a - m)' to it.
+    # P_a + (m_a - m) (m_a - m)': a further column m_a - m in the root of P_a adds the second term.
     with_distance = np.append(updated.root, (moves - mean_move[:, None])[..., None], axis=-1)
     return y + mean_move, np.einsum("ta,tapq->tpq", weight, covariance_of_root(with_distance))

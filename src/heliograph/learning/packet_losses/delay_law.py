@@ -55,8 +55,10 @@ class Delays:
 def learn_delays(late: "Float[ArrayLike, ' measurements']", step: "Float[ArrayLike, '']") -> Delays:
     """Learn the law of delays from how late each measurement was logged, in the order of measuring.
 
-    The share of each delay is its most likely probability, and its interval is Wilson's. A link is late for a while at
-    a time, so N measurements with correlation a between neighbours count as N (1 - a) / (1 + a).
+    A delay is a whole number of steps. Its share of the measurements is its most likely probability, and Wilson's
+    interval says how well it is known. A link is late for a while at a time, so N measurements with correlation a
+    between neighbours count as only N (1 - a) / (1 + a) independent ones. Measurements that were logged before their
+    time are counted, but not used.
 
     Args:
         late: seconds from measuring to logging, for each measurement.
@@ -68,12 +70,14 @@ def learn_delays(late: "Float[ArrayLike, ' measurements']", step: "Float[ArrayLi
     seconds = array("delays", late, (None,))
     size = float(scalar("step of delays", step, TINY))
     steps = np.floor(seconds / size + 0.5).astype(np.int64)
+    # Delays below 0 are errors of clocks.
     known = steps[steps >= 0]
     if not len(known):
         raise fail("delays", "at least one measurement that was logged after its time", f"{len(steps)} before it")
     shares = {}
     for delay in np.unique(known):
         is_delay = (known == delay).astype(float)
+        # N (1 - a) / (1 + a) independent measurements, a share of which has this delay.
         count = count_independent(is_delay)
         shares[int(delay)] = wilson(float(is_delay.mean()) * count, count)
     return Delays(size, len(known), len(steps) - len(known), shares)

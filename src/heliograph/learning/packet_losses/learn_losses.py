@@ -60,6 +60,9 @@ class LossMemory(NamedTuple):
     def of(cls, fates: object) -> "LossMemory":
         """Test losses that the receiver knows of for memory; where nothing varies there is no evidence, p = 1.
 
+        Memory means that a loss makes the next one more or less probable. Two tests: a likelihood ratio of dependent
+        and of independent losses, and the number of runs of equal fates (arrived or lost).
+
         Args:
             fates: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a list of stretches.
 

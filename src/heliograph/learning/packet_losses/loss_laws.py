@@ -234,24 +234,27 @@ def _measure_spans(parts: Fates) -> np.ndarray:
 def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
     """Return the Markov law of order 1 that is most likely given that each stretch was cut where packets arrived.
 
-    The law's `counts` are equivalent ones. After either fate they are n p and n (1 - p), with p the most likely
-    probability and n = 1 / (p (1 - p) Var(logit p)), the number of plain trials that have this variance (at most the
-    number of packets counted).
+    A stretch of packets begins and ends with one that arrived, since nothing outside is known; plain counts of losses
+    would be biased by that. So the law's two probabilities maximise the likelihood given both ends. Its `counts` are
+    then n p and n (1 - p) after an arrival, and after a loss, with p the most likely probability and
+    n = 1 / (p (1 - p) Var(logit p)), the number of plain trials that have this variance (at most the number of packets
+    counted).
 
     Args:
         counts: (arrived, lost) after an arrival and after a loss (2, 2).
         spans: steps from the first to the last packet of each such stretch (stretches,).
         intervals: whether the intervals of the two probabilities are computed too.
     """
+    # The most likely logits of P(lost | arrived) and P(arrived | lost), searched from three starts.
     likelihood = _LikelihoodBetweenEnds(counts, spans).evaluate
     top, value = maximise_over_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
-    # Variances of the logits: the diagonal of the Hessian's inverse, by central differences of the gradient. Over this
-    # width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
+    # Variances of the logits: the diagonal of the inverse Hessian of -log likelihood, by central differences of its
+    # gradient. Over this width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
     width = 1e-4
     shifts = width * np.eye(2)
     hessian = np.stack([likelihood(top - shift)[1] - likelihood(top + shift)[1] for shift in shifts]) / (2 * width)
     variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
-    # The number of packets that tell as much, and their fates in these shares.
+    # n of each probability, and the equivalent counts [[n (1 - fail), n fail], [n recover, n (1 - recover)]].
     fail, recover = shares = 1 / (1 + np.exp(-top))
     packets = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
     equivalent = packets[:, None] * np.array([[1 - fail, fail], [recover, 1 - recover]])

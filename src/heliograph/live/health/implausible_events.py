@@ -129,8 +129,11 @@ class JudgementReader:
     def _name_faulty_function(self, candidate: CandidateEvent) -> str:
         """Return the name of a filter's function that returned no number in a row, after "; "; "" where none did.
 
-        A filter's fault, once found, is repeated without another search. A filter is searched at most TRIES times, for
-        a plant may send implausible events for ever.
+        A filter whose function returns NaN or infinity judges every event to be no number; the name of the function
+        tells the user what to mend. A fault, once found, is repeated without another search. A filter is searched at
+        most TRIES times, for a plant may send implausible events for ever. `candidate` is an event with its plant and
+        the row of measurements that it stands in; a slot is the number of a row in the table of live states, and
+        `columns` says where the outputs of a filter stand in such a row: among them its judgement of the measurements.
         """
         event, row = candidate.event, candidate.row
         row_before, outputs = self._find_row_before(candidate), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]

@@ -119,12 +119,13 @@ def _read_step_length(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
 def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     """Return the plant of all clocks: offset o+ = o + dt d and drift d+ = d + w of each, independent at the start.
 
-    Steps of one length: w has the variance `wander`. Lengths that an input says: d gains white noise within the step,
-    w has the variance wander dt, and o gains its integral.
+    The clock of a node shows t + o at the time t. If all steps have one length dt, w has the variance `wander`. If an
+    input says the length, d gains white noise within the step: w has the variance wander dt, and o gains the integral
+    of the noise, so that the covariance is wander [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]].
 
     Args:
-        clocks: by node.
-        dt: length of a step, or the input that says it.
+        clocks: clock of each node: deviations of offset and drift at the start, `wander`, and the mean offset `delay`.
+        dt: length of a step, or the name of the input that says it.
     """
     # Means and variances of (offset, drift) of clock after clock.
     means, variances, wanders, states = [], [], [], []

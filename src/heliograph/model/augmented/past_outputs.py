@@ -20,17 +20,18 @@ from heliograph.random_affine.shaped_noise import Shaped
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
     """Return plant, sensor and channel of the state (x_k, y_k, y_{k-1}, ..., y_{k-D}), and so without a delay.
 
-    The sensor reads all these outputs without noise, and the channel takes them and has the law of the delayed one. So
-    any filter of linear plants can be made for the three. Before the first step zeros were sent.
+    A channel that delivers late, by up to D steps, needs the past outputs y of the sensor, so they become states. The
+    new sensor reads all these outputs without noise, and the new channel takes them and delivers one by the law of the
+    delay. So any filter of linear plants can be made for the three. Before the first step zeros were sent.
 
     The state y_{k+1} = C x_{k+1} + v_{k+1} contains the sensor's noise. So if one y is received twice, it brings the
     same noise twice, and is used as one measurement. With past x as states instead, its noise would count as two
     independent ones, and the claimed covariance would be too small.
 
     Args:
-        plant: linear.
-        sensor: linear.
-        channel: one that delivers late, by up to D steps.
+        plant: a linear plant, n states.
+        sensor: a linear sensor.
+        channel: a channel that delivers late, by up to D steps.
 
     Raises:
         ValueError: a plant or sensor that is not linear or has angles, parts that do not fit, process noise that
@@ -40,7 +41,8 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
     augmented: AnyPlant = at_each_step(partial(_append_delay_line, past=first(channel).past), plant, sensor)
     n, states = len(first(plant).states), first(augmented).states
-    outputs = len(states) - n  # y_k, ..., y_{k-D}, read without noise
+    # The new sensor has the matrix (0, I) for the state (x, y_k, ..., y_{k-D}), and no noise.
+    outputs = len(states) - n
     read_outputs = LinearSensor(np.eye(len(states))[n:], np.zeros((outputs, outputs)), states[n:])
     return augmented, read_outputs, place_on_delay_line(channel)
 

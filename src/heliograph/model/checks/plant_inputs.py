@@ -106,6 +106,9 @@ def check_inputs(
 ) -> None:
     """Raise ValueError where a time step is none, or a plant's function of the inputs returns what it must not.
 
+    Matrices and noise of plants and sensors may be functions of the inputs, such as of the time step dt. They are
+    computed at the given inputs, before a run does so in compiled code, where nothing can be refused.
+
     Args:
         names: names of the inputs.
         u: the inputs of consecutive steps (steps, inputs).
@@ -117,6 +120,7 @@ def check_inputs(
     u = np.asarray(u)
     check_time_step(names, u)
     steps = np.arange(len(u)) + step if np.ndim(step) == 0 else np.asarray(step)
+    # Each plant and each sensor is checked once, though many filters hold the same object: `known` has their ids.
     known: set[int] = set()
     for plant in yield_plants(models):
         if id(plant) not in known and first(plant).inputs == tuple(names):

@@ -123,6 +123,7 @@ def with_premise(made: B, premise: Premise | None) -> B:
         ValueError: the plant has an unknown start, attitudes, limits or rates of its modes, and `made` is of a kind
             that has no formulas for them.
     """
+    # Each property of a plant that needs formulas of its own; `made` says by a flag whether it has them.
     unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
     if unknown and not getattr(made, "takes_unknown_start", False):
         raise fail("initial covariance", TAKEN_BY, "hg.diffuse")

@@ -153,6 +153,8 @@ def find_stuck_counts(
 ) -> Float[np.ndarray, " received"] | None:
     """Return of each received number how many equal readings in a row mean that its sensor is stuck.
 
+    Noise makes long runs of exactly equal readings improbable, so such a run tells of a sensor that is stuck.
+
     Args:
         received: how many numbers are received.
         stuck: True for as many as noise and resolution of the sensor give once in 10^9 readings; or a whole number; or

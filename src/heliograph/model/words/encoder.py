@@ -59,8 +59,10 @@ class Words(Module):
     ):
         """Check and hold the lowest and highest word, the bits of a word, and the kind of dither.
 
-        If the distance D of two words (`resolution`) is given in place of `bits`, the bits are the fewest with which
-        words low, low + D, ... reach `high`. The highest word is then low + (2^bits - 1) D, and may be above `high`.
+        A word (codeword) is a quantised value: 2^bits of them lie at equal distances D from `low` to `high`, which are
+        numbers or arrays of one number for each output. If D (`resolution`) is given in place of `bits`, the bits are
+        the fewest with which words low, low + D, ... reach `high`. The highest word is then low + (2^bits - 1) D, and
+        may be above `high`. A dither is a random number that is added before rounding.
         """
         self.low, self.high = (np.asarray(_read_range_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):
@@ -162,9 +164,12 @@ class Words(Module):
     ) -> Float[np.ndarray, "messages outputs"]:
         """Return the dithers that a sender draws for messages of these numbers, which its receiver draws again.
 
-        With h = crc32(node) 2^32 + component, s = h 0x9e3779b97f4a7c15 + (number + 1) 0xbf58476d1ce4e5b9 (modulo 2^64)
-        mixed by splitmix64, and u the highest 53 bits as a fraction: d = D (u - 1/2). So a lost message shifts no
-        other, and no two senders or components share theirs.
+        A dither d is a random number that is added before rounding, and subtracted by the receiver, so that the error
+        of rounding does not depend on the signal. It is a function of node, component and number of the message: with
+        h = crc32(node) 2^32 + component, s = h 0x9e3779b97f4a7c15 + (number + 1) 0xbf58476d1ce4e5b9 (modulo 2^64) is
+        mixed twice as by splitmix64, and u is the highest 53 bits as a fraction. Then d = D (u - 1/2) with the
+        quantiser's step D. So a lost message does not shift the dithers of others, and no two senders or components
+        share theirs.
 
         Args:
             node: name of the sender's node.

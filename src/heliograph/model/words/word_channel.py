@@ -122,8 +122,9 @@ def rewrite_channel(channel: AbstractRandomAffine, form: WordForm) -> RewrittenM
 def _rewrite_map(link: AbstractRandomAffine, components: Components, form: WordForm) -> RewrittenMap:
     """Return a map of codewords as a map of the numbers that stand for them, and the components of y at its outputs.
 
-    Maps that are made of others are rewritten one by one. In series each gets the components that the one before it
-    delivers.
+    A codeword is a quantised number of the signal y, sent as bits. Filters need a channel of numbers, so each codeword
+    is written as its bits, or as its value, according to `form`. Maps that are made of other maps are rewritten map by
+    map; in a series each map gets the components that the map before it delivers.
 
     Args:
         link: the map; it may select, copy, flip, delay and lose codewords.
@@ -135,7 +136,7 @@ def _rewrite_map(link: AbstractRandomAffine, components: Components, form: WordF
             return RewrittenMap(form.flips(link, components), components)
         case GainAndNoise():
             return _rewrite_selection(link, components, form)
-        case ModeOutput():
+        case ModeOutput():  # tells the present mode of a memory; its outputs are flags, which stand for no component
             return RewrittenMap(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
         case Series():
             return _rewrite_series(link, components, form)

@@ -32,6 +32,7 @@ def check_rows(
         return value
     if value is None:
         raise fail(name, f"shape ({steps}, {length})", "none")
+    # Names of columns first. Then the values as doubles: masked ones become NaN, texts and dates are refused.
     check_columns(name, value, names)
     try:
         values = np.asarray(fill_masked(value))

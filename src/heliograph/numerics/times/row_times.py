@@ -138,6 +138,7 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
         labels = rows.coords.get(next(iter(dims))) if dims else None
     if labels is None or callable(labels):  # a list has a function of that name
         return None
+    # Dates that a file stores as numbers (CF conventions) must have been decoded by the reader.
     if packing := find_packing(labels):
         came = f"{packing!r} of {getattr(labels, 'attrs', {})[packing]!r}"
         raise fail(f"dates of {name}", "decoded ones, as xarray.decode_cf makes them", came)

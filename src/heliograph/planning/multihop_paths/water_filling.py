@@ -40,23 +40,25 @@ def water_filling(
 ) -> Powers:
     """Return the powers (time, free) of the least error within limits, where each path has one free hop.
 
-    Each iteration finds the powers that fill to one water level, with the present derivatives of the error, and moves
-    on the way to them to a point of less error. It ends when the gap to a lower bound of the error closes, or has not
-    shrunk for PATIENCE iterations.
+    A free hop is a transmitter whose power may be chosen. Each iteration linearises the error in the information j of
+    the paths, finds the powers that minimise that (water filling: all transmitters fill to one level), and moves
+    towards them to a point of less error. It ends when the gap to a lower bound of the error closes, or has not shrunk
+    for PATIENCE iterations.
 
     Args:
-        limits: of the powers.
+        limits: the largest powers: of each transmitter at each time and on average, and of all together.
         sensitivity: powers -> error, -d error / d j of each free hop's path, d error / d p.
-        whole: the path of each free hop.
-        start: powers at which to begin.
+        whole: the path of each free hop, as a function of that hop's power: j = 1 / (full (1 + alpha / p) - signal).
+        start: powers at which to begin (time, free).
     """
-    # The information of each free hop's path is j = p / (a p + b) at the power p of that hop.
+    # At the power p of its free hop, a path has j = p / (a p + b), with a = full - signal and b = full alpha.
     a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
     b = whole.full * whole.alpha[..., 0]
 
     def slopes_at(powers: Powers) -> ErrorSlopes:
         return ErrorSlopes(*sensitivity(powers))
 
+    # `best` are the powers with the least gap so far.
     best = p = start
     least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
     slopes = slopes_at(p)
@@ -68,6 +70,7 @@ def water_filling(
             least_gap, best = gap, p
         if gap <= CLOSED * abs(slopes.error) or idle > PATIENCE:
             break
+        # The powers that minimise -sum w j with the weights w = -d error / d j, and the best point on the way to them.
         filled = _fill_to_limits(limits, slopes.weights, a, b)
         p, slopes = _search_line(slopes_at, p, slopes, filled - p)
     return best

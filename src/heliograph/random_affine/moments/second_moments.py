@@ -75,10 +75,10 @@ def describe_second_moments(
 
     Args:
         mean: nominal [M, b] = E[(G, n)] (m, p + 1). The maps below take W = E[(y, 1) (y, 1)'] to a matrix (m, m).
-        spread: above E_v[(z - M y - b) (z - M y - b)'] under every possible law v.
-        shift: above the same with the mean M_v y + b_v under law v in place of z.
-        power: above E_v[G y y' G'].
-        nominal: the spread under the nominal law.
+        spread: W to a matrix above E_v[(z - M y - b) (z - M y - b)'] for every possible law v.
+        shift: W to a matrix above the same with the mean M_v y + b_v under law v in place of z.
+        power: W to a matrix above E_v[G y y' G'].
+        nominal: W to the spread under the nominal law, split here in the share of G and the noise Cov n.
         uncertain: True if several laws are possible.
     """
     gain_spread, noise = split_off_noise(nominal.center, columns_of)
@@ -121,12 +121,12 @@ def has_known_mean(described: SecondOrder) -> bool:
 def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """Return mean and second moments of z = G y + n, bounded over the polytope of uncertain probabilities.
 
-    Exact for a gain common to all components, else dominating. With one scalar gain g, the largest E_v (g - mu)^2,
-    (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these multilinear (or convex) functions of the
-    probabilities have their maxima.
+    G and n are the random gain and noise of the channel. The bounds are exact for a gain common to all components, else
+    above. With one scalar gain g, mu its nominal mean and mu_v its mean under law v, the largest E_v (g - mu)^2,
+    (mu_v - mu)^2 and E_v g^2 are at extreme laws (corners of the set of laws), since they are convex or multilinear.
 
     Args:
-        channel: one that forgets.
+        channel: one without memory.
 
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
@@ -136,7 +136,7 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     bounds, uncertain = _bound_moments(channel), count_corners(channel) != 1
     if uncertain or not channel.has_known_gain:
         return describe_second_moments(*bounds, uncertain)
-    # A known gain has no spread: the noise of the parts of a channel is all, and no tensor of all outputs is needed.
+    # A known gain has Cov G = 0, so the noise of the channel's parts suffices, and no tensor of all outputs is needed.
     return SecondOrder(
         mean_gain=bounds.mean[:, :-1],
         offset=bounds.mean[:, -1],
@@ -345,9 +345,9 @@ def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
 def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
     """Return the bounds of a sum of independent maps and a noise, from those of each map.
 
-    Spreads add up; shifts of means meet in every pair. With D_i the shift of mean i and Y = E[(y, 1) (y, 1)'],
-    (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, here in proportion to the sizes of the
-    shifts; the spread about the nominal means is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
+    Spreads (second moments about nominal means) add up; shifts of means, D_i, between laws meet in every pair of maps.
+    With Y = E[(y, 1) (y, 1)'] and weights w of sum 1, in proportion to the shifts' sizes, (sum D_i) Y (sum D_i)' <=
+    sum_i D_i Y D_i' / w_i, and the spread of the sum is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
 
     Args:
         channel: the sum.
@@ -360,7 +360,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     noise = map_of_known_law(channel.noise.covariance[..., None, None] * make_power_of_constant(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
     spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
-    # Known means: nothing is shifted.
+    # All means are known: no shifts.
     sizes = [size_of_map(bounds.shift) for bounds in parts]
     total = sum(sizes)
     if is_zero(total):

@@ -44,7 +44,12 @@ class FilterErrors(NamedTuple):
 
 
 def compute_filter_errors(record: Record) -> list[FilterErrors]:
-    """Return the errors of each filter, the fused ones first; nothing of a record without true states."""
+    """Return the errors of each filter, the fused ones first; nothing of a record without true states.
+
+    They are the RMSE of each state, and the NEES e' P^-1 e divided by the number of states whose truth is known, with
+    e the error and P the claimed covariance: 1 where the claim holds. Both come with standard errors. `record` has true
+    states and estimates of a run, by node and filter; Network.FUSED stands for the fusion centre.
+    """
     if record.truth is None:
         return []
     known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)  # how many states' truth is known, by row
@@ -248,13 +253,17 @@ def judge_outputs(
 ) -> list[OutputJudgement]:
     """Return what the innovations of a filter, and the values that were received, say of each output.
 
+    For each output: its bias, whether outliers make it suspicious, the size of its innovations against what the filter
+    claims, and the longest run of equal values (a stuck sensor).
+
     Args:
-        names: of the outputs (m).
+        names: names of the outputs (m).
         received: values (time, m), NaN where none arrived.
         innovations: value, variance and weight of each (time, m).
-        medians: of innovations under a law that is not symmetric (m,); the bias is that beyond these.
-        blames: whether weights tell of outliers.
-        expected: of the squares (time, m), as `compute_expected_squares` returns them.
+        medians: medians (m,) that the innovations have anyway, where the noise's law is not symmetric; a bias is
+            measured from these.
+        blames: whether the filter weighs outliers down, so that low weights tell which output has them.
+        expected: expected squares of the innovations (time, m), as `compute_expected_squares` returns them.
         laws: of each output's noise; None where they are not known.
     """
     # Each bias, with both ends of its interval, less the median that the law of the noise explains.

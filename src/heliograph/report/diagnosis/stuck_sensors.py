@@ -90,10 +90,11 @@ def find_stuck_value(
 ) -> StuckValue | None:
     """Return the longest run of equal values, if chance makes one as long less than once in 10,000 recordings.
 
-    A run of n begins at one of N readings with probability at most N p^(n - 1), where p bounds the probability that a
-    reading equals the one before it. It is what the noise allows (`_bound_repetition_probability`). But a law may
-    repeat a value by itself, as a link that is off gives 0 each time: p is at least the share of the value among the
-    readings outside of the run, and the share of those that equal the one before. Where all values are equal, p = 1/2.
+    With p a bound of the probability that a reading equals the one before it, chance makes a run of n equal values
+    somewhere in N readings with probability at most N p^(n - 1). The noise gives one bound
+    (`_bound_repetition_probability`). But a link may repeat a value by itself, as one that is off gives 0 each time. So
+    p is at least two shares among the readings outside of the run: the share of the run's value, and the share of
+    readings that equal the one before. Where all values are equal, nothing is outside of the run, and p = 1/2.
 
     Args:
         values: what was received (time,), NaN where nothing arrived.
@@ -118,7 +119,7 @@ def find_stuck_value(
         p = max(by_noise, *_compute_shares_outside_run(received, start, length))
     if p >= 1:
         return None
-    # Logarithm of N p^(n - 1), the expected number of runs as long; p may be 0, of which there is none.
+    # Logarithm of N p^(n - 1), the expected number of runs as long. A p of 0 has no logarithm: 1e-300 stands for it.
     log_expected = np.log(len(received)) + (length - 1) * np.log(max(p, 1e-300))
     if length < SHORTEST or log_expected > np.log(SELDOM):
         return None

@@ -22,12 +22,16 @@ def describe_wrong_time_unit(
 ) -> str:
     """Return the sentence that times are in another unit, if innovations are as claimed in it and not else; or "".
 
+    A common error is a recording in milliseconds for a plant in seconds. The filter runs on the recording as it is, and
+    with dt in other units. The sentence is returned if the innovations agree with their claimed covariances in another
+    unit alone, and the log likelihood is clearly higher there.
+
     Args:
-        name: of the filter.
+        name: name of the filter.
         filter: a filter that claims a covariance.
         measurements: what it received (time, m), NaN where nothing arrived.
-        inputs: its inputs (time, inputs), of which dt, the time between rows, is one.
-        names: of the inputs.
+        inputs: its inputs (time, inputs); one of them is dt, the time between rows, else "" is returned.
+        names: names of the inputs.
     """
     if TIME_STEP not in names:
         return ""

@@ -135,7 +135,11 @@ def describe_coverage_misses(found: "heliograph.forecasting.Backtest") -> list[s
 
 @matplotlib.rc_context(STYLE)
 def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
-    """Draw the share within the interval of 80 % over the horizon, a panel a number and a line a filter."""
+    """Draw the share within the interval of 80 % over the horizon, a panel a number and a line a filter.
+
+    `found` holds the scores of forecasts on recorded data. The share (coverage) says how often the value that was
+    forecast lay in the forecast's interval of 80 %; the dashed line is the claimed 80 %. Bars are 2 standard errors.
+    """
     numbers = list(dict.fromkeys((s.node, s.part, s.name) for s in found.scores))[:PANELS]
     filters = list(dict.fromkeys(s.filter for s in found.scores))
     nodes = {node for node, _, _ in numbers}

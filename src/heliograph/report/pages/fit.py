@@ -217,7 +217,10 @@ def _list_key_figures(learned: FitResults) -> list[KeyFigures]:
 def _make_estimates_table(learned: FitResults, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
     """Return the figure of the estimates, and the table with start, estimate and interval of each number.
 
-    `drawings`: each figure as SVG.
+    A fit finds unknown numbers of a model by maximum likelihood. The likelihood has a form: "linear" takes what a
+    random gain adds to the variance from the state's moments before any data, "conditional" from its moments given the
+    data, and "truth" is the density of the true states. `learned` has the fit and the numbers at which it started;
+    `drawings` has each figure as SVG, by name.
     """
     picture = Picture(
         drawings["estimates"],

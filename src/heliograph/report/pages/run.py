@@ -256,8 +256,9 @@ def _make_headline(health: Health) -> str:
 def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | PictureChoice | Text]:
     """Return the pictures of the filtered estimates, then of the smoothed ones if there are any.
 
-    Of each kind the map of a position if there is one, estimates and probabilities of modes by node, and a text that
-    names what is not drawn. `drawings`: each figure as SVG, by its name.
+    For filtered and for smoothed estimates there are: the map of a position if there is one, the estimates and the
+    probabilities of modes of each node, and a text that names nodes that are not drawn. `health` holds the record of
+    the run with its estimates. `drawings` has each figure as SVG, by its name.
     """
     pictures: list[Picture | PictureChoice | Text] = []
     for kind, record in _collect_estimates(health):

@@ -62,10 +62,11 @@ def parse_page_address(
 ) -> PageAddress:
     """Return where a page is served: `PORT`, of this machine alone, or `ADDRESS:PORT`, with its token and hosts.
 
-    The token is that in HELIOGRAPH_PAGE_TOKEN; an address that others can reach needs one.
+    The token is a password for the page, read from the environment variable HELIOGRAPH_PAGE_TOKEN. An address that
+    other machines can reach needs one; at a loopback address it is optional.
 
     Args:
-        address: the address.
+        address: `PORT` or `ADDRESS:PORT`.
         environment: environment variables; by default those of the process.
         hosts: names by which a proxy or others ask for the page, without a port.
 

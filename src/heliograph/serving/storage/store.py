@@ -73,7 +73,11 @@ class Store:
         carrier: PlantMigration | None = None,
         begun: bool = False,
     ):
-        """Open the database at `location`, or make it, and check that it is of the network `mine`."""
+        """Open the database at `location`, or make it, and check that it is of the network `mine`.
+
+        `mine` says of which network a state must be; None opens any. `opened` is a store on the same location that has
+        looked for damage, `carrier` converts plants of another network, and `begun` demands that there is a state.
+        """
         self.process, self.journal, self._begun = process, journal, begun
         self.identity: Identity = {}
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
@@ -94,15 +98,12 @@ class Store:
             raise InputError(f"{error}; to begin anew, name another{more}") from None
 
     def _open_state(self, mine: Identity | None, opened: "Store | None", carrier: PlantMigration | None) -> None:
-        """Read the identity, check that the state can be used, find damaged plants, and carry plants over if asked to.
+        """Read the identity, raise ValueError if the state cannot be used, find damaged plants, and carry plants over.
 
         Args:
             mine: identity of the network, with the layout of this version; None opens any.
             opened: a store open on the same location, which has already looked for damage.
             carrier: converts the plants of another network; None refuses them.
-
-        Raises:
-            ValueError: the state cannot be used.
         """
         self.identity = self._read_identity(mine)
         self._check_layout(carrier is not None or mine is None)

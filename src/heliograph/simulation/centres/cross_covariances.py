@@ -86,9 +86,14 @@ class CrossCovariances:
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
         """Return the moments at relays that forward the matrix-weighted estimate of their nodes.
 
-        An error W e is a linear map of the nodes' errors, so its sources are W shared, and the rest has covariance
-        W independent W' as long as no two relays receive the same node. Known means of the errors are subtracted. Apply
-        it level by level for a deeper tree; its root is `matrix_weights` of the last level.
+        The nodes' errors are e_i = shared_i s + a_i, with sources s of covariance I that all have in common and a_i
+        independent, of covariance independent_i. A relay fuses the estimates of its nodes with weights W, so its error
+        W e has the sources W shared and the independent covariance W independent W', as long as no two relays receive
+        the same node. Known means of the errors are subtracted. Apply it level by level for a deeper tree of relays;
+        its root is `matrix_weights` of the last level.
+
+        Args:
+            relays: names of the nodes that each relay receives, by name of the relay.
 
         Raises:
             ValueError: no relays, a relay without nodes, unknown nodes, a node that two relays receive.
@@ -142,8 +147,10 @@ def cross_covariances(
 ) -> CrossCovariances:
     """Compute how the errors of the filters of this name are correlated after `horizon` steps of complete data.
 
-    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i H_i, for all pairs at once and whatever the gains;
-    errors of a filter's model enter too.
+    Errors of two nodes are correlated since both follow the same plant: with the plant's A and Q, the gain K_i and the
+    output matrix H_i of node i, and S_ij the covariance of two nodes' noises, P_ij+ = F_i (A P_ij A' + Q) F_j' +
+    K_i S_ij K_j', F_i = I - K_i H_i. It holds for any gains K_i, and where a filter's model is wrong, the error that
+    this causes is in P_ij too. The result holds the covariances of all pairs as factors.
 
     Args:
         network: a network of linear filters.
@@ -158,6 +165,7 @@ def cross_covariances(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     instance("network", network, Network, "a Network")
+    # The errors of nodes are followed for a fusion with matrix weights, so one is made of the filters of this name.
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _plan_network_filters(alone, horizon, inputs)

@@ -95,8 +95,10 @@ def _make_error_maps(
 def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tuple[float, np.ndarray]:
     """Return by which factor the errors' second moments grow in a step, in the long run, and each node's share of them.
 
-    J = E[e e'] of all nodes' errors e. The message from j to i arrives with probability p_ij, independently of others,
-    and then adds G_ij (e_i, e_j) to the error of node i, G_ij = (of_receiver_ij, of_sender_ij). With the mean step E[M]
+    Nodes fuse their neighbours' estimates with fixed shares; a factor below 1 means that errors stay bounded in spite
+    of lost messages. J = E[e e'] of all nodes' errors e. The message from j to i arrives with probability p_ij,
+    independently of others, and then adds G_ij (e_i, e_j) to the error of node i, G_ij = (of_receiver_ij,
+    of_sender_ij). Without messages the error of node i becomes without_messages_i e_i. With the mean step E[M]
 
       J+ = E[M] J E[M]', plus sum_j p_ij (1 - p_ij) G_ij E[(e_i, e_j) (e_i, e_j)'] G_ij' in the block of node i.
 
@@ -105,13 +107,15 @@ def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMap
     `arrives`: p_ij of each message (node, degree). `maps`: the step of the errors.
     """
     nodes, n = maps.without_messages.shape[:2]
-    # E[M]: e_j enters by p_ij of_sender_ij, e_i by without_messages_i + sum_j p_ij of_receiver_ij.
+    # E[M]: e_j enters by p_ij of_sender_ij, e_i by without_messages_i + sum_j p_ij of_receiver_ij. Column 0 of the axis
+    # `degree` is the node itself.
     probability = arrives[:, :, None, None]
     mean_step = probability * maps.of_sender
     mean_step[:, 0] = maps.without_messages + (probability * maps.of_receiver)[:, 1:].sum(axis=1)
     m = scatter_blocks(mean_step, graph.senders, graph.present)
     variance = (arrives * (1 - arrives))[:, :, None, None]
     g = np.concatenate([maps.of_receiver, maps.of_sender], axis=3)  # (node, degree, n, 2 n)
+    # Power iteration: the step of J is repeated, with J scaled to trace 1 each time.
     joint, logarithms, each_node = np.eye(nodes * n), [], np.arange(nodes)
     for _ in range(STEPS):
         by_message = propagate_by_mode(g, _take_moments_of_pairs(joint.reshape(nodes, n, nodes, n), graph), 0.0)

@@ -70,10 +70,15 @@ class FusedInnovation(Module):
     ) -> FusedSquaredInnovation:  # fmt: skip
         """Return e' S^-1 e of the fused estimate `before`, predicted over step k, by the measurements of that step.
 
+        e are the innovations of all nodes' measurements and S is their covariance under the fused estimate: the sum
+        tests whether the fused estimate's claimed covariance holds. It is summed node by node, each correcting the
+        estimate for the next. A kind is a group of filters that differ in numbers alone, so that they are stacked in
+        arrays; `self.sources` lists (kind, number of the filter in it) for each group of nodes that is fused.
+
         Args:
             before: the fused estimate after step k - 1.
             alike: the nodes' filters, stacked by kind.
-            states: of these filters before step k, by kind.
+            states: the states of these filters before step k, by kind.
             z: measurements (node, received) by group of nodes, NaN where one is missing.
             u: inputs of the plant over the step.
             k: number of the step.
@@ -85,6 +90,7 @@ class FusedInnovation(Module):
             stacked, reasons = alike[kind], skip[kind]
             filters, beliefs = stacked.take_filter(f, states[kind])
             received = z[stacked.group]
+            # A measurement that is not used becomes NaN, which counts as missing.
             if reasons is not None:
                 received = jnp.where(reasons[f][:, None] > 0, jnp.nan, received)
             # x = N(xf-, Pf-): predicted from the fused estimate, by the first node's model of the plant.
@@ -93,6 +99,7 @@ class FusedInnovation(Module):
                 corrected = _CorrectedEstimate(x, jnp.zeros(()), jnp.zeros(()))
             corrected = _correct_in_turn(corrected, filters, beliefs, received, u, k)
         assert corrected is not None  # there is at least one node
+        # Where nothing arrived there is nothing to test: NaN.
         return FusedSquaredInnovation(jnp.where(corrected.arrived > 0, corrected.distance, jnp.nan), corrected.arrived)
 
 

@@ -117,10 +117,12 @@ class FusionCentre(Module):
     ) -> SourceFactors:
         """Return the factors of the errors' joint covariance after all steps.
 
+        Errors are correlated, since all nodes follow the same plant. Factors are a root of their joint covariance.
+
         Args:
             start: the filters' states and the factors before the first step.
-            compute_matrices: of (states, u, k), the matrices of the filters' step k in the order of the nodes.
-            step_filters: of (states, u, k), the filters' states after step k.
+            compute_matrices: (states, u, k) -> the matrices of the filters' step k in the order of the nodes.
+            step_filters: (states, u, k) -> the filters' states after step k.
             u: inputs of the plant (step, inputs), one row for each step.
         """
 
@@ -157,17 +159,14 @@ class FusionCentre(Module):
         """Propagate the moments of all nodes' errors over step k, and fuse the nodes' estimates by every rule.
 
         A source is a stack of filters of one structure. `self.order` brings their nodes, one source after another, into
-        the order of the nodes.
+        the order of the nodes. Returned are the next state, and the fused estimates by name of the fusion.
 
         Args:
             state: moments of the errors, and states of the rules, before the step.
             matrices_by_source: matrices of the filters in the step, with a leading axis of nodes.
-            means_by_source: their estimates after it (node, n).
+            means_by_source: estimates of the nodes' filters after the step (node, n), for each source.
             u: inputs of the plant over the step.
             k: number of the step.
-
-        Returns:
-            The next state, and the fused estimates by name of the fusion.
         """
         error_step = self.step_errors(state.errors, self.gather_matrices(matrices_by_source), u, k)
         reports = jnp.concatenate(means_by_source)[self.order]  # the nodes' estimates (node, n)
@@ -212,18 +211,19 @@ NodeModels = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, 
 def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: NodeModels, shared: bool) -> Claim:
     """Return the claim of fusion by a rule that knows how errors are correlated: "exact", "upper" or "nominal".
 
-    "upper" where noise is known by bounds; "nominal" where probabilities are uncertain or gains depend on data.
+    The claim says what the fused covariance is: "upper" (a bound) where noise is known by bounds, "nominal" (neither)
+    where probabilities are uncertain or gains depend on data.
 
     Args:
-        rule: its name, for errors.
-        plant: that all nodes estimate.
+        rule: name of the rule, for errors.
+        plant: the plant that all nodes estimate.
         nodes: sensor, channel and filter of each node.
         shared: whether the nodes receive parts of one channel.
 
     Raises:
         ValueError: naming the knowledge that is missing.
     """
-    # What a channel remembers would be part of the errors' joint state.
+    # A channel's memory would have to be part of the errors' joint state, which it is not: refused.
     for name, (_, channel, _) in nodes.items():
         if first(channel).remembers:
             expected = f"fusion by {rule}: node {name!r}"

@@ -87,16 +87,17 @@ def gather_messages(
 ) -> ArrivingEstimates:  # fmt: skip
     """Return the estimates that arrive at a step.
 
-    An estimate that saturates its quantizer never arrives; the measurement sent with it arrives at once or not at all.
-    So data decide what is fused: E[e_i e_i'] given that x was beyond the amplitude may be far above P_i.
+    Nodes send their estimates to neighbours, quantised or late. An estimate that saturates its quantizer never arrives;
+    the measurement sent with it arrives at once or not at all. So data decide what is fused: given that x was beyond
+    the quantizer's amplitude, E[e_i e_i'] may be far above the covariance P_i.
 
     Args:
         mean: estimates of the nodes now (node, n).
-        covariance: of their errors (node, n, n).
-        way: messages that were sent before.
-        quantizer: of the estimates that are sent, stacked by node; None where they are sent as they are.
-        senders: of whom each node receives (node, degree), itself first.
-        ages: of the messages that arrive, in steps, -1 where none does.
+        covariance: covariances of their errors (node, n, n).
+        way: messages that were sent 1, 2, ... steps before, as estimates of the present state (age, node, ...).
+        quantizer: quantizer of the estimates that are sent, stacked by node; None where they are sent as they are.
+        senders: numbers of the nodes of which each node receives (node, degree), itself first.
+        ages: ages in steps of the messages that arrive, -1 where none does; the last round counts.
     """
     # Rows: the nodes' own estimates, what they send now, then what they sent 1, 2, ... steps ago.
     sent = mean, covariance
@@ -132,8 +133,8 @@ def step_messages_on_the_way(
     """Return the estimates on the way after a step: those sent now join, corrected by the measurement sent with them.
 
     Args:
-        messages: estimates that arrived in the step, of which rows nodes to 2 nodes are those sent now.
-        way: messages that were on the way before it.
+        messages: estimates that arrived in the step; its rows from `nodes` to 2 `nodes` are those sent now.
+        way: estimates (age, node, ...) in messages that were sent before the step and may still arrive.
         motion: the plant over the step.
         common: the state m about which measurements are taken (n,).
         weighted: H_j' R_j^-1 (z_j - H_j m) of each node's measurement (node, n).

@@ -77,13 +77,18 @@ class LinearisedCentre(Module):
     ) -> tuple[dict[str, LinearisedFusionState], dict[str, Estimate]]:
         """Return the next state and the fused estimates of step k, both by name of the fusion.
 
+        The centre fuses the estimates of nodes with nonlinear filters. Weights need the joint covariance of the nodes'
+        errors, which is propagated here with models linearised at the estimates; so the claim is nominal.
+
         Args:
-            state: before the step.
-            derivatives_by_source: of the filters in the step, for each stack of filters, with a leading axis of nodes.
-            means_by_source: their estimates after it (node, n).
+            state: moments of the errors, last fused estimate (`known`) and the rule's state, by name of the fusion.
+            derivatives_by_source: gain, output matrix and noise of the nodes' filters in the step, for each stack of
+                filters, with a leading axis of nodes.
+            means_by_source: the nodes' estimates after the step (node, n), for each stack of filters.
             u: inputs of the plant over the step.
             k: number of the step.
         """
+        # The stacks of filters joined, and sorted in the order of the nodes.
         linear = join_step_matrices(derivatives_by_source, self.order, self.size)
         reports = jnp.concatenate(means_by_source)[self.order]
         plant = at(self.plant, k)

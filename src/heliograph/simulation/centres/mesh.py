@@ -341,11 +341,14 @@ class Mesh(Module):
     ) -> NodeGains:  # fmt: skip
         """Return the gains by which every node fuses, predicts and corrects, with a leading axis of nodes.
 
+        A node fuses its own estimate with its neighbours' (weights by its rule of fusion), predicts the result, and
+        corrects it by the measurements that reach it.
+
         Args:
             covariance: of all estimates before the step (row, n, n), one row for each node unless `senders` is given.
             blocks: joint covariance of each neighbourhood (node, degree, n, degree, n); None where no rule needs it.
             present: which messages arrive (node, degree).
-            motion: the plant over the step.
+            motion: the plant over the step: its matrix, shift, and noise covariance.
             information: sum of H_j' R_j^-1 H_j over the measurements that reach each node (node, n, n).
             complete: the same sum if none were missing (node, n, n).
             precomputed: weights computed before, by bucket; empty where the rule computes them.

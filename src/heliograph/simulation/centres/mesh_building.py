@@ -18,19 +18,24 @@ DENSE = 200  # most nodes whose joint covariance is propagated at every step
 
 
 def build_mesh(network: Network, name: str) -> Mesh:
-    """Return the fusion `name` between neighbours of a network, ready to be stepped: its graph, edges and models."""
+    """Return the fusion `name` between neighbours of a network, ready to be stepped: its graph, edges and models.
+
+    In a mesh there is no centre: at each step every node fuses its own estimate with those that its neighbours send.
+    """
     fusion = network.meshes[name]
     assert fusion.neighbours is not None
     nodes = network.mesh_nodes(name)
     graph = graph_of(fusion.neighbours, nodes)
-    # Nodes of about as many neighbours are computed together, as one bucket. A node is the first of its own senders.
+    # Nodes of about as many neighbours are computed together, as one bucket: arrays of (node, sender) need little
+    # padding then. `senders` has one row a node, with the node itself first.
     buckets = []
     for part in graph.buckets():
         members, width = part.senders[:, 0], part.senders.shape[1]
         buckets.append(NodeBucket(rule=fusion.rule.placed(part), rows=members, width=width))
     # Place of each node among the results of all buckets, one after another: the inverse of the order of the members.
     ranks = np.argsort(np.concatenate([bucket.rows for bucket in buckets]))
-    # Kinds of the mesh's estimates, one for each group of nodes, and the places of their nodes in the mesh.
+    # A group has nodes of equal models; a kind is a group with its filters. For each group that has the mesh's
+    # estimates: the numbers of its nodes in the mesh.
     index = {node: i for i, node in enumerate(nodes)}
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
     kind_places = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]

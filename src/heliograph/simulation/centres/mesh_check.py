@@ -149,12 +149,13 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
 def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Raise ValueError for links, delays and quantizers with which the covariances of the nodes would not hold.
 
-    `build_edges` refuses links that it cannot draw. A late or quantized estimate has an error of its own: covariance
-    intersection needs a bound on it alone, but rules by the joint covariance would have to follow it, which they do
-    not. Exchanges in several rounds and events are of present estimates that arrive as they are. A quantizer's error
-    must have a bound that no loss can break.
+    Nodes of this fusion send their estimates to neighbours. A late or quantized estimate has an error of its own.
+    Covariance intersection needs only a bound on that error, but rules that use the joint covariance of all errors
+    would have to follow it, which they do not. Several rounds of exchange in a step, and sending on events, are
+    implemented for present estimates that arrive unchanged. A quantizer's error must have a bound that no loss can
+    break. `build_edges` refuses links that it cannot draw.
 
-    `what`: the fusion, for errors.
+    `what`: the fusion, for errors. `graph`: which nodes send to which.
     """
     longest_delay, kind = build_edges(fusion, graph).past, type(fusion.rule).__name__
     if not longest_delay and fusion.quantizer is None:
@@ -176,10 +177,12 @@ def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) 
 def _check_detectability(what: str, name: str, fusion: Fusion, network: HasNodes) -> None:
     """Raise ValueError if neither a node nor one upstream of it observes an unstable mode; warn of decaying modes.
 
-    Mode lambda is observed where rank [lambda I - A; H of all upstream and itself] = n. Not checked where plant,
-    sensors or channels vary over time. `what`: the fusion of this `name`, for errors.
+    A mode is an eigenvalue lambda of the plant's A (n, n). Nodes upstream of a node are those whose messages reach it,
+    also through others. The node observes the mode by its own H and theirs if rank [lambda I - A; all these H] = n (the
+    test of Hautus); an unstable mode that it does not observe makes its error grow without bound. Nothing is checked
+    where plant, sensors or channels vary over time. `what` names the fusion `name` in errors.
     """
-    # Models that do not vary.
+    # Only models that do not vary over time.
     names = network.mesh_nodes(name)
     nodes = [network.nodes[node] for node in names]
     observations = [(node.sensor, node.channel) for node in nodes if isinstance(node, Node)]

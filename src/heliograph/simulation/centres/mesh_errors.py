@@ -265,15 +265,12 @@ def best_possible(
 def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshStep]) -> list[np.ndarray]:
     """Return for each step the sum of H_j' R_j^-1 H_j over the measurements that reach a node by the last step.
 
-    A measurement reaches a node if messages carry it there at its own step or at later ones, through others too.
+    A measurement reaches a node if messages carry it there at its own step or later. Each sum is (node, n, n).
 
     Args:
         mesh: the fusion between neighbours.
         flags: which messages arrive (step, node, rounds, degree).
         steps: models of all steps, with the information of each node's measurement.
-
-    Returns:
-        For each step an array (node, n, n).
     """
     count = len(mesh.nodes)
     # From the last step back: a measurement passes through the exchanges of its own step and of all later ones.
@@ -331,13 +328,16 @@ def freeze(
 ) -> Network:
     """Return the network whose best weights between neighbours are those for the mean of drawn joint covariances.
 
-    The joint covariance is followed once along these arrivals; the means of each neighbourhood's block over the last
-    steps are frozen. The network then runs without it, on thousands of nodes; its claim is "nominal".
+    Best weights need the joint covariance J of all nodes' errors, which is costly to follow. So J is followed once,
+    along these arrivals, and the mean over the last steps of its blocks (a node and its neighbours) is stored in the
+    rule of fusion. The network then runs without J, on thousands of nodes; its claim is "nominal", neither exact nor a
+    bound.
 
     Args:
         network: the network; its fusion may have more nodes than `Fusion` follows.
         fusion: name of its fusion between neighbours by best weights.
-        arrived: what arrives (horizon, node, rounds, degree), such as `mesh_arrivals` draws.
+        arrived: True where a message arrives (horizon, node, rounds of exchange in a step, degree), such as
+            `mesh_arrivals` draws; the axis `degree` has the node itself first, then its neighbours.
         last: number of last steps over which blocks are averaged, 50 by default.
         inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
@@ -352,7 +352,7 @@ def freeze(
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
     u = read_plant_inputs(network, inputs, len(flags))
-    # Mean of each neighbourhood's block of J, from which weights are made, over the last steps.
+    # Sum over the last steps of each neighbourhood's block of J (node, degree, n, degree, n).
     total: np.ndarray | None = None
     by_nodes = (len(mesh.nodes), len(network.states)) * 2  # the shape of J as (node, n, node, n)
     for k, (joint, _, _) in enumerate(propagate_errors_over_time(mesh, flags, u)):

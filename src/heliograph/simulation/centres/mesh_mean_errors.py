@@ -208,14 +208,16 @@ def _average_joint(
 def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPatterns:
     """Return all patterns of what may arrive at every node, with their probabilities.
 
-    P(pattern) = prod_j p_ij over the edges j to i that deliver, and 1 - p_ij over those that do not.
-    `chances`: p of every edge, receiver after receiver.
+    Nodes of the mesh send their estimates to neighbours, and edge j to i delivers with probability p_ij. A pattern of
+    node i says which messages arrive there. Its probability is the product over all edges to i: p_ij for an edge that
+    delivers, 1 - p_ij for one that does not. `chances` has p of every edge (edges,), receiver after receiver.
     """
     # Number of neighbours of each node; in the axis of messages the node's own, which always arrives, comes first.
     counts = mesh.edges.present[:, 1:].sum(axis=1)
     if len(counts) > NODES or counts.max() > DEGREE:
         raise fail("mean errors between neighbours", f"at most {NODES} nodes of at most {DEGREE} neighbours",
                    f"{len(counts)} nodes of up to {counts.max()}")  # fmt: skip
+    # One row a pattern, node after node; `start` has the first row of each node.
     node: list[int] = []
     present: list[list[bool]] = []
     probability: list[float] = []

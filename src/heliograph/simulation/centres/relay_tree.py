@@ -187,9 +187,17 @@ def _propagate_block(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> tuple[A
 def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorSources:
     """Return the errors of a block of leaves after all steps, as roots times shared sources and independent parts.
 
-    `leaves`: what all leaves have in common. `numbers`: of each leaf, with a leading axis. `u`: inputs of the plant.
+    In a tree of relays the leaves are nodes with filters, whose estimates relays fuse on the way to the root. The error
+    of leaf i is root_i s + a_i: s are sources that all leaves share (x_0 and the plant's noise at each step), and a_i
+    is independent, from its own measurements.
+
+    Args:
+        leaves: what all leaves have in common: plant, name of the filter, and a function that makes a leaf.
+        numbers: numbers of each leaf, with a leading axis of leaves.
+        u: inputs of the plant (step, inputs).
     """
-    # All leaves of the block from their numbers.
+    # All leaves of the block from their numbers, with their filters stacked, and a centre that propagates their errors;
+    # it fuses nothing (no rules).
     nodes = eqx.filter_vmap(leaves.node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
     channels = eqx.filter_vmap(lambda values: compute_channel_moments(leaves.node(values).channel))(numbers)

@@ -53,16 +53,19 @@ def examine_innovations(
 ) -> InnovationTests:
     """Test the innovations of a filter: their mean squares by class, and their correlation over messages.
 
+    Messages of the link declare the variance of their noise, and a class has messages of similar variances. If the
+    declared variances hold, whitened innovations have mean square 1 in each class, and are not correlated in time.
+
     Args:
         declared: the recording, and the link that is judged.
-        filter: the filter, as declared or refitted.
+        filter: the filter, with variances as declared, or scaled to fit the recording.
         classes: class of each row, -1 of a row that is not used.
     """
     # u = S^-1/2 (z - E z) of the link's values: independent of each other, of variance 1, if S is true.
     values_of_link = declared.place.values  # columns of z
     whitened = whitened_innovations(declared.z, filter, declared.u)[:, values_of_link]
-    # Probability beyond each end of a class's interval. All classes together contradict a true claim with probability
-    # LEVEL.
+    # Probability beyond each end of a class's interval, two ends for each class: by Bonferroni, all classes together
+    # contradict a true claim with probability LEVEL at most.
     tail = LEVEL / declared.classes / 2
     nis = list[NisOfClass]()
     for number in range(declared.classes):
@@ -74,7 +77,8 @@ def examine_innovations(
             quantiles = (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail))
             low, high = quantiles if count else (0, 1)  # without values the mean is NaN, in no interval
         else:
-            # With random gains only the mean of many squares is, with an error that counts correlations between rows.
+            # With random gains only the mean of many squares is Gaussian: 1 -+ quantile * error, with a standard error
+            # that counts correlations between rows.
             _, error = average_correlated(np.nanmean(squares, axis=1))
             low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
         nis.append(NisOfClass(mean=mean, low=float(low), high=float(high)))

@@ -148,12 +148,12 @@ def judge_declared(
 ) -> DeclaredJudgement:
     """Judge the variances that messages declare by a recording, with the plant as it is.
 
-    Innovations in claimed deviations u are tested twice at 1 %: the mean square of each class of declared variances,
-    and the correlation over up to ten messages, r_l = sum u_k u_(k-l) / sum u^2, which is in units of what was seen,
-    not of what was claimed. Small innovations alone mean nothing: variances that are too large, and an error that
-    changes slowly, look alike. So variances are scaled to fit best, R = s a for each class, and the tests repeated: if
-    they pass, a scale was wrong; if not, a Gauss-Markov bias of each output is fitted beside the scales, and taken if
-    the likelihood says so.
+    Each message declares the variance a of its noise. Innovations over their claimed deviations, u, are tested twice at
+    1 %: the mean of u^2 in each class of declared variances (messages of similar a), and the correlation over up to ten
+    messages, r_l = sum u_k u_(k-l) / sum u^2, on which the scale of a has no effect. Small innovations alone mean
+    nothing: variances that are too large, and an error that changes slowly, look alike. So variances are scaled to fit
+    best, R = s a with one s for each class, and the tests repeated. If they pass, a scale was wrong; if not, a
+    Gauss-Markov bias of each output is fitted beside the scales, and taken if the likelihood says so.
 
     Args:
         filter: a filter behind a link whose Gaussian noise is told (`hg.model.told`).
@@ -217,11 +217,12 @@ def _judge_link(
     rows_with_values = int(np.sum(classes >= 0))
     if rows_with_values < FEWEST:
         return None, rows_with_values
-    # The variances as declared: where the innovations fit them, all scales are 1.
+    # The variances as declared. Where the innovations do not contradict them, all scales are 1.
     tests = examine_innovations(declared, filter, classes)
     if not tests.contradicts:
         ones = np.ones(declared.classes)
         return _make_judgement(declared, classes, (tests, tests), (ones, ones, ones), bias=None), rows_with_values
+    # Scales of the classes; a bias too if the innovations are still correlated.
     refit = refit_scales(declared)
     tests_of_refit = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if tests_of_refit.p_value < LEVEL else None
@@ -330,8 +331,10 @@ def _make_judgement(
 ) -> DeclaredJudgement:
     """Return the judgement of a link from the tests of its innovations (`tested`), before and after the refit.
 
-    `classes`: class of each row, -1 of a row that is not used. `scales`: of each class, with the lower and the upper
-    ends of their intervals. `bias`: what explains the innovations where no scale does; None without.
+    A class has messages that declare similar variances of their noise; the refit scales the variances of each class.
+    `declared`: the filter and the recording. `classes`: class of each row, -1 of a row that is not used. `scales`: of
+    each class, with the lower and the upper ends of their intervals, (classes,) each. `bias`: a slow error that
+    explains the innovations where no scale does; None if there is none.
     """
     before, after = tested
     place, judged_classes = declared.place, []

@@ -93,12 +93,14 @@ class ReceivedLinkPlace(NamedTuple):
 def find_link_place(filter: ToldFilter, link: int) -> ReceivedLinkPlace:
     """Return which received numbers belong to one of the links that report numbers of their law with each message.
 
-    A row of z has values and reported numbers: `filter.values` and `filter.numbers` are their indices in it.
+    Each message brings values, and numbers such as the variance of their noise. A row of z has the values and numbers
+    of all links: `filter.values` and `filter.numbers` are their indices in it.
 
     Args:
         filter: the filter of all links.
         link: number of the link among those that report numbers, in the filter's order (`list_told_maps`).
     """
+    # The links as maps; `memory.announced` is how many numbers each message of a link reports.
     maps, sensor = list_told_maps(first(filter.link)), first(filter.sensor)
     # The link's numbers among all reported numbers: those of the links before it come first.
     begin = sum(affine.memory.announced for affine in maps[:link])

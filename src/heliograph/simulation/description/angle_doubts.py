@@ -173,7 +173,8 @@ def _yield_deviations(
 def doubt_degrees_at_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle that a model has beyond a full turn before any data, as degrees are.
 
-    Looked at are initial means of states, limits of nodes, and what sensors measure at that mean with inputs of 1.
+    Angles are in radians here, so an angle of 90 was probably meant in degrees. Looked at are the initial means of
+    states, the limits of nodes, and what sensors measure at the initial mean with inputs of 1.
     """
     plant = first(network.plant)
     start, u = np.asarray(plant.initial_mean, dtype=float), np.ones(len(plant.inputs))

@@ -56,6 +56,9 @@ class Doubt(NamedTuple):
 def doubts_before_data(network: Network) -> list[Doubt]:
     """Return what is doubtful in a network that has not seen any data, the serious first.
 
+    A doubt is serious if an estimate may not be what it is for; all others are good to know, such as what costs time.
+    Each is a sentence for the user, found from the models of plant, sensors, channels and filters.
+
     Args:
         network: the network.
 
@@ -63,11 +66,13 @@ def doubts_before_data(network: Network) -> list[Doubt]:
         ValueError: what is no network.
     """
     instance("network", network, Network, "a Network")
-    # What an estimate may lack: states that nothing shows, bounds, links, memories, the world, angles.
+    # Serious: states that no sensor observes, errors without a bound, links that carry nothing, filters that ignore a
+    # link's memory, filters that assume other models than the true ones, angles.
     lines = [*_doubt_unobservable_states(network), *_doubt_boundedness(network), *_doubt_useless_links(network)]
     lines += [*_doubt_forgetful_filters(network), *_doubt_mistaken_beliefs(network)]
     lines += [Doubt(True, words) for words in (*doubt_wide_angles_at_start(network), *doubt_degrees_at_start(network))]
-    # What is good to know: digits, what is shared, what takes long, what messages declare, what is independent.
+    # Good to know: lost digits, links that fail together, slow computation, noise that messages declare, and nodes that
+    # are independent of each other.
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded_numbers(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared_in_words(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in explain_xla_fallbacks(network)]

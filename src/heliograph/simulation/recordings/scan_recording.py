@@ -236,11 +236,13 @@ def _scan_rows(
     """Step over rows: return the last states, and the results by row.
 
     Args:
-        filters: of the network.
-        states: before the first row.
-        rows: as `FilteringTask.rows` returns them.
-        judged: leave out what is implausible.
-        is_counted: rows that are not change no state (steps,); None: all are.
+        filters: all filters of the network.
+        states: their states before the first row.
+        rows: (step numbers, inputs, measurements, arrivals), each with a leading axis of rows, as `FilteringTask.rows`
+            returns them.
+        judged: whether filters leave out measurements that they judge implausible.
+        is_counted: flag of each row (rows,); False for a row that only fills up the scan and must change no state. None
+            if all rows count.
     """
 
     def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:

@@ -44,17 +44,21 @@ def screen_recording(
     """Return the measurements without readings that their nodes refuse, with the reason of each refusal.
 
     A node with limits refuses readings beyond them, error codes of the sensor, and readings of a sensor that is stuck.
+    The result also has lines of text for the user on refused readings, on values that the sender's rule forbids, and on
+    silences longer than a node's timeout.
 
     Args:
-        nodes: of the network, by name.
+        nodes: nodes of the network, by name.
         inputs: names of the plant's inputs.
         z: measurements by node, (steps, received), NaN where nothing arrived.
         u: inputs (steps, inputs).
-        before: the runs of equal readings with which the rows before these ended, by node; {} before the first ones.
+        before: the runs of equal readings with which the rows before these ended, by node, so that a stuck sensor is
+            seen across calls; {} before the first rows.
     """
     accepted, refused, lines_to_say = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
     repeats = dict[str, Repeats]()
     for name, node in nodes.items():
+        # Without limits all is accepted; `refused` has a code of the reason for each value, 0 for none.
         accepted[name], refused[name] = z[name], np.zeros(z[name].shape, dtype=np.int8)
         lines = list[str]()
         if node.limits is not None:
@@ -65,7 +69,7 @@ def screen_recording(
                 _describe_refused(reason, node.limits, z[name], refused[name], node)
                 for reason in count_by_reason(refused[name])
             ]
-        # Values that their sender should not have sent stay.
+        # A sender with a rule (send on delta) should not have sent these values. They are reported, but stay in use.
         if rows := find_forbidden_rows(node, accepted[name]):
             lines.append(
                 f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "

@@ -239,12 +239,16 @@ class RowSmoother:
     """
 
     def __init__(self, network: Network, dt: int | None):
-        """Prepare the backward sweep of the network's filters as arrays and code; `dt`: index of the time step in u."""
+        """Prepare the backward sweep of the network's filters as arrays and code; `dt`: index of the time step in u.
+
+        The sweep smooths a history of rows from the last to the first, the filters of all nodes side by side. A kind is
+        filters that differ in numbers alone, stacked in arrays; a central filter uses the measurements of all nodes.
+        """
         instance("network", network, Network, "a Network")
         if dt is not None and not (is_whole(dt) and 0 <= dt < len(network.inputs)):
             raise fail("dt", f"the place of one of {len(network.inputs)} inputs, or None", show_value(dt))
         self.network = network
-        # Filters that can be smoothed: of the nodes by kind, of the centre by name.
+        # Filters that can be smoothed: numbers of the kinds of the nodes' filters, and central filters by name.
         kinds = tuple(
             k for k, kind in enumerate(network.kinds) if _can_smooth(_get_filter(network, k, kind.filters[0]))
         )
@@ -254,7 +258,7 @@ class RowSmoother:
             raise fail(
                 "smoothing", "a filter that keeps its covariance and says how its state moves", "none in the network"
             )
-        # The network's filters without its fusions, which have no part in a sweep: they fuse the smoothed estimates.
+        # The network's filters without its fusions, which have no state to sweep back: they fuse smoothed estimates.
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
         # The sweep as a function of its arrays, compiled when a history's length is known.

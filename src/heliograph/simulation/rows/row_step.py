@@ -114,7 +114,9 @@ class RowStep:
     def __init__(self, network: Network):
         """Lay out state, measurement and outputs of one step of the network's filters in rows; compile the step.
 
-        Filters judge whether measurements are plausible, and fused estimates are tested by what arrives after them.
+        A row is an array of doubles: the states of all filters, the measurements of all nodes, the inputs and the
+        step's number. One call steps many rows, such as those of many plants. Filters also judge whether measurements
+        are plausible, and fused estimates are tested by what arrives after them.
         """
         instance("network", network, Network, "a Network")
         self._network = network
@@ -132,7 +134,7 @@ class RowStep:
         _, output_shapes = _trace_step(self._layout, self._shapes).out_info
         self.outputs = make_flat_layout(output_shapes)
         self.columns = find_filter_columns(network, self.outputs)
-        # Native code with the network's numbers filled in, where it takes the step.
+        # Native code (by `straightline`) with the network's numbers filled in; None if that cannot compile the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
         self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), differs_by_run=(False, True))
@@ -321,7 +323,8 @@ def _write_step_text(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...
 def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: int, is_long: bool) -> PyTree:
     """Return XLA's program (numbers, rows, iterations) -> stepped rows, a loop that steps `together` rows at once.
 
-    The number of iterations is an argument, so that one program serves any number of rows up to `width`.
+    Each row of the table is stepped by itself: it holds states, measurements and inputs of one plant. The number of
+    iterations is an argument, so that one program serves any number of rows up to `width`.
 
     Args:
         layout: the structure of the step, and where state, measurements and inputs stand in a row.
@@ -349,4 +352,5 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
         stepped: jax.Array = jax.lax.fori_loop(0, iterations, step_rows, jnp.zeros((width, columns)))
         return stepped
 
+    # `in_haste`: options of XLA that compile quickly, to slower code.
     return jax.jit(run, compiler_options=in_haste() if is_long else understood())

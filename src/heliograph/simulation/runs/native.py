@@ -84,9 +84,6 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
         runs: number of runs.
         horizon: number of steps.
         precision: the precision in which runs are computed.
-
-    Raises:
-        ValueError: more memory than is available.
     """
     # Memory of what is collected, of sums in each lane, and of lanes that run at once.
     lanes = min(LANES, -(-runs // BLOCK))
@@ -222,10 +219,13 @@ def _find_program(
 def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Precision) -> tuple[Any, Any]:
     """Return the code of worlds of one structure, and the structure of what its runs return, as an `OfStep`.
 
+    A world is plant, channels and filters; a run simulates it once, and a reducer makes results from the run's steps.
+    Structures are trees without the numbers of their arrays: one program serves worlds that differ in numbers alone.
+
     Args:
         of_world: structure of the world.
-        of_rest: structure of (smoother that follows or None, inputs, reducer).
-        precision: in which runs are computed.
+        of_rest: structure of the tuple (smoother that follows the run or None, inputs, reducer).
+        precision: "float32" or "float64", in which runs are computed.
     """
     result_trees: list[Any] = []  # one, which is found when `run` is traced
 
@@ -245,7 +245,8 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
         result_trees[:] = [jax.tree.structure(OfStep(sums, ever, reduced.collected))]
         return (sums, ever), reduced.collected
 
-    # Traced with a key, argument 0, and examples of the arrays, of which some entries are known.
+    # The program is traced with a random key (argument 0) and examples of all arrays (arguments 1, 2, ...). The masks
+    # mark entries of these whose values are known now, so that the compiler may use them.
     key, known = jax.eval_shape(lambda: jax.random.key(0)), of_world.known + of_rest.known
     masks = {i: entries.mask for i, entries in enumerate(known, start=1) if entries.mask.any()}
     single = precision == "float32"
@@ -307,6 +308,8 @@ def simulate_natively(
 ) -> Result | None:
     """Simulate a network by native code, and return what the reducer makes of its runs.
 
+    The result is None where native code does not support the network or the reducer.
+
     Args:
         network: the network.
         inputs: of the plant (horizon, inputs).
@@ -318,9 +321,6 @@ def simulate_natively(
         progress: is called with how many runs are done, and of how many.
         smoothing: the part of the network that is smoothed; None if nothing is.
         precision: in which runs are computed.
-
-    Returns:
-        None where native code does not support the network or the reducer.
     """
     # Many nodes that share nothing go in parts, where the reducer has a method of its own to join their results.
     can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)

@@ -99,8 +99,11 @@ class ChannelGroup(Module):
 def group_channels(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """Return the channels by structure: those of one are stacked, with a row for each name.
 
-    Names of memories do not matter to the structure.
+    Channels of one structure differ in numbers alone, so that one vectorised program draws what they deliver. Names of
+    memories (which links share what they remember) do not matter to the structure. `channels`: channels by the name
+    that seeds their draws.
     """
+    # Of each channel: the numbers that seed its memories, and the checksum of its name, which seeds its draws.
     listed, memories = list(channels.values()), list(number_memory_seeds(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
     # Rows of each structure's channels, by the objects' identities: one object under many names is stacked once.
