@@ -84,7 +84,7 @@ def lower_traced(
         traced: the program, in single precision or in double.
         tree: the structure of its results.
         most: operations above which it is refused.
-        known: by the number of the argument, which of its entries are the same in every call, and these numbers.
+        known: by number of an argument, a mask of the entries that are the same in every call, and these numbers.
         single: whether numbers are float32.
     """
     lowering = Lowering(most)

@@ -326,7 +326,8 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
 
     Args:
         path: the log, or a folder with several.
-        dbc: database of its bus; None where it needs none, or for the identifiers alone.
+        dbc: file (.dbc) that says which signals the frames of the CAN bus hold. None for a log that has this itself, or
+            to list the identifiers of the frames alone.
 
     Raises:
         ValueError: no such file, one that cannot be opened, a database that does not fit; one line.

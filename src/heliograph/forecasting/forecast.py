@@ -254,9 +254,13 @@ def combine_predictions(
 ) -> Forecast:
     """Return a forecast with the filter's claims, from moments of the states, the outputs and what arrives.
 
+    A claim says what a covariance is: exact, an upper bound, nominal, or none. Those of the outputs and of what arrives
+    may be weaker than that of the states.
+
     Args:
-        predictor: the filter's predictor.
-        moments: of the states, the outputs and what arrives, at each horizon; None where it is not predicted.
+        predictor: the filter, its sensor and the limits of the states.
+        moments: means and covariances at each horizon of the states, the sensor's outputs, and the numbers that arrive
+            through the channel; None where they are not predicted.
         received_names: names of the numbers that arrive.
         steps: how far ahead each horizon is.
         time: of each horizon.

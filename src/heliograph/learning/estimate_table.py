@@ -282,8 +282,8 @@ class Solution:
         Args:
             entry: the number.
             value: its estimate.
-            slopes: its derivative, on the line, by each active coordinate (active,).
-            error: its standard error on the line.
+            slopes: its derivative, in its unbounded coordinate, by each active (not fixed) coordinate (active,).
+            error: its standard error in that coordinate.
             freedom: degrees of freedom with which the error is known.
             method: of `Fit.rows`.
             level: probability with which the interval holds the number.

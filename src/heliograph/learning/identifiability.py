@@ -218,11 +218,14 @@ def _format_interval(
 ) -> str:
     """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum; "" if none.
 
+    Data may tell a product or a sum of confounded parameters though not each one: so its interval is shown. By the
+    delta method its variance is g' C g, with its gradient g and the covariance C of the estimates.
+
     Args:
-        parameters: the free numbers.
-        group: the group that it is of.
-        row: exponents of a product, or weights of a sum, by place in the group.
-        solution: the maximum; None where there is none yet.
+        parameters: the free numbers v_i.
+        group: the confounded numbers; `places` are their coordinates.
+        row: exponents a_i of a product, or weights of a sum, by place in the group.
+        solution: the maximum of the likelihood; None where there is none yet.
         log: whether it is a product, whose logarithm sum_i a_i log |v_i| is a sum.
     """
     if solution is None or not all(solution.active[i] for i in group.places):
@@ -234,7 +237,7 @@ def _format_interval(
             weight = row[group.places.index(entry.coordinate)]
             slopes += weight * (slope / number if log else slope)
             value += weight * (np.log(abs(number)) if log else number)
-    # g' C g is the variance of a function with the gradient g.
+    # Half the width of the interval: student's quantile times sqrt(g' C g).
     covariance, freedom = solution.covariance()
     gradient = slopes[solution.active]
     reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))

@@ -76,7 +76,7 @@ class Timeline:
         """Begin with the initial laws of a network's filters, and no event.
 
         `window`: how late an event may be; `start`: of continuous time; `ahead`: how much later than its arrival an
-        event may be dated; `capacity`: greatest number of rows held. Times are in steps or in the unit of dt.
+        event may be dated; `capacity`: most rows held, not final yet. Times are in steps or in the unit of dt.
         """
         # The arguments, checked.
         self.network = instance("network", network, Network, "a Network")
@@ -88,10 +88,10 @@ class Timeline:
         self._program = shared_program(network)
         if self._program.dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
-        # Such a plant takes other steps where a prediction stops in between.
+        # Such a plant is integrated by steps that depend on where a prediction in between stops.
         if what := self._program.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
-        # A fleet of one plant, and a slot of its table to predict into.
+        # A fleet of one plant, and a slot (row of its table of states) to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin_plant("", start, origin=None), self._fleet.pool.take_slot()
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.

@@ -80,12 +80,14 @@ class _PlantAndSenders(NamedTuple):
 def design_bits(network: Network, total: int) -> BitsDesign:
     """Return the bits of each sender's words, of `total` bits a step, for a small error of the filter of all nodes.
 
-    A word of B bits over a range of 2a, with D = 2a / (2^B - 1), U = D^2 (4^B - 1)/12 and flips of g = 1 - 2p, says as
-    much of y as one measurement of the information j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)). j is convex in B while
-    D^2/12 > R and concave then, so that one more bit may say little where three say much: bits are added greedily,
-    several at once, by the decrease of the error for each. The steady trace is convex in all j; with each j replaced by
-    its concave envelope the best real bits give the bound, by Frank and Wolfe's steps, whose linear part is exact. It
-    is close where steps are no coarser than the noises, and loose where a precise sensor has few bits.
+    A word of B bits rounds y, whose noise has the variance R, to steps of D = 2a / (2^B - 1) in a range of 2a; each bit
+    is flipped with the probability p, g = 1 - 2p, and U = D^2 (4^B - 1)/12. The word says as much of y as one
+    measurement of the information j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)). j is convex in B while D^2/12 > R and
+    concave for more bits: one more bit may say little where three say much. So bits are added greedily, several at
+    once, by the decrease of the error per bit. The steady trace of the covariance is convex in all j. With each j
+    replaced by its concave envelope, the best real numbers of bits give the bound, by Frank and Wolfe's steps, whose
+    linear part is exact. It is close if steps are no coarser than the noises, and loose for a precise sensor with few
+    bits.
 
     Args:
         network: nodes with encoders, whose ranges and links are kept, of one output each.

@@ -118,7 +118,8 @@ class SumOfLinksTask(NamedTuple):
     def search_amplitudes(self, total: float, starts: int, first: Vector | None = None) -> Vector:
         """Return the amplitudes (links,) of the least error that descents find from `first` and from drawn starts.
 
-        Amplitudes may be negative: their signs matter where noises of links are correlated.
+        The receiver gets the sum of all links' signals, each times its amplitude. Amplitudes may be negative: their
+        signs matter where noises of links are correlated. The error is not convex in them, hence several starts.
 
         Args:
             total: power that the free links may send together.

@@ -58,8 +58,9 @@ class World(Module):
         """Step the world over step k: return its next state, and what is recorded of the step.
 
         Args:
-            carry: state before the step, as `init` returns it.
-            key: of the run.
+            carry: state before the step: x (n,) of the plant, states of the medium (all channels to the nodes), of the
+                filters and of the links between neighbours, and the modes of the plant's memories (Markov chains).
+            key: random key of the run.
             row: (k, inputs of the plant over step k).
 
         Returns:

@@ -373,7 +373,7 @@ class FunctionWriter:
         return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.write_operand(condition)} to %lanes')}, 0")
 
     def _write_guard(self, guard: Guard) -> None:
-        """Write a guarded block, which is skipped where its condition holds in no lane; its results are zero then."""
+        """Write a guarded block: it is skipped if its condition holds in no SIMD lane; its results are then 0."""
         self.count += 1
         name = f"guard{self.count}"
         # Jump past the body if no lane needs it.

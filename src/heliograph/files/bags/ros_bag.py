@@ -226,18 +226,19 @@ def _append_messages(
     table: EventTable,
     strict: bool,
 ) -> Counter[str]:
-    """Append the events of messages one after another; what cannot be read is refused alone.
-
-    Returned is by topic how many say that something read of them has no value.
+    """Append the events of messages one after another; a message that cannot be read is counted and left out.
 
     Args:
         path: the bag, for errors.
-        reader: its reader.
-        sources: the sources.
-        batch: the messages.
+        reader: decodes its messages.
+        sources: which fields of which topic are a node's measurement.
+        batch: the messages: connection (topic and type), time of logging, and bytes.
         done: how many messages of the sources' topics were read before.
         table: where the events go.
         strict: whether the first message that cannot be read is an error.
+
+    Returns:
+        By topic, the number of messages which say themselves that a value in them is not valid.
     """
     marked = Counter[str]()
     for number, (connection, logged, data) in enumerate(batch, done + 1):

@@ -291,7 +291,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
     """
     if are_same(a, b):
         return True
-
+    # Numbers under JAX tracing cannot be compared; maps of other sizes, or of `past` outputs (delays), never agree.
     if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:
         return False
     if a.covers(b, lambda x, y: _same_noise(x, y, order)):

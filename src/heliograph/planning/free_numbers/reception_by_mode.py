@@ -145,8 +145,8 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     plants = [at(network.plant, k) for k in range(steps)]
     a = jnp.stack([jnp.asarray(plant.matrix) for plant in plants])
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
-    # What each node receives, from the second moments E (x, 1)(x, 1)' of the state. They are steady where the steps
-    # repeat for ever.
+    # What each node receives: H = E[G] C and the noise N by mode. Random gains make N depend on the second moment
+    # E (x, 1)(x, 1)' of the state, which is steady where the steps repeat for ever.
     seconds = [steady_moment_with_one(plants[0])] * steps if forever else moments_with_one_over(network.plant, steps)
     states = jnp.stack([jnp.asarray(second) for second in seconds])
     b = None if young is None else jnp.broadcast_to(young, (steps,))

@@ -96,7 +96,12 @@ class MeshEdges(Module):
     ) -> tuple[PyTree, jax.Array]:
         """Send one message over each channel of a group: return their next states, and flags or ages of what arrives.
 
-        `count`: how many messages each edge sent before, which seeds the draws.
+        Args:
+            group: channels of one structure from neighbour to neighbour, stacked along a leading axis of edges.
+            state: states of these channels, with the same axis.
+            key: random key of the run.
+            k: number of the step, which selects the channel if it varies over time.
+            count: how many messages each edge sent before, which seeds the draws.
         """
 
         def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:

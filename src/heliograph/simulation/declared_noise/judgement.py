@@ -294,7 +294,7 @@ def _classify_rows(
 def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
     """Return the bias of each output that fits beside the scales; None where it is not significant, at 1 %."""
     filter = declared.filter
-    # A bias is a further state: not for models that vary over time, nor for values that are no outputs one by one.
+    # A bias is a further state: it needs a model constant over time, and a link whose values are outputs one by one.
     varies = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
     if varies or declared.place.outputs is None:
         return None

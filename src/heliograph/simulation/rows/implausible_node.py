@@ -32,7 +32,7 @@ def blame_nodes_for_implausible_rows(
         z: measurements by node, in the order in which the filters receive them, NaN where one is missing.
         u: inputs by row.
         why: rows that are implausible, with the reason.
-        nodes: those that no filter of their own judges.
+        nodes: nodes without a filter of their own that judges their values.
 
     Returns:
         The rows of each node that is to blame, with the reason.
