@@ -103,6 +103,7 @@ def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     """Return the C expression of a node's operation on arguments, which are names and literals.
 
     Operations that depend on the types are written first, then those of the tables by operation.
+
     Args:
         node: an operation of the program's graph, with its type and its arguments' types.
         arguments: C texts of its arguments.

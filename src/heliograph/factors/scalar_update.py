@@ -61,10 +61,10 @@ def update_root_columns(
 
     Args:
         root: V (rows, n), zero above its diagonal; V_j is its column j.
-        d: variances (n,) of xi.
+        d: variances d_k (n,) of the uncorrelated xi.
         product: d_k f_k (n,).
-        f: slopes (n,).
-        s: sums s_0 ... s_n (n + 1,).
+        f: slopes f_k (n,) of the measurement in xi.
+        s: sums s_0 ... s_n (n + 1,), of which s_n = Var v and s_0 is the variance of the innovation.
     """
     n, is_lower = len(d), np.tril(np.ones(root.shape, bool))
     # Column j of w is w_j.

@@ -212,9 +212,9 @@ def _make_vehicle_plant(
         wheelbase: distance of the axles of a bicycle, steered by the angle of its front wheel; None of a unicycle,
             which is steered by its turn rate.
         steered_by: name of the input by which it is steered, behind "speed".
-        intensity: S of Q = S dt (3, 3).
+        intensity: noise intensity S (3, 3): over a step of length dt the states gain the covariance Q = S dt.
         initial_mean: mean before the first step (3,).
-        initial_covariance: its covariance, or the law of its deviation.
+        initial_covariance: covariance before the first step, or the law of the deviation from the mean.
         dt: length of every step; None where the input "dt" says it.
         axes: names of both positions.
     """

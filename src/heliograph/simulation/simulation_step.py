@@ -64,8 +64,9 @@ class World(Module):
             row: (k, inputs of the plant over step k).
 
         Returns:
-            The next state, and "truth" (n,), "measurements" (node, received) by group, "transmissions" by group, and
-            all that `AllFilters.step` puts out, with estimated angles within half a turn of the true ones.
+            The next state, and "truth" (n,), "measurements" (node, received) by group of nodes, "transmissions" by
+            group (why senders with a trigger sent), and all that `AllFilters.step` puts out, with estimated angles
+            within half a turn of the true ones.
         """
         (x, medium, states, edges, modes), (k, u) = carry, row
         # The plant moves, in the present modes of its memories, and its nodes receive.

@@ -250,7 +250,7 @@ def _make_odometry(
     pose: Pose,
     types: Any,
 ) -> object:
-    """Return an odometry message.
+    """Return an odometry message of ROS: position, orientation and velocities, with their covariances.
 
     Args:
         stamp: its time in nanoseconds since 1970.

@@ -123,8 +123,8 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
     Args:
         store: the store, for errors.
         options: the options, "table=NAME&org=NAME"; of PostgreSQL others are the server's.
-        is_influx: whether the store is InfluxDB, which has no others.
-        asks: whether the URL has a statement, beside which no table may stand.
+        is_influx: whether the store is InfluxDB, which has no other options than these two.
+        asks: whether the URL has a statement (a query); then no table may be named.
 
     Raises:
         ValueError: an option that InfluxDB has not, several tables, a table beside a statement.

@@ -131,12 +131,15 @@ def check_time_variation(network: Network, error: Error) -> None:
 def make_mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
     """Return the system of a network's best linear filter over the steps of an error, by the modes that it observes.
 
-    Noises are exact, or upper bounds where probabilities are uncertain.
+    A mode is a state of the links' Markov chains, such as which packets are lost. The system has for each step the
+    plant's A and Q, the transition and law of the modes, and by mode H and N of z = H x + n, Cov n = N. Noises are
+    exact, or upper bounds where probabilities are uncertain.
 
     Args:
         network: the network at some values of its free numbers, which may be traced.
         error: says over which steps: a period that repeats for ever, or a horizon.
-        young: the scalar b of Young's inequality at each step, (steps,) or (); None where the mean gains are known.
+        young: scalar b of Young's inequality at each step, (steps,) or (), for mean gains that are uncertain; None
+            where they are known.
 
     Raises:
         ValueError: a channel with memory whose mode is not observed, more than MOST_MODES modes together.

@@ -162,7 +162,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """Return the filter of one node of a fusion between neighbours, on what its neighbours send.
 
     In such a fusion there is no centre: each node corrects its estimate by its own measurement and by its neighbours'
-    messages. The filter does this for one node, with the messages as inputs, so that it can run on a device.
+    messages. The filter does this for one node, with messages as measurements, so each node can be another process.
 
     Args:
         network: the network.

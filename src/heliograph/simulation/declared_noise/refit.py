@@ -291,9 +291,9 @@ def find_median_step(declared: DeclaredRows) -> float:
 def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: int) -> float:
     """Return an end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
 
-    The numbers are those that rescale the noise which messages declare. At the end the likelihood, with the other
-    numbers at their best (profile likelihood), is 1.92 nats (REACH) below its maximum: half the 95 % point of
-    chi-squared with one degree of freedom.
+    The numbers are scales of the noise that messages declare, and with a bias its deviation and memory. At the end the
+    likelihood, with the other numbers at their best (profile likelihood), is 1.92 nats (REACH) below its maximum: half
+    the 95 % point of chi-squared with one degree of freedom.
 
     Args:
         declared: the filter and the recording.

@@ -24,7 +24,7 @@ def blame_nodes_for_implausible_rows(
 ) -> dict[str, dict[int, str]]:
     """Give each row that all central filters find implausible to one of the nodes that have a value there.
 
-    It is the node without whose values the filters find the row plausible, as `Judgement.find_culprit` chooses it.
+    A row is blamed on a node without whose values the filters find it plausible; `Judgement.find_culprit` chooses.
 
     Args:
         filters: the central filters, which receive from all nodes.
