@@ -255,7 +255,7 @@ def _judge_repeated_events(
     Args:
         verdicts: verdicts on all events, such as USED, changed here to DUPLICATE (same values) or CONFLICT (others).
         numbers: numbers of the events to judge, in order of arrival.
-        identities: for each of these, a number for its node, time and count; events of one identity are copies.
+        identities: for each, a number for its node, time and count; later events of one identity are repetitions.
         places: for each, a number that stands for its row and node if rows are joint, else its identity.
         values: the values of the event with a number.
         joint: whether all events of one time are one row.

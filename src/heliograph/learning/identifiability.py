@@ -237,7 +237,7 @@ def _format_interval(
             weight = row[group.places.index(entry.coordinate)]
             slopes += weight * (slope / number if log else slope)
             value += weight * (np.log(abs(number)) if log else number)
-    # Half the width of the interval: student's quantile times sqrt(g' C g).
+    # Half the width of the interval: the quantile of Student's t times sqrt(g' C g).
     covariance, freedom = solution.covariance()
     gradient = slopes[solution.active]
     reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))

@@ -143,8 +143,8 @@ class PlantState:
 
         Args:
             clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
-            time: what that clock says.
-            now: its arrival.
+            time: the event's time by that clock.
+            now: arrival of the event.
             longest_gap: longest gap that needs no other clock.
             agreed: whether another clock says the same.
         """

@@ -35,7 +35,7 @@ def simulation_smoother(
         z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
         u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
         draws: number of paths; 1000 by default.
-        seed: of the random numbers; 0 by default.
+        seed: seed of the random numbers; 0 by default.
 
     Returns:
         States (draws, steps, n), angles between -pi and pi.

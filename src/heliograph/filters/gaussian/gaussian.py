@@ -186,7 +186,8 @@ def correct_signal(
         rule: how the error covariance is bounded if the law of G is uncertain, as one of a set of laws.
         z: measurement (m,), NaN where a component did not arrive. If none arrived, the prior is returned.
         angles: which components of z are angles.
-        moments_for_gain: moments of y that gain and covariance use, by default `signal`.
+        moments_for_gain: moments of y that gain and covariance use, by default `signal`; a linear filter gives those
+            before any data, so that its gains depend on no data.
 
     Returns:
         The posterior of x, and the innovation with the covariance and density of the nominal law of G, its center.

@@ -156,7 +156,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             The hypotheses given codeword i, unchanged if it did not arrive, and the codeword's probability.
         """
         # Four Gaussians [h, a] and their probabilities (2, 2): h = 0 or 1 is the hypothesis so far, and a = 0 if the
-        # leading bits of codeword i are right, 1 if not.  P[h, a] = P(h) P(a, codeword i | h).
+        # leading bits of codeword i are right, 1 if not. P[h, a] = P(h) P(a, codeword i | h).
         gaussians, probability = jax.lax.map(lambda x: self._split_by_answer(x, i, words), joint.parts)
         probability = probability * joint.weights[:, None]
         total = jnp.sum(probability)

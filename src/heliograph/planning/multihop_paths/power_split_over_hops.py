@@ -119,8 +119,8 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     then dD/dP = -l D.
 
     Args:
-        whole: by path and step A (`full`), D at infinite powers; t (`signal`); and alpha (path, hop), 0 where a path
-            has fewer hops.
+        whole: A (`full`), which is D at infinite powers, and t (`signal`), of each path at each step (time, path); and
+            alpha (time, path, hop), 0 where a path has fewer hops than another.
         total: the power P of each path at each step (time, path).
     """
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
