@@ -62,7 +62,7 @@ def measure_beside_noises(
     """Condition x = m + L xi on z = E z + slopes xi + N omega, one component at a time, omega beside xi as unknowns.
 
     The noises omega become columns of the factor, as the noise of one component also enters later ones. Each component
-    is then measured without further noise. Results are as of `measure_uncorrelated`, which decorrelates z instead.
+    is then measured without further noise. `measure_uncorrelated` gives the same results by decorrelating z first.
 
     Args:
         root: L (n, n), the factor of Cov x = L diag(d) L'.

@@ -151,7 +151,7 @@ def _find_filter(
     """
     states_by_kind, states_of_central, *_ = origin.state
     if (node, name) in network.places:
-        # One after another: each filter of the kind, and for it each node of the kind's group of nodes.
+        # A kind stacks filters of one structure: filter after filter, and for each the nodes of the kind's group.
         kind, filter_of_kind, node_of_group = network.places[node, name]
         nodes_in_group = len(network.groups[network.kinds[kind].group])
         index = filter_of_kind * nodes_in_group + node_of_group

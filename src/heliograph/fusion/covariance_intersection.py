@@ -109,8 +109,12 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
 def _take_newton_step(point: _PointWithDerivatives) -> tuple[jax.Array, jax.Array]:
     """Return weights w and multipliers s after one Newton step for g - s + m 1 = 0, sum w = 1, w s = target.
 
-    g is the gradient, s the multipliers of w >= 0, m that of the sum. The target follows from where the step with
-    target 0 would end (Mehrotra's predictor and corrector).
+    The weights w minimise tr (sum_k w_k J_k)^-1, with the gradient g. s are the multipliers of w >= 0 (`slack`), and m
+    is that of sum w = 1. An interior point method lets w s go to 0 by a target that shrinks with each step; it follows
+    from where the step with target 0 would end (Mehrotra's predictor and corrector).
+
+    Args:
+        point: weights w, multipliers s, gradient g and Hessian H of the trace.
     """
     w, slack, gradient = point.weights, point.slack, point.gradient
     # With H the Hessian, s = (target - s dw) / w is eliminated: (H + diag(s / w)) dw + m 1 = target / w - g. In the

@@ -164,7 +164,7 @@ class Timeline:
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once); return the verdict on it.
 
-        It costs one step of all filters for the event's row and for each later one.
+        A row is all events of one time; an event costs one step of all filters for its row and for each later one.
 
         Args:
             node: name of the node, or "inputs" of the plant's inputs.
@@ -182,10 +182,10 @@ class Timeline:
         event = screened.event
         verdict, lines = self._fleet.take_event(plant, event, arrival is not None), list[str]()
         if verdict == "used":
-            row, _ = plant.changes[-1]  # that which holds the event now
+            row, _ = plant.changes[-1]  # the row that holds the event now
             why = screened.why if screened.is_empty else self._explain_implausible(event, row)
             if why is not None:
-                # As if it had never arrived.
+                # The event is implausible: undo it, as if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
                 self._fleet.undo_events(plant, clock_before)
                 self._fleet.step([plant])

@@ -18,8 +18,9 @@ NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
     """Raise ValueError unless the flags that these channels deliver are those of the filter's model.
 
-    A flag is a number received behind the measurement that tells the mode of a link, in this step or the step before
-    (late). A filter that takes one for the other would claim a wrong covariance.
+    A flag is a number that is received after the measurement and tells the mode of a link (such as good or bad), in
+    this step or the step before (late). A filter that took a late flag for one of this step would claim a wrong
+    covariance.
 
     Args:
         name: of the filter, for the error.

@@ -27,9 +27,9 @@ def check_error_decay(
         what: name of the fusion.
         graph: whom each node receives.
         shares: c_ij of node i for its neighbour j (node, degree), zero for the node itself.
-        arrival: probability of every edge's message (edge,), receiver after receiver.
-        plant: A and Q.
-        squares: H_j' R_j^-1 H_j (node, n, n).
+        arrival: probability that the message of each edge (neighbour to node) arrives (edge,), receiver after receiver.
+        plant: the plant's matrix A and noise covariance Q.
+        squares: information H_j' R_j^-1 H_j of each node's measurement (node, n, n).
 
     Raises:
         ValueError: errors that grow, by the name of the node where they are largest.
