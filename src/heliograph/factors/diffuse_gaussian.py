@@ -97,7 +97,7 @@ def triangularise_both_levels(
 
     Args:
         rows: (rows, c).
-        weights: of the columns (c,).
+        weights: finite and infinite weights of the columns (c,) each; one of the two is 0.
         count: how many rows are made orthogonal.
         whole: squares (rows,) of the rows in the infinite columns before anything was subtracted, which rounding is a
             share of; by default those of `rows`.

@@ -66,7 +66,7 @@ def observe_root(
     rows[..., :m, : noise.shape[-1]] = noise
     rows[..., :m, noise.shape[-1] : columns] = output_root
     rows[..., m:, noise.shape[-1] : columns] = root
-    # Dependent components are moved behind the others: what rounding left of them would else take from these.
+    # Dependent components are moved after the others: else their rounding would take a part of these.
     independent = _find_independent_rows(rows[..., :m, :columns])
     order = None if independent.all() else np.argsort(~independent, axis=-1, kind="stable")
     if order is not None:

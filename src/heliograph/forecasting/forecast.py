@@ -263,7 +263,7 @@ def combine_predictions(
             through the channel; None where they are not predicted.
         received_names: names of the numbers that arrive.
         steps: how far ahead each horizon is.
-        time: of each horizon.
+        time: time of each horizon.
         inputs: whether inputs were "given" or "held"; "none" of a plant without.
     """
     states, outputs, received = moments

@@ -281,7 +281,7 @@ class Solution:
 
         Args:
             entry: the number.
-            value: its estimate.
+            value: estimate of the number.
             slopes: its derivative, in its unbounded coordinate, by each active (not fixed) coordinate (active,).
             error: its standard error in that coordinate.
             freedom: degrees of freedom with which the error is known.

@@ -97,8 +97,8 @@ def compare_before_and_after(
     Args:
         before: the network before learning.
         after: the same with the numbers learned.
-        measurements: by node (rows, received); the filters run over all rows.
-        inputs: of the plant (rows, inputs).
+        measurements: measurements by node (rows, received); the filters run over all rows.
+        inputs: inputs of the plant (rows, inputs).
         cut: number of the first row that was not learned from.
     """
     results = []

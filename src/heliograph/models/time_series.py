@@ -128,9 +128,9 @@ def seasonal(
 
     Args:
         period: steps after which it returns, at least 2.
-        variance: of w; 0 for a season that is always the same.
-        initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
-        name: of the component; "season" by default.
+        variance: variance of w; 0 for a season that is always the same.
+        initial_variance: variance of each state before the first step, or `hg.diffuse`; 1e8 by default.
+        name: name of the component; "season" by default.
 
     Raises:
         ValueError: a period below 2, a negative variance.
@@ -162,10 +162,10 @@ def trigonometric_seasonal(
 
     Args:
         period: steps after which it returns, at least 2; it need not be whole.
-        variance: of each wave's noise.
+        variance: variance of each wave's noise.
         harmonics: number of waves; by default all that differ at whole steps.
-        initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
-        name: of the component; "season" by default.
+        initial_variance: variance of each state before the first step, or `hg.diffuse`; 1e8 by default.
+        name: name of the component; "season" by default.
 
     Raises:
         ValueError: a period below 2, more waves than differ, a negative variance.
@@ -272,9 +272,9 @@ def regression(
 
     Args:
         regressors: names of the inputs.
-        variance: of each coefficient's step; 0 by default: constants.
-        initial_variance: of each coefficient before the first step, or `hg.diffuse`; 1e8 by default.
-        name: of the component; "regression" by default.
+        variance: variance of each coefficient's step; 0 by default: constants.
+        initial_variance: variance of each coefficient before the first step, or `hg.diffuse`; 1e8 by default.
+        name: name of the component; "regression" by default.
 
     Raises:
         ValueError: no regressors, a negative variance.

@@ -94,7 +94,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
         total: bits that all nodes together send at a step.
 
     Raises:
-        ValueError: no network of senders of words with one output each behind constant error rates, a sender that
+        ValueError: nodes that do not all send words of one output over links of constant error rates, a sender that
             decides when to transmit, a plant that is not linear or not stable, a range that the steady state leaves in
             more than 1 of 1000 steps, no bit.
 

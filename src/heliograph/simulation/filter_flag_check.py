@@ -23,9 +23,9 @@ def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[Abs
     covariance.
 
     Args:
-        name: of the filter, for the error.
+        name: name of the filter, for the error.
         filter: with all filters inside it.
-        channels: whose outputs it receives, one after another.
+        channels: channels whose outputs the filter receives, one after another.
 
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
@@ -34,7 +34,7 @@ def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[Abs
     channel_of_number = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
     for reader in _find_flag_filters(filter):
         if isinstance(reader, ModeObservedFilter):
-            # All numbers behind the channel's outputs are flags.
+            # All received numbers after the channel's outputs are flags.
             measured, expected = first(reader.channel).outputs, LATE if reader.late else NOW
             flags = channel_of_number[measured : reader.received]
             wrong = [flag for flag in flags if not _reveals_mode(flag, reader.late)]

@@ -73,7 +73,7 @@ class World(Module):
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
-        # Measurements of which nothing is ever missing are marked, so that native code need not look for NaN.
+        # Measurements that always arrive in full are marked, so that native code need not look for NaN.
         z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
         # Draw which reports and messages between neighbours arrive; then step all filters.
         drawn: dict[str, PyTree] = {

@@ -202,7 +202,7 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
     these are yielded in its place.
 
     Raises:
-        BagDamagedError: a record that is longer than what is left.
+        BagDamagedError: a record that is longer than the rest of the file.
         Exception: whatever else damage leads to.
     """
     from rosbags.rosbag2.storage_mcap import decompress

@@ -150,7 +150,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         log-likelihood. -log P(sent), the same for all z, is not added here.
 
         Args:
-            innovation: of the value, as if it were sent always.
+            innovation: innovation of the value, as if values were always sent.
             link: E G (m, p) and Cov of (G, n) (m, m, p + 1, p + 1), for z = G y + n.
             signal: moments of y before the value.
             reference: r, with which the sender compares y (m,).

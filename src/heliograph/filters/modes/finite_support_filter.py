@@ -273,7 +273,7 @@ def _list_combinations(
     Args:
         sensor: C and v.
         modes: the links' modes, each with its law of G and n.
-        modes_before: those of the step before, which hold the transition to this step.
+        modes_before: modes of the step before, which hold the transition to this step.
         added_variance: variance that is added to each component of each noise.
 
     Raises:

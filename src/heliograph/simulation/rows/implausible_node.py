@@ -28,7 +28,7 @@ def blame_nodes_for_implausible_rows(
 
     Args:
         filters: the central filters, which receive from all nodes.
-        before: their states before each row, with a leading axis of rows.
+        before: states of these filters before each row, with a leading axis of rows.
         z: measurements by node, in the order in which the filters receive them, NaN where one is missing.
         u: inputs by row.
         why: rows that are implausible, with the reason.
@@ -37,7 +37,7 @@ def blame_nodes_for_implausible_rows(
     Returns:
         The rows of each node that is to blame, with the reason.
     """
-    # One trial for each implausible row and each of these nodes that has a value in it: the row without the node's.
+    # One trial for each implausible row and each node with a value in it: the row without the values of this node.
     removals = [_RowWithoutNode(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
     rows = np.array([removal.row for removal in removals], dtype=int)
     without = {name: values[rows] for name, values in z.items()}

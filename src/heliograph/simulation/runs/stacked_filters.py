@@ -50,7 +50,7 @@ def filter_step(
 
     Args:
         filter: the filter.
-        state: before the step.
+        state: state of the filter before the step.
         z: measurement (received,), NaN where a component is missing.
         u: inputs of the plant over the step.
         k: number of the step.
