@@ -271,7 +271,11 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
 
 
 def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
-    """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON."""
+    """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON.
+
+    Args:
+        learned: results of a fit of a network to a recording: `changes` by filter, and `losses` by node.
+    """
     # Each filter, on rows that were not fitted: gain of the log-likelihood per row; "size", the mean square of the
     # innovations over the claimed one; and "p", the p-value of their whiteness.
     filters: list[Json] = [

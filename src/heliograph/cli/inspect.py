@@ -49,7 +49,16 @@ def inspect(
 
 
 def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, TopicStatistics], str]":
-    """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files."""
+    """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files.
+
+    Args:
+        recording: path of a file or folder, or the URL of a broker.
+        seconds: how long to listen to a broker.
+        dbc: file that says which signals the frames of a CAN bus hold; None for none.
+
+    Returns:
+        Statistics by topic, and the first reason why something cannot be read, "" if all can be.
+    """
     from heliograph.files.logs.vehicle_log import is_log
     from heliograph.files.messages.folder_of_message_files import is_message_folder
     from heliograph.files.messages.message_files import LINES

@@ -45,8 +45,9 @@ class _InteriorPointState(NamedTuple):
 def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[jax.Array, " count"]:
     """Return the weights w >= 0, sum w = 1, that minimise tr P, P = (sum w_k J_k)^-1, for information matrices J_k.
 
-    By a primal-dual interior point method. The gradient is g_k = -tr(P J_k P); since tr P is convex in w, it exceeds
-    its minimum by at most max_k tr(P J_k P) - tr P. The iteration stops when this certificate is below GAP tr P.
+    J_k is the inverse of the k-th estimate's covariance. The method is a primal-dual interior point method. The
+    gradient is g_k = -tr(P J_k P); since tr P is convex in w, tr P exceeds its minimum by at most
+    max_k tr(P J_k P) - tr P. The iteration stops when this certificate is below GAP tr P.
     """
     count = information.shape[0]
     # In a unit in which traces are 1 on average: the first multipliers below are of that size.

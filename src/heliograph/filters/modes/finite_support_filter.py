@@ -140,7 +140,8 @@ class MixtureFilter(AbstractSizedFilter):
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching.
 
         A combination is one choice of the values of all gains and noises of finite support: it is a gain, an offset and
-        a Gaussian noise.
+        a Gaussian noise. The state holds the law of the links' modes and one Gaussian of x, which after the correction
+        has the mean and covariance of the mixture of all updates (moment matching).
         """
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
         prior = state.law[c.mode] * jnp.asarray(c.weight)  # P(combination) = P(mode) P(combination | mode)

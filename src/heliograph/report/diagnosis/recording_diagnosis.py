@@ -176,7 +176,8 @@ class Health:
 
         These are: outputs left out, a constant error, variances reported with messages (`declared`), an impossible
         innovation in a short recording, sizes other than claimed, and correlation in time (memory). A doubt that
-        explains later ones ends the list. `health.test` is the test of size and whiteness, None with too few rows.
+        explains later ones ends the list. `health` holds the innovations of one filter of a node and their tests:
+        `test` is that of size and whiteness, None with too few rows.
         """
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
