@@ -34,12 +34,14 @@ def inspect(
     from heliograph.numerics.check import TINY, scalar
 
     scalar("--seconds", seconds, TINY, 86400)
+    # Names of the numbers that each node receives, to be matched with the topics' fields.
     names: dict[str, tuple[str, ...]] = {}
     if network:
         from heliograph.files.network_file import load_network
 
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
+    # The table of topics, the sources that are suggested for them, and what could not be read.
     topics, broken = _collect_topics(recording, seconds, dbc)
     _print_table(topics)
     if topics:
@@ -67,6 +69,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
     from heliograph.report.progress import progress
 
     with progress(2) as advance:
+        # The URL of a broker; else by what the path is: a file of messages, a vehicle's log, a folder, or a bag.
         if "://" in recording:
             from heliograph.serving.brokers.broker_address import parse_address
             from heliograph.serving.brokers.broker_inspection import listen

@@ -106,6 +106,7 @@ def update_by_parts(
     """
     n, gains = len(rounding_variance), list[jax.Array]()
     first_part = len(root) - n  # number of the row of part 0
+    # Many parts: a loop in the traced program.
     if n > WRITTEN:
 
         def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -118,6 +119,7 @@ def update_by_parts(
         no_gains = jnp.zeros((len(root), n), root.dtype)
         root, d, _, all_gains = lax.fori_loop(0, n, measure_next, (root, d, rounding_variance, no_gains))
         return root, d, all_gains
+    # Few parts: the same, unrolled.
     for i in range(n):
         root, d, gain = measure_part(i, root, d, rounding_variance[i])
         rounding_variance = propagate_slope_rounding(rounding_variance, gain[first_part:], rounding_variance[i])

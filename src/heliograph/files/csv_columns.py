@@ -106,6 +106,7 @@ class CsvColumnReader:
             else:
                 numbers.append(row.number)
                 texts.append(row.cells)
+        # Columns of the names in `_only`, or of all if that is None.
         columns = dict[str, np.ndarray]()
         for i, name in enumerate(self.header):
             if self._only is None or name in self._only:

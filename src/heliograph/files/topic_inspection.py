@@ -332,6 +332,7 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
     Raises:
         ValueError: no such file, one that cannot be opened, a database that does not fit; one line.
     """
+    # All messages, by name: the units and bits of their signals, and the moments when they were logged.
     log = open_logs(path, LogSources({}, dbc=dbc), lambda name: True)
     topics, broken = dict[str, TopicStatistics](), ""
     for message in log.messages:
@@ -345,6 +346,7 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
             kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
             topics[name] = TopicStatistics(kind, list(units), measured_in=known, bits=bits)
         topics[name].logged.append(parse_arrival(message.arrival, message.where))
+    # Frames without a database have identifiers alone.
     if topics and not log.units:
         broken = broken or str(fail(str(path), "the database of its frames, to list signals (--dbc car.dbc)", "none"))
     return topics, broken

@@ -122,6 +122,7 @@ def separate_outlier_noise(
         _, last_hop_noise = step.detach_outliers()
         return describe_outlier_noise(sensor.noise, last_hop_noise, moments, independent)
 
+    # Once where sensor and channel are constant, else once for each step.
     moments: SecondOrder | OverTime = at_each_step(describe_without_outliers, channel)
     noise: ReceivedNoise | OverTime = at_each_step(describe_noise, sensor, channel, moments)
     return moments, noise

@@ -270,6 +270,7 @@ def combine_predictions(
     assert states is not None  # a filter always predicts its states
     filter, sensor = predictor.filter, first(predictor.sensor)
     angles = filter.angles_used() or FilterAngles((), ())
+    # Each prediction gets its own claim, and its angles between -pi and pi.
     predicted_outputs = predicted_received = None
     if outputs is not None:
         output_claim = find_output_claim(filter, predictor)

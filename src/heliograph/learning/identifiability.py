@@ -230,6 +230,7 @@ def _format_interval(
     """
     if solution is None or not all(solution.active[i] for i in group.places):
         return ""
+    # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unbounded coordinates.
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
     for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):

@@ -227,6 +227,7 @@ class Schedule(Module):
         """
         instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
+        # Sizes are read from two of the fields, and the shapes of all are checked against them.
         time, n, m = np.shape(gains.gain)
         q = np.shape(gains.output_offset)[-1]
         shape_of_field: dict[str, tuple[int, ...]] = {

@@ -103,8 +103,10 @@ def design_bits(network: Network, total: int) -> BitsDesign:
     instance("network", network, Network, "a Network").check_sends_each_step("design of bits")
     senders = _collect_plant_and_senders(network)
     budget, names = check_count("total bits", total), list(network.names)
+    # Bits (nodes,), and the steady trace of the filter's covariance with them.
     bits = _add_bits_greedily(senders, budget)
     error = _compute_steady_error(senders, _information_of_bits(senders, bits))
+    # Encoders with these bits and the ranges of before; nodes without bits send nothing.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     encoders = {
         name: Words(int(count), node.encoder.low, node.encoder.high, "subtracted")

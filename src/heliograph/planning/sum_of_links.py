@@ -115,6 +115,7 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
         sizes = _cap_amplitudes(np.abs(b), variances + nu * links.unit, links.floor - nu * total, caps)
         return np.asarray(np.sign(b) * sizes)
 
+    # At `low` the links send more than P, at `high` at most P.
     low, high = 0.0, links.floor / total
     for _ in range(HALVINGS):
         nu = (low + high) / 2

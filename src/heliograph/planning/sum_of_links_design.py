@@ -147,6 +147,7 @@ class SumOfLinksTask(NamedTuple):
         def error_at(x: Vector) -> float:
             return self.compute_error(amplitudes_at(x))
 
+        # Descend from `first`, if it is given, and from uniform draws in the box; keep the best end.
         generator = np.random.default_rng(self.seed)
         points = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
         if first is not None:

@@ -83,6 +83,7 @@ def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterat
         file.seek(len(MAGIC))
         try:
             for count, channel, logged, data, types in _yield_stored_messages(path, file, sources):
+                # Decode only what the sources read.
                 where = f"{path}, message {count}"
                 wanted = sources is None or bool(sources.of(channel.topic))
                 payload = _decode_payload(where, channel, types, data) if wanted else None

@@ -245,6 +245,7 @@ def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
     Raises:
         ValueError: a field of a type that is not read, or of another one than the schema's.
     """
+    # A single value has the wire type of the schema.
     expected = _find_wire_type(field)
     if wire == expected:
         return [value]

@@ -243,17 +243,20 @@ def _append_messages(
     marked = Counter[str]()
     for number, (connection, logged, data) in enumerate(batch, done + 1):
         topic, kind = connection.topic, connection.msgtype
+        # Decode the message; a decoder may raise any error at bad bytes.
         try:
             content = reader.deserialize(data, kind)
         except Exception as error:
             where = f"{path}, {topic}, logged at {format_moment(logged)}"
             table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
+        # Fields that the message itself marks as not valid become NaN, except where a source asks for none ({}).
         marked[topic] += blank_message(
             kind,
             content,
             {f for single in sources.of(topic) if single.source.valid != {} for f in single.source.fields},
         )
+        # Each source of the topic makes an event of it, or says why it cannot.
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):
                 where = f"{path}, message {number}, logged at {format_moment(logged)}"

@@ -125,6 +125,7 @@ def read_events(
         events = _read_table_of_own_format(source, network, strict, ignore_unknown)
     else:
         events = _read_by_topic(source, network, checked, strict)
+    # Note what the sources left out, and judge the events as a whole, such as time stamps that were never set.
     if checked is not None:
         _note_left_out(source, checked, events)
     events.finish(str(source), strict)

@@ -131,6 +131,7 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
     """
     from heliograph.numerics.check import fail
 
+    # The table's option, and all others, one of which may be InfluxDB's organisation.
     decoded = [unquote(option) for option in options.split("&") if option]
     tables = [option.removeprefix("table=") for option in decoded if option.startswith("table=")]
     others = [option for option in decoded if not option.startswith("table=")]

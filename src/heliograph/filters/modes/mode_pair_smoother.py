@@ -89,6 +89,8 @@ def move_pairs(
         f(x, u) is described by its slopes in x and the covariance that they do not explain. `transform` gives these for
         a nonlinear f. u is the input. `initial_power` is E[x_i^2] at the start, for rounding.
         """
+        # With x = m + L xi, the next state is mean + slopes xi + (what xi does not explain: error of f's linearisation
+        # and noise).
         image = find_transition_moments(plant, transform, x, u)
         unexplained = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
         mean = image.mean + plant.noise_mean()

@@ -65,6 +65,7 @@ def sum_mixtures(
     present, m = ~jnp.isnan(z), len(z)
     # d (B, Gaussians, m) = (z - expected) - base; then particles and Gaussians become one axis.
     d = wrap_near(z - predicted.expected - base, jnp.zeros(m), angles)
+    # Gaussians without a finite innovation get the weight 0, and zeros in place of NaN.
     is_valid = jnp.all(jnp.isfinite(d) | ~present, axis=-1)
     w = jnp.where(is_valid, weight[:, None] * predicted.share, 0.0).ravel()
     d = jnp.where(is_valid[..., None], d, 0.0).reshape(-1, m)

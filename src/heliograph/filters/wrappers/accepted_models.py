@@ -36,6 +36,7 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 
         `make` is the function that makes the filter, and `parameters` its signature.
         """
+        # Without limits, or without a plant (the function itself refuses that), nothing is changed.
         bound = parameters.bind(*args, **kwargs)
         plant = bound.arguments.get("plant")
         start = first(plant)

@@ -81,6 +81,7 @@ def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterCo
     # The axis of filters is the third from last of means (filter, node, n), the fourth of covariances.
     mean = split_by_name(network, numbered, attrgetter("mean"), axis=-3)
     covariance = split_by_name(network, numbered, attrgetter("covariance"), axis=-4)
+    # Columns of judgements, of weighed innovations, of mode probabilities (first, last + 1), and of a centre's tests.
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     modes = {
         name: (int(columns[0]), int(columns[-1]) + 1)

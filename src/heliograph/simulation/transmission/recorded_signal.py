@@ -103,6 +103,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, least=0)]
         values, delays = _separate_delays(name, network.nodes[name], values)
+        # A row arrived if any of its numbers did, and its delay is known; it was sent at step k - delay.
         arrived = ~np.isnan(values).all(axis=1) & ~np.isnan(delays)
         for k in np.flatnonzero(arrived):
             sent = int(k - delays[k])
