@@ -102,7 +102,12 @@ def write_literal(value: float | int | bool, type: Type, real: Real) -> str:
 def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     """Return the C expression of a node's operation on arguments, which are names and literals.
 
-    `real` is the type of C for numbers that are f64 in the graph.
+    Operations that depend on the types are written first, then those of the tables by operation.
+
+    Args:
+        node: an operation of the program's graph, with its type and its arguments' types.
+        arguments: C texts of its arguments.
+        real: type of C for numbers that are f64 in the graph, "double" or "float".
 
     Raises:
         Unsupported: an operation that C does not have.

@@ -84,7 +84,7 @@ def lower_traced(
         traced: the program, in single precision or in double.
         tree: the structure of its results.
         most: operations above which it is refused.
-        known: by the number of the argument, which of its entries are the same in every call, and these numbers.
+        known: by number of an argument, a mask of the entries that are the same in every call, and these numbers.
         single: whether numbers are float32.
     """
     lowering = Lowering(most)
@@ -92,7 +92,7 @@ def lower_traced(
     inputs, values = [], []  # of each argument its memory, and the array that the program computes with
     for number, aval in enumerate(shapes_and_types):
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
-        shape = (*aval.shape, 2) if is_key else aval.shape  # a key is two words
+        shape = (*aval.shape, 2) if is_key else aval.shape  # a random key is two numbers of 32 bits
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
         view = StridedArray.of_whole_buffer(buffer)
         inputs.append(buffer)

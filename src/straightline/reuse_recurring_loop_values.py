@@ -311,16 +311,21 @@ def _choose_ring_row(
 def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], restarts: Node) -> Node:
     """Return whether the next values of carried numbers have the bits that these numbers had before row 0 of the ring.
 
-    Then the iterations since row 0 are a cycle. Bits are compared rather than numbers, so that NaN equals itself.
+    The ring buffer holds one row of computed values for each of the last iterations. If the carried numbers are again
+    what they were before row 0, the loop is in a cycle, and later values can be read from the ring. Bits are compared
+    rather than numbers, so that NaN equals itself.
 
     Args:
         graph: the program; its open block is executed when the recurring numbers are computed.
         loop: the loop.
         carried: which of the numbers that it carries, by number in the carry.
         restarts: whether this iteration fills row 0, so that its carried numbers must be stored.
+
+    Returns:
+        A node of the graph: a flag that the program computes in each iteration.
     """
     block, zero = graph.current, graph.constant(0, "i64")
-    # The bits before row 0: a ring of one row, which only such an iteration fills.
+    # The bits before row 0: a ring of one row, which is filled in a guarded block, run only where `restarts` is true.
     types = [INTEGERS.get(loop.parameters[k].type, loop.parameters[k].type) for k in carried]
     start_bits = RingBuffer(graph, types, loop, rows=1)
     guard = Guard(Block(block, pinned=True), restarts)

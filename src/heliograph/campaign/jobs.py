@@ -150,10 +150,11 @@ def _drop_old_programs(network: Network) -> None:
 def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarray]:
     """Return the reducer's results by variable of the store, on its axes (run, time, node, filter, ...).
 
-    NaN where a node lacks a filter.
+    A node without a filter has NaN in its place.
 
     Args:
-        recorded: as `ErrorReducer` returns it, by node and filter.
+        recorded: "estimates" by node and filter, with "error", "variance" and "nees_per_dimension" (run, time, ...);
+            if whole trajectories are kept, also "truth" and the "measurements" by node.
         labels: names along the axes of the store.
     """
     estimates = recorded["estimates"]

@@ -210,12 +210,12 @@ def _create_array(
 
     Args:
         group: the store.
-        name: of the array.
-        axes: their names.
-        shape: their lengths.
-        chunks: lengths of a chunk, which is one file.
-        fill: value of what is not written; a text makes an array of texts.
-        attributes: what is said of the array.
+        name: name of the array.
+        axes: names of its axes.
+        shape: lengths of its axes.
+        chunks: lengths of a chunk along the axes; a chunk is one file.
+        fill: value of entries that were never written; a text makes an array of texts.
+        attributes: metadata of the array, such as its unit.
         kind: type of the numbers.
     """
     is_text = isinstance(fill, str)

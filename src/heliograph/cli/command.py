@@ -71,7 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run_command(arguments: Sequence[str] | None) -> int:
-    """Parse the arguments and run their command; return the exit status. What a user can mend is one line on stderr."""
+    """Parse the arguments and run their command; return the exit status. What a user can mend is one line on stderr.
+
+    These are errors in the arguments, input that cannot be used (InputError), files, and packages that are missing. Any
+    other error is a defect of the package and is raised, with its traceback.
+    """
     with suppress(ValueError):  # where the user's home cannot be written to everything is compiled again
         keep_compilations()
     try:

@@ -271,8 +271,13 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
 
 
 def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
-    """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON."""
-    # Each filter: gain of the log-likelihood per row, size and whiteness of its innovations.
+    """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON.
+
+    Args:
+        learned: results of a fit of a network to a recording: `changes` by filter, and `losses` by node.
+    """
+    # Each filter, on rows that were not fitted: gain of the log-likelihood per row; "size", the mean square of the
+    # innovations over the claimed one; and "p", the p-value of their whiteness.
     filters: list[Json] = [
         {
             "node": change.node,
@@ -286,7 +291,8 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
         }
         for change in learned.changes
     ]
-    # Each node: numbers of packets, the best law, and the shares of all laws.
+    # Each node: numbers of packets, the law of losses that predicts best, the p-value of independent losses, the
+    # probabilities of each fitted law, and each law's gain on packets that were not fitted.
     losses: dict[str, Json] = {
         name: {
             "packets": loss.packets,

@@ -34,12 +34,14 @@ def inspect(
     from heliograph.numerics.check import TINY, scalar
 
     scalar("--seconds", seconds, TINY, 86400)
+    # Names of the numbers that each node receives, to be matched with the topics' fields.
     names: dict[str, tuple[str, ...]] = {}
     if network:
         from heliograph.files.network_file import load_network
 
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
+    # The table of topics, the sources that are suggested for them, and what could not be read.
     topics, broken = _collect_topics(recording, seconds, dbc)
     _print_table(topics)
     if topics:
@@ -49,7 +51,16 @@ def inspect(
 
 
 def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, TopicStatistics], str]":
-    """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files."""
+    """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files.
+
+    Args:
+        recording: path of a file or folder, or the URL of a broker.
+        seconds: how long to listen to a broker.
+        dbc: file that says which signals the frames of a CAN bus hold; None for none.
+
+    Returns:
+        Statistics by topic, and the first reason why something cannot be read, "" if all can be.
+    """
     from heliograph.files.logs.vehicle_log import is_log
     from heliograph.files.messages.folder_of_message_files import is_message_folder
     from heliograph.files.messages.message_files import LINES
@@ -58,6 +69,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
     from heliograph.report.progress import progress
 
     with progress(2) as advance:
+        # The URL of a broker; else by what the path is: a file of messages, a vehicle's log, a folder, or a bag.
         if "://" in recording:
             from heliograph.serving.brokers.broker_address import parse_address
             from heliograph.serving.brokers.broker_inspection import listen

@@ -71,7 +71,11 @@ class ServeOptions:
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False
 
     def settings(self, reference: str) -> "ServiceSettings":
-        """Load the network, and return the settings of its service."""
+        """Load the network, and return the settings of its service, from the options of the command line.
+
+        Args:
+            reference: the Python file of the network, as FILE or FILE:NAME.
+        """
         from heliograph.files.network_file import load_module
         from heliograph.live.fleet import Options
         from heliograph.numerics.times.dates import horizons_in

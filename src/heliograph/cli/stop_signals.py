@@ -22,8 +22,11 @@ SOON = 0.01  # seconds
 def unwind_on_signals(stopped: list[int]) -> Iterator[None]:
     """Let SIGINT and SIGTERM unwind the running code, so that no temporary file is left; record each in `stopped`.
 
-    An exception that is raised in a callback of the compiler, or in a destructor, does not get out of it: Python only
-    reports it. An interrupt that ends so is raised again by a timer.
+    A signal raises KeyboardInterrupt. If it comes while a callback of the compiler or a destructor runs, Python only
+    reports the exception (`sys.unraisablehook`) and goes on. Such an interrupt is raised again by a timer.
+
+    Args:
+        stopped: list to which the number of each signal is appended.
     """
 
     def interrupt(number: int, _: FrameType | None) -> NoReturn:

@@ -97,9 +97,9 @@ def run_studies(
     """Run studies of a kind one after another, each into its own folder in `out`.
 
     Args:
-        names: of the studies.
-        out: the folder; if it is named `own_folder` it is the study's own.
-        values: other settings, by name.
+        names: names of the studies.
+        out: the folder of the results; if it is named `own_folder` it is the study's own.
+        values: settings that differ from the study's own, as texts by name.
         kind: "publication" or "example".
         own_folder: name of the study's own folder; that of the first study by default.
 

@@ -114,11 +114,16 @@ def _generate_inputs_check(program: StepProgram) -> list[str]:
 
 
 def _generate_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
-    """Return the statements of C that compute a part, refuse what is wrong, and then write all that changed.
+    """Return the C statements of one part of a step: compute it, refuse a bad result, and then write the state.
 
-    `number` is that of the part: of the whole step or the prediction 0, of the correction 1. All is computed into
-    `after`, a copy of the state. A refusal returns its code: 4 the estimate would not be finite, 5 it would lose its
-    digits, 6 the inputs are none.
+    All is computed into `after`, a struct like the state, so that a refusal changes nothing. A refusal returns its
+    code: 4 the estimate would not be finite, 5 it would lose its digits, 6 the inputs are none.
+
+    Args:
+        program: the step as C functions; `beside` of a part names results other than the state, such as the flags
+            "implausible" (code 5) and "spoilt" (code 6).
+        number: 0 for the whole step or the prediction, 1 for the correction.
+        prefix: beginning of all C names.
     """
     part, code = program.parts[number], program.computes[number]
     is_correction = part.name == "correct"

@@ -59,8 +59,9 @@ def generate_header_and_source(program: StepProgram, form: CTextOptions) -> CTex
     """Return header and source of a step in C, with its counts of operations and bytes.
 
     Args:
-        program: the step, as functions of C.
-        form: names and options of the text.
+        program: the filter's step, as functions of C, and the arrays of the state (`members`).
+        form: the prefix of all names, the C type of numbers (`real`), the names of z's components, a description, and
+            how many steps late a measurement may be (`late`; None for none).
     """
     prefix, real = form.prefix, form.real
     # The struct of the state: (C type, name, count of numbers) of each member, then the step's number. The type of a
@@ -128,8 +129,8 @@ def _generate_header_comment(program: StepProgram, form: CTextOptions, window: W
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold.
 
     Args:
-        program: the step, as functions of C.
-        form: names and options of the text.
+        program: the filter's step, as functions of C.
+        form: the prefix of all names, the C type of numbers (`real`), the names of z's components, and a description.
         window: the functions for measurements that come late; None where there are none.
     """
     filter, prefix, claim = program.filter, form.prefix, find_claim_at_precision(program.filter, form.real)

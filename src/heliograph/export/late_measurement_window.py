@@ -86,14 +86,17 @@ class WindowText(NamedTuple):
 
 
 def generate_window_code(program: StepProgram, steps: int, state: StructLayout, prefix: str, real: Real) -> WindowText:
-    """Return the text of the window of a filter whose plant counts steps, or has a time step among its inputs.
+    """Return the C text of the window: the newest rows, stored so that a late measurement can be filtered in its place.
+
+    The plant counts steps, or has a time step among its inputs. The window keeps the state before each row, and the
+    row's measurement and inputs: with a late value in its row, the filter is run again from there.
 
     Args:
-        program: the step.
+        program: the step, as functions of C.
         steps: how many rows before the newest one a measurement may be late.
-        state: layout of the filter's state.
-        prefix: of all names.
-        real: type of numbers.
+        state: size and alignment in bytes of the filter's state.
+        prefix: beginning of all C names.
+        real: C type of the numbers.
     """
     filter = program.filter
     inputs, received = filter.inputs, filter.received

@@ -197,18 +197,18 @@ def _lower_part_to_c(
 def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
     """Lower to C, and return, the function that makes the members of a state from a mean and a covariance.
 
-    Its last result, `none`, is a flag: the arguments are no finite mean, or no covariance. The state keeps factors of
-    the covariance. An indefinite matrix is changed by its factoring, so the product of these factors differs from it:
-    by this it is refused.
+    Members are the arrays of the filter's state as a C struct. The last result, `none`, is a flag: the arguments are no
+    finite mean, or no covariance. The state keeps factors of the covariance. An indefinite matrix is changed by its
+    factoring, so that the product of the factors differs from it: this sets the flag.
 
     The results have the names of those of a step, `next_` and the member's, since both write the members of a state.
 
     Args:
         filter: the filter.
-        kept: which arrays of state and estimate are members.
-        names: of the members.
-        prefix: of the function's name.
-        real: type of its numbers.
+        kept: numbers of the members among the arrays of the state, the estimate's mean and its covariance.
+        names: names of the members.
+        prefix: beginning of the function's name.
+        real: C type of its numbers, "float" or "double".
     """
     make_state = centred_from_covariance if isinstance(filter.init(), SplitMeanGaussian) else from_covariance
 

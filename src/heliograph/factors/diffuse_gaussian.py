@@ -88,15 +88,16 @@ class FiniteAndInfiniteWeights(NamedTuple):
 def triangularise_both_levels(
     rows: jax.Array, weights: FiniteAndInfiniteWeights, count: int, whole: jax.Array | None = None
 ) -> tuple[jax.Array, FiniteAndInfiniteWeights, jax.Array]:
-    """Make the first `count` rows (c columns) orthogonal in the weights w, from the first down.
+    """Factor A diag(w) A' = L diag(d) L' by Gram-Schmidt on the rows of A, where some weights w are infinite.
 
-    Let a be row j and s = sum of w a^2 over the infinite columns. If s is more than rounding, d_inf,j = s and
-    L_ij = (row i, a) / s over these columns alone. Else their entries of a are set to 0, and d_j and L_ij are the same
-    sums over the finite columns. Then each row i below becomes row i - L_ij a.
+    Column k of A is a direction of variance w_k, or of kappa w_k with kappa to infinity (an infinite column). Row after
+    row, let a be row j and s = sum of w a^2 over the infinite columns. If s is more than rounding, d_inf,j = s and
+    L_ij = sum w (row i) a / s over these columns alone. Else their entries of a are set to 0, and d_j and L_ij are the
+    same sums over the finite columns. Then each row i below becomes row i - L_ij a.
 
     Args:
         rows: (rows, c).
-        weights: of the columns (c,).
+        weights: finite and infinite weights of the columns (c,) each; one of the two is 0.
         count: how many rows are made orthogonal.
         whole: squares (rows,) of the rows in the infinite columns before anything was subtracted, which rounding is a
             share of; by default those of `rows`.
@@ -107,6 +108,7 @@ def triangularise_both_levels(
     whole = rows**2 @ weights.infinite if whole is None else whole
     columns, finite, infinite, numbers = [], [], [], np.arange(len(rows))
     for j in range(count):
+        # s over the infinite columns, which counts as rounding up to the share FALLEN of the row's first square.
         infinite_s = rows[j] ** 2 @ weights.infinite
         is_infinite = infinite_s > FALLEN * whole[j]
         row = jnp.where((weights.infinite > 0) & ~is_infinite, 0.0, rows[j])
@@ -178,12 +180,13 @@ def observe_diffuse(
 ) -> tuple[Diffuse, MeasurementLikelihood]:
     """Condition x on z = H x + v; return its law given z, and the likelihood of z.
 
-    A component that shows an unknown direction, and so has an infinite variance kappa s_inf, adds -1/2 log s_inf to the
-    log-likelihood, and any other log N(e; 0, s). Their sum is the log of the integral of p(z | delta) over the unknown
-    delta.
+    The covariance of x is P + kappa P_inf in the limit of a large kappa: directions of P_inf are unknown. A component
+    of z that shows an unknown direction has the infinite variance kappa s_inf and adds -1/2 log s_inf to the
+    log-likelihood; any other, with the innovation e of variance s, adds log N(e; 0, s). Their sum is the log of the
+    integral of p(z | delta) over the position delta in the unknown directions.
 
     Args:
-        x: the state's law.
+        x: mean, and factors of both covariances, L diag(d) L' and L diag(d_inf) L'.
         matrix: H (m, n).
         innovation: z - H m - E v (m,), m the mean of x; NaN where a component did not arrive.
         noise: Cov v.
@@ -196,6 +199,7 @@ def observe_diffuse(
     # `correction` is the change of the mean by the components so far.
     correction, log_likelihood, shows_unknown = jnp.zeros_like(state.mean), jnp.asarray(0.0), []
     for i in range(len(innovation)):
+        # `s` is s_inf if the component shows an unknown direction (`shows`), else the variance of its innovation.
         h = rows[i, :-1]
         state, gain, s, shows = _observe_scalar(state, h, noises[i])
         e = rows[i, -1] - h @ correction  # innovation of component i given those before it

@@ -63,17 +63,37 @@ def measure_beside_noises(
     present: jax.Array,
     least: jax.Array,
 ) -> Measured:
-    """Compute `measure_uncorrelated` with omega as more columns, so that a component has no other noise."""
+    """Condition x = m + L xi on z = E z + slopes xi + N omega, one component at a time, omega beside xi as unknowns.
+
+    The noises omega become columns of the factor, as the noise of one component also enters later ones. Each component
+    is then measured without further noise. `measure_uncorrelated` gives the same results by decorrelating z first.
+
+    Args:
+        root: L (n, n), the factor of Cov x = L diag(d) L'.
+        d: variances (n,) of xi.
+        mean: m (n,).
+        rows: slopes (m, n), and z - E z as a last column; 0 of a missing component.
+        noise: N (m, m), unit lower triangular, and the variances r (m,) of omega.
+        present: which components arrived (m,).
+        least: variance (m,) up to which slopes are nothing but rounding.
+
+    Returns:
+        Rows (n + m, n) and variances (n,) of xi given all components; the mean (n,), and below it what remains of
+        z - E z, times -1; the m innovations, each given the components before it, and their variances.
+    """
     n, m = len(d), len(present)
+    # Rows [[L, 0], [slopes, N]] on the unknowns (xi, omega), of variances (d, r). A missing component has no noise.
     N, r = jnp.where(present[:, None], noise.matrix, 0.0), jnp.where(present, noise.weights, 0.0)
     of_state = jnp.concatenate([root, jnp.zeros((n, m), N.dtype)], axis=1)
     root = jnp.concatenate([of_state, jnp.concatenate([rows[:, :n], N], axis=1)])
+    # The mean and -(z - E z) below it change alike: both gain (their row's gain) times the innovation.
     news, d = jnp.concatenate([mean, -rows[:, n]]), jnp.concatenate([d, r])
     innovations, variances = list[jax.Array](), list[jax.Array]()
     for i in range(m):
-        f = root[n + i]
+        f = root[n + i]  # slopes of component i on (xi, omega), given the components before it
+        # Where earlier components leave only rounding of the state's slopes, a huge noise makes the component change
+        # nothing. A missing component has slopes of 0, and noise 1 so that nothing is divided by 0.
         is_rounding = spoils_what_is_known(d[:n] @ f[:n] ** 2, least[i], r[i]) if i else jnp.asarray(False)
-        # Of what is missing all slopes are 0, and the noise is 1.
         other_noise = jnp.where(is_rounding, noise_beside_rounding(n, least[i]), jnp.where(present[i], 0.0, 1.0))
         root, d, gain, total = update_by_scalar(root, d, f, other_noise)
         total = jnp.where(is_rounding, r[i], total)

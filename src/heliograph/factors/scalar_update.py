@@ -61,10 +61,10 @@ def update_root_columns(
 
     Args:
         root: V (rows, n), zero above its diagonal; V_j is its column j.
-        d: variances (n,) of xi.
+        d: variances d_k (n,) of the uncorrelated xi.
         product: d_k f_k (n,).
-        f: slopes (n,).
-        s: sums s_0 ... s_n (n + 1,).
+        f: slopes f_k (n,) of the measurement in xi.
+        s: sums s_0 ... s_n (n + 1,), of which s_n = Var v and s_0 is the variance of the innovation.
     """
     n, is_lower = len(d), np.tril(np.ones(root.shape, bool))
     # Column j of w is w_j.
@@ -89,28 +89,28 @@ def update_by_parts(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Measure n parts of a vector one after another; return the rows of the factor, the variances d and all gains.
 
-    Up to WRITTEN parts are written out, more are measured in a loop, so that the program stays short.
+    x = V xi with Cov xi = diag(d). Part i is the scalar f_i' xi, whose slopes f_i are a row below those of V, so that
+    each measurement changes the slopes of the later parts like rows of V. Up to WRITTEN parts are unrolled in the
+    traced program; more are measured in a loop, so that the program stays short.
 
     Args:
         measure_part: from the part's number, the rows, the variances and its entry of `rounding_variance` to the rows
             and the variances given the part, and its gain (rows,).
         root: rows (rows, columns) of x, and below them those of the n parts.
         d: variances (columns,).
-        rounding_variance: variance (n,) up to which a part's slopes are rounding (`propagate_slope_rounding`).
+        rounding_variance: variance f_i' diag(d) f_i (n,) up to which the slopes of part i are nothing but rounding. It
+            grows with each measurement, which changes the slopes by slopes that are rounded too.
 
     Returns:
         Rows, variances, and gains (rows, n), a column for each part.
     """
     n, gains = len(rounding_variance), list[jax.Array]()
     first_part = len(root) - n  # number of the row of part 0
+    # Many parts: a loop in the traced program.
     if n > WRITTEN:
 
         def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            """Measure part i of a vector of n, and put its gain into column i of the gains.
-
-            `rounding_variance` (n,) are the variances up to which a part's slopes are rounding. Row `first_part` is
-            that of part 0.
-            """
+            """Measure part i, and put its gain into column i of the gains (rows, n)."""
             root, d, rounding_variance, gains = carry
             root, d, gain = measure_part(i, root, d, rounding_variance[i])
             gains = jnp.where(np.arange(n) == i, gain[:, None], gains)
@@ -119,6 +119,7 @@ def update_by_parts(
         no_gains = jnp.zeros((len(root), n), root.dtype)
         root, d, _, all_gains = lax.fori_loop(0, n, measure_next, (root, d, rounding_variance, no_gains))
         return root, d, all_gains
+    # Few parts: the same, unrolled.
     for i in range(n):
         root, d, gain = measure_part(i, root, d, rounding_variance[i])
         rounding_variance = propagate_slope_rounding(rounding_variance, gain[first_part:], rounding_variance[i])

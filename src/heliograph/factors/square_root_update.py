@@ -46,16 +46,16 @@ def observe_root(
     output: Float[np.ndarray, "*items m n"],
     noise: Float[np.ndarray, "*items m d"],
 ) -> ObservedRoot:
-    """Condition x of covariance W W' on z = C x + v, Cov v = N N'; return the gain K (n, m) and a root of what is left.
+    """Condition x of covariance W W' on z = C x + v, Cov v = N N'; return the gain K (n, m) and a root of Cov(x | z).
 
     [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C W W' C' + N N': sums of squares alone,
-    each row known to eps of its length. A component of z of whose variance the components before it leave less than the
-    share RANK is dependent: it has the gain zero, since a given covariance is not known to more digits.
+    so each row is known to eps of its length. A component of z is dependent if at most the share RANK of its variance
+    remains given the components before it: that rest may be rounding, so it gets the gain zero.
 
     Args:
-        root: W, for each item.
-        output: C.
-        noise: N.
+        root: W (n, c) for each item of a batch.
+        output: C (m, n).
+        noise: N (m, d).
 
     Source: Morf and Kailath, Square-root algorithms for least-squares estimation (1975).
     """
@@ -66,7 +66,7 @@ def observe_root(
     rows[..., :m, : noise.shape[-1]] = noise
     rows[..., :m, noise.shape[-1] : columns] = output_root
     rows[..., m:, noise.shape[-1] : columns] = root
-    # Dependent components are moved behind the others: what rounding left of them would else take from these.
+    # Dependent components are moved after the others: else their rounding would take a part of these.
     independent = _find_independent_rows(rows[..., :m, :columns])
     order = None if independent.all() else np.argsort(~independent, axis=-1, kind="stable")
     if order is not None:
@@ -77,7 +77,7 @@ def observe_root(
     lower = upper.swapaxes(-1, -2)
     v, k_v = lower[..., :m, :m], lower[..., m:, :m]
     gain = _solve_for_gain(v, k_v, independent)
-    # The columns of K V that no gain uses stay in the root of what is left.
+    # The columns of K V for dependent components were used by no gain: they stay in the root beside W+.
     unused = np.where(independent[..., None, :], 0.0, k_v)
     if order is not None:  # the gain's columns in the order of z again, by the inverse of the permutation
         gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)

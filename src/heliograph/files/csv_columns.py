@@ -82,7 +82,10 @@ class CsvColumnReader:
         self._zoned = dict[str, bool]()  # for each column of dates whether these have a time zone
 
     def read(self, rows: Iterable[CsvRow | InputError]) -> TableRows:
-        """Return the rows that can be read, as columns; why the others cannot.
+        """Return the rows that can be read as columns by name with their numbers in the file, and errors of the others.
+
+        Args:
+            rows: for each row of the file its number and its cells, or the error for which it could not be split.
 
         Raises:
             ValueError: another header than before; where reading is strict, a row that cannot be read.
@@ -103,6 +106,7 @@ class CsvColumnReader:
             else:
                 numbers.append(row.number)
                 texts.append(row.cells)
+        # Columns of the names in `_only`, or of all if that is None.
         columns = dict[str, np.ndarray]()
         for i, name in enumerate(self.header):
             if self._only is None or name in self._only:

@@ -254,9 +254,9 @@ def _judge_repeated_events(
     """Write the verdicts on copies, and on second values of a node in a joint row: the first event stays.
 
     Args:
-        verdicts: verdicts on all events, which are changed.
+        verdicts: verdicts on all events, such as USED, changed here to DUPLICATE (same values) or CONFLICT (others).
         numbers: numbers of the events to judge, in order of arrival.
-        identities: for each of these, a number that stands for its node, time and count.
+        identities: for each, a number for its node, time and count; later events of one identity are repetitions.
         places: for each, a number that stands for its row and node if rows are joint, else its identity.
         values: the values of the event with a number.
         joint: whether all events of one time are one row.

@@ -165,7 +165,7 @@ class EventTable:
         self.reasons += [str(error)] if len(self.reasons) < 3 else []
 
     def finish(self, source: str, strict: bool = False) -> None:
-        """End the reading of a source: leave out stamps that were not set; say what was left out.
+        """End the reading of a source: leave out events whose time stamp was not set, and note what was left out.
 
         A stamp more than a year before its arrival, or far from all others, counts as not set, unless most of a node's
         stamps are like that: then its clock is another one. Step numbers are no stamps, and not looked at.

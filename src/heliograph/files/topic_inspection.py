@@ -332,11 +332,13 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
 
     Args:
         path: the log, or a folder with several.
-        dbc: database of its bus; None where it needs none, or for the identifiers alone.
+        dbc: file (.dbc) that says which signals the frames of the CAN bus hold. None for a log that has this itself, or
+            to list the identifiers of the frames alone.
 
     Raises:
         ValueError: no such file, one that cannot be opened, a database that does not fit; one line.
     """
+    # All messages, by name: the units and bits of their signals, and the moments when they were logged.
     log = open_logs(path, LogSources({}, dbc=dbc), lambda name: True)
     topics, broken = dict[str, TopicStatistics](), ""
     for message in log.messages:
@@ -350,6 +352,7 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
             kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
             topics[name] = TopicStatistics(kind, list(units), measured_in=known, bits=bits)
         topics[name].logged.append(parse_arrival(message.arrival, message.where))
+    # Frames without a database have identifiers alone.
     if topics and not log.units:
         broken = broken or str(fail(str(path), "the database of its frames, to list signals (--dbc car.dbc)", "none"))
     return topics, broken

@@ -294,8 +294,8 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, 
     """Judge a measurement z (m,), some of it `angles`, by its innovation e = z - expected and its covariance S.
 
     Far: components with |z| > |expected| whose squared distance e' S^-1 e exceeds `largest_plausible_distance`.
-    Excluded: every component is determined by the model (no variance), and one of them differs; or, for a mixture
-    (`of_atoms`), the likelihood of z is 0 in each component.
+    Excluded: every component is determined by the model (no variance), and one of them differs; or, for a filter that
+    is a mixture (`of_atoms`), z has the likelihood 0 under each Gaussian of it.
     """
     value, covariance, z = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance), jnp.asarray(z)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements

@@ -96,10 +96,17 @@ class ReceivedNoise(Module):
 def separate_outlier_noise(
     sensor: AnySensor, channel: Channel, independent: bool
 ) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
-    """Split a channel's description: moments of z without the noise that may hold outliers, and that noise.
+    """Describe the received z = G y + n by its moments without the last hop's outliers, and by the noise with outliers.
 
-    The noise is that of the sensor and of the last hop, as it arrives at the filter. `independent`: whether its
-    components must be independent, since the filter uses them one after another.
+    A robust filter weighs the noise that may hold outliers by its full law, and all else by mean and covariance. The
+    noise is that of the sensor and of the channel's last hop, as it arrives at the filter. A channel that varies over
+    time gives a description for each step (`OverTime`).
+
+    Args:
+        sensor: gives the noise of y.
+        channel: gives the random gain G and the noise n.
+        independent: whether the components of the noise must be independent, as for a filter that uses them one after
+            another.
 
     Raises:
         ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
@@ -115,6 +122,7 @@ def separate_outlier_noise(
         _, last_hop_noise = step.detach_outliers()
         return describe_outlier_noise(sensor.noise, last_hop_noise, moments, independent)
 
+    # Once where sensor and channel are constant, else once for each step.
     moments: SecondOrder | OverTime = at_each_step(describe_without_outliers, channel)
     noise: ReceivedNoise | OverTime = at_each_step(describe_noise, sensor, channel, moments)
     return moments, noise

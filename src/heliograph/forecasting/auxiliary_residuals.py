@@ -136,8 +136,8 @@ def disturbances(
     predicted = predict_rows(filter, rows, inputs)
     if not _is_received_unchanged(predicted):
         raise fail("disturbances", "a filter whose channel hands on what is measured", "one with gains or noise")
-    # Both noises given all data, from the innovations e of the filter's predictions. The filter predicts what arrives,
-    # which here is what is measured.
+    # Estimates of both noises given all data, with their covariances if the model is right, from the innovations e of
+    # the filter's predictions. The filter predicts what arrives, which here is what is measured.
     C, R = np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
     A, Q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)  # type: ignore[union-attr]  # a Gaussian's
     assert predicted.received is not None

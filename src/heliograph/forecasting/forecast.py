@@ -151,7 +151,7 @@ def _find_filter(
     """
     states_by_kind, states_of_central, *_ = origin.state
     if (node, name) in network.places:
-        # One after another: each filter of the kind, and for it each node of the kind's group of nodes.
+        # A kind stacks filters of one structure: filter after filter, and for each the nodes of the kind's group.
         kind, filter_of_kind, node_of_group = network.places[node, name]
         nodes_in_group = len(network.groups[network.kinds[kind].group])
         index = filter_of_kind * nodes_in_group + node_of_group
@@ -254,18 +254,23 @@ def combine_predictions(
 ) -> Forecast:
     """Return a forecast with the filter's claims, from moments of the states, the outputs and what arrives.
 
+    A claim says what a covariance is: exact, an upper bound, nominal, or none. Those of the outputs and of what arrives
+    may be weaker than that of the states.
+
     Args:
-        predictor: the filter's predictor.
-        moments: of the states, the outputs and what arrives, at each horizon; None where it is not predicted.
+        predictor: the filter, its sensor and the limits of the states.
+        moments: means and covariances at each horizon of the states, the sensor's outputs, and the numbers that arrive
+            through the channel; None where they are not predicted.
         received_names: names of the numbers that arrive.
         steps: how far ahead each horizon is.
-        time: of each horizon.
+        time: time of each horizon.
         inputs: whether inputs were "given" or "held"; "none" of a plant without.
     """
     states, outputs, received = moments
     assert states is not None  # a filter always predicts its states
     filter, sensor = predictor.filter, first(predictor.sensor)
     angles = filter.angles_used() or FilterAngles((), ())
+    # Each prediction gets its own claim, and its angles between -pi and pi.
     predicted_outputs = predicted_received = None
     if outputs is not None:
         output_claim = find_output_claim(filter, predictor)

@@ -45,8 +45,9 @@ class _InteriorPointState(NamedTuple):
 def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[jax.Array, " count"]:
     """Return the weights w >= 0, sum w = 1, that minimise tr P, P = (sum w_k J_k)^-1, for information matrices J_k.
 
-    By a primal-dual interior point method. The gradient is g_k = -tr(P J_k P); since tr P is convex in w, it exceeds
-    its minimum by at most max_k tr(P J_k P) - tr P. The iteration stops when this certificate is below GAP tr P.
+    J_k is the inverse of the k-th estimate's covariance. The method is a primal-dual interior point method. The
+    gradient is g_k = -tr(P J_k P); since tr P is convex in w, tr P exceeds its minimum by at most
+    max_k tr(P J_k P) - tr P. The iteration stops when this certificate is below GAP tr P.
     """
     count = information.shape[0]
     # In a unit in which traces are 1 on average: the first multipliers below are of that size.
@@ -109,8 +110,12 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
 def _take_newton_step(point: _PointWithDerivatives) -> tuple[jax.Array, jax.Array]:
     """Return weights w and multipliers s after one Newton step for g - s + m 1 = 0, sum w = 1, w s = target.
 
-    g is the gradient, s the multipliers of w >= 0, m that of the sum. The target follows from where the step with
-    target 0 would end (Mehrotra's predictor and corrector).
+    The weights w minimise tr (sum_k w_k J_k)^-1, with the gradient g. s are the multipliers of w >= 0 (`slack`), and m
+    is that of sum w = 1. An interior point method lets w s go to 0 by a target that shrinks with each step; it follows
+    from where the step with target 0 would end (Mehrotra's predictor and corrector).
+
+    Args:
+        point: weights w, multipliers s, gradient g and Hessian H of the trace.
     """
     w, slack, gradient = point.weights, point.slack, point.gradient
     # With H the Hessian, s = (target - s dw) / w is eliminated: (H + diag(s / w)) dw + m 1 = target / w - g. In the

@@ -234,9 +234,14 @@ class _RecursiveDesigner:
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
         """Return the design at one level, feasible or not.
 
+        The level gamma bounds the error M e, e = x - xhat, by the disturbances (v, rho), in sums of squares. P_k is a
+        weight of (x, e) before step k. Each step looks for a gain and a P_k+1 for which the form Phi =
+        E[(x, e)+' P_k+1 (x, e)+] + |M e|^2 - gamma^2 |(v, rho)|^2 - (x, e)' P_k (x, e), plus terms for the growth of
+        the nonlinear functions, is negative: then the sum over all steps gives the bound.
+
         Args:
             level: gamma.
-            initial: P_0 in the user's units; nearly level^2 W, the largest allowed, if None.
+            initial: P_0 in the user's units; nearly level^2 W, the largest allowed, if None. W weighs the first (x, e).
         """
         system, n, coordinates = self.system, self.system.states, self.coordinates
         design = _make_unsolved_design(system, self.separate, level, "")

@@ -294,7 +294,10 @@ def _sum_intervals(a: Interval, axes: tuple[int, ...]) -> Interval:
 def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
     """Return the interval of a contraction (`dot_general`): that of all products, then of their sums.
 
-    dimensions: the contracted axes of a and of b, and the axes of both that are a batch.
+    Args:
+        a: lower and upper ends of the first factor's entries.
+        b: lower and upper ends of the second factor's entries.
+        dimensions: the contracted axes of a and of b, and the axes of both that are a batch.
     """
     (left, right), (left_batch, right_batch) = dimensions
 
@@ -313,6 +316,7 @@ def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Int
     free_b = b.low.ndim - len(right) - len(left_batch)
     wide_a = Interval(*(lay_out(end, left, left_batch, 0, free_b) for end in a))
     wide_b = Interval(*(lay_out(end, right, right_batch, free_a, 0) for end in b))
+    # The products of all pairs; rounded outward, so that rounding cannot move a true product out of its interval.
     product = round_outward(*_bound_product(wide_a, wide_b))
     axes = tuple(range(product.low.ndim - len(left), product.low.ndim))
     return _sum_intervals(product, axes)

@@ -178,14 +178,16 @@ def _list_objectives(
     sizes: tuple[float, float],
     reached: "Parameter",
 ) -> list[tuple["Minimize | Maximize", list["Constraint"]]]:
-    """Return the objectives on L = P+^-1, one after another, each with the constraints that express it.
+    """Return the objectives on L = P+^-1, to be solved one after another, each with the constraints that express it.
+
+    A later step of the H-infinity design needs weights P+ as large as possible, hence L as small as possible.
 
     Args:
         cp: the module cvxpy.
-        objective: its name.
-        weights: P1 of x and P2 of e, P+ = diag(P1, P2).
-        sizes: of x and e, in whose units L is measured.
-        reached: the value of the objective before, which the next must not give up.
+        objective: "none", "log_determinant", "trace", or else the largest eigenvalue.
+        weights: variables P1 of x and P2 of e, P+ = diag(P1, P2).
+        sizes: sizes of x and e, the units in which L is measured.
+        reached: value of the first objective that the second must keep.
     """
     if objective == "none":
         return [(cp.Minimize(0), [])]

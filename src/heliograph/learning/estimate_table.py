@@ -281,11 +281,11 @@ class Solution:
 
         Args:
             entry: the number.
-            value: its estimate.
-            slopes: its derivative, on the line, by each active coordinate (active,).
-            error: its standard error on the line.
+            value: estimate of the number.
+            slopes: its derivative, in its unbounded coordinate, by each active (not fixed) coordinate (active,).
+            error: its standard error in that coordinate.
             freedom: degrees of freedom with which the error is known.
-            method: of `Fit.rows`.
+            method: "bootstrap", "profile", or another one, for estimate +- quantile x standard error.
             level: probability with which the interval holds the number.
         """
         coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own

@@ -97,8 +97,8 @@ def compare_before_and_after(
     Args:
         before: the network before learning.
         after: the same with the numbers learned.
-        measurements: by node (rows, received); the filters run over all rows.
-        inputs: of the plant (rows, inputs).
+        measurements: measurements by node (rows, received); the filters run over all rows.
+        inputs: inputs of the plant (rows, inputs).
         cut: number of the first row that was not learned from.
     """
     results = []
@@ -106,9 +106,11 @@ def compare_before_and_after(
         for key, old_filter in before.nodes[name].filters.items():
             if old_filter.claim == "none" or not old_filter.received:
                 continue
+            # Of both filters the log-likelihood (rows,) and the whitened innovations `white` (rows, received).
             old = _predict_rows(old_filter, z, inputs, cut)
             new = _predict_rows(after.nodes[name].filters[key], z, inputs, cut)
             received = ~np.all(np.isnan(old.white), axis=1)  # rows in which anything arrived
+            # Mean gain of log-likelihood in these rows, with its standard error; None with too few rows for a test.
             gain = None
             if received.sum() >= LAGS:
                 gain = test_zero_mean((new.log_likelihood - old.log_likelihood)[received])

@@ -225,15 +225,19 @@ def _format_interval(
 ) -> str:
     """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum; "" if none.
 
+    Data may tell a product or a sum of confounded parameters though not each one: so its interval is shown. By the
+    delta method its variance is g' C g, with its gradient g and the covariance C of the estimates.
+
     Args:
-        parameters: the free numbers.
-        group: the group that it is of.
-        row: exponents of a product, or weights of a sum, by place in the group.
-        solution: the maximum; None where there is none yet.
+        parameters: the free numbers v_i.
+        group: the confounded numbers; `places` are their coordinates.
+        row: exponents a_i of a product, or weights of a sum, by place in the group.
+        solution: the maximum of the likelihood; None where there is none yet.
         log: whether it is a product, whose logarithm sum_i a_i log |v_i| is a sum.
     """
     if solution is None or not all(solution.active[i] for i in group.places):
         return ""
+    # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unbounded coordinates.
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
     for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
@@ -241,7 +245,7 @@ def _format_interval(
             weight = row[group.places.index(entry.coordinate)]
             slopes += weight * (slope / number if log else slope)
             value += weight * (np.log(abs(number)) if log else number)
-    # g' C g is the variance of a function with the gradient g.
+    # Half the width of the interval: the quantile of Student's t times sqrt(g' C g).
     covariance, freedom = solution.covariance()
     gradient = slopes[solution.active]
     reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))

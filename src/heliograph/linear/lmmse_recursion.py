@@ -207,7 +207,8 @@ def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
     """Return E[(x - xhat)(x - xhat)'] over time of a schedule run on a system that it need not have been designed for.
 
-    Mean and covariance of (y, s), the system's state and the schedule's, are propagated; the gains may be any.
+    A schedule is a linear filter with gains known before any data; they may be optimal for another system, or for none.
+    Mean and covariance of (y, s), the system's state and the schedule's, are propagated together.
 
     Args:
         system: the true system, y+ = A y + a + w and z = C y+ + c + v, with x = W y to be estimated.

@@ -194,6 +194,7 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     what = "steady state"
     (a, q), (c, r) = plant_matrices(plant, what), sensor_matrices(sensor, len(first(plant).states), what)
     step = Steps(transition=a, drift=np.zeros(len(a)), process=q, output=c, offset=np.zeros(len(c)), noise=r)
+    # P- solves the Riccati equation of the prediction, which is that of control with transposed matrices.
     try:
         prior = solve_discrete_are(a.T, c.T, q, r)
     except (LinAlgError, ValueError) as error:
@@ -202,6 +203,8 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     noises = find_noise_roots(step, np.diag(prior))
     gain, root = observe_root(roots_of(prior), c, noises.received)
     again = covariance_of_root(step_covariance_roots(root, step, noises).predicted)
+    # Refuse a solution that moves by more than CLOSE, relative to its deviations, or whose errors do not decay: they
+    # move by F (I - K H).
     unit = standard_deviations(prior)
     moved = np.abs(again - prior) / (unit[:, None] * unit)
     if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ gain @ c) >= 1:

@@ -217,11 +217,17 @@ class Schedule(Module):
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
         """Check and hold the gains of each step, the filter's state before the first, and the claim.
 
-        The claim says what the covariances are: exact, an upper bound, nominal, or none. Sizes are time, n of the
-        filter's state, m of z and q of the estimate.
+        A schedule is a linear filter whose gains are known before any data: s+ = F s + K z + f, xhat = L s + J z + d.
+
+        Args:
+            gains: F (`transition`), K (`gain`), f (`offset`), L (`output`), J (`direct`), d (`output_offset`), and the
+                covariances, each with a leading axis of time; n numbers in s, m in z and q in xhat.
+            start: the filter's state s before the first step (n,).
+            claim: what the covariances are: exact, an upper bound, nominal, or none.
         """
         instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
+        # Sizes are read from two of the fields, and the shapes of all are checked against them.
         time, n, m = np.shape(gains.gain)
         q = np.shape(gains.output_offset)[-1]
         shape_of_field: dict[str, tuple[int, ...]] = {

@@ -137,13 +137,14 @@ class PlantState:
     def pass_time(self, clock: str, time: float, now: float, longest_gap: float, agreed: bool) -> None:
         """Advance the plant's time to `now`, the arrival of an event that was used.
 
-        If time goes on by more than `longest_gap` at once and no other clock says the same, this is a leap: rows do not
-        become final by it until it is confirmed or believed. An event on the far side of an open leap may confirm it.
+        If time goes on by more than `longest_gap` at once and no other clock says the same, this is a leap, perhaps the
+        error of one clock: rows do not become final by it until another clock confirms it, or it is believed because no
+        other clock could confirm it. An event dated after an open leap may confirm it.
 
         Args:
             clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
-            time: what that clock says.
-            now: its arrival.
+            time: the event's time by that clock.
+            now: arrival of the event.
             longest_gap: longest gap that needs no other clock.
             agreed: whether another clock says the same.
         """
@@ -155,7 +156,7 @@ class PlantState:
             if time < leap.time - longest_gap or (time == leap.time and clock == leap.clock):
                 return
             leap = self._confirm_leap(clock, leap, time, longest_gap)
-        # A new leap; but while an earlier one is in doubt, this event belongs to that one's far side.
+        # Record a new leap, unless an earlier one is in doubt: then this event only lies behind that one.
         if now > newest + longest_gap and not agreed and (leap is None or leap.believed):
             moments = {node: (link.at, link.latest) for node, link in self.links.items()}
             leap = ClockLeap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)

@@ -76,11 +76,11 @@ class Stream:
         # The sensor and the channel that the filter was made for, where it says so.
         self.filter, premise = filter, filter.premise
         sensor, channel = (None, None) if premise is None else (premise.sensor, premise.channel)
-        # What is refused before the filter, and how many values of each component were.
+        # Rules by which values are refused before the filter, and the number of refused values by reason (received,).
         self.limits = make_limits(filter.received, limits, invalid, stuck, sensor, channel)
         self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}
-        # Runs of equal readings. They are watched where no rule refuses them; a sender that decides when to send has a
-        # reason for the values that come.
+        # Runs of equal readings are watched (for a warning) where no rule refuses them, and where the sender does not
+        # decide when to send: such a sender may well repeat a value.
         self._repeats = Repeats()
         refuses_stuck = self.limits is not None and self.limits.stuck is not None
         is_watched = not refuses_stuck and not find_deciding_sender(filter)

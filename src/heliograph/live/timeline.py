@@ -74,7 +74,7 @@ class Timeline:
         """Begin with the initial laws of a network's filters, and no event.
 
         `window`: how late an event may be; `start`: of continuous time; `ahead`: how much later than its arrival an
-        event may be dated; `capacity`: greatest number of rows held. Times are in steps or in the unit of dt.
+        event may be dated; `capacity`: most rows held, not final yet. Times are in steps or in the unit of dt.
         """
         # The arguments, checked.
         self.network = instance("network", network, Network, "a Network")
@@ -86,10 +86,10 @@ class Timeline:
         self._program = shared_program(network)
         if self._program.dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
-        # Such a plant takes other steps where a prediction stops in between.
+        # Such a plant is integrated by steps that depend on where a prediction in between stops.
         if what := self._program.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
-        # A fleet of one plant, and a slot of its table to predict into.
+        # A fleet of one plant, and a slot (row of its table of states) to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin_plant("", start, origin=None), self._fleet.pool.take_slot()
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.
@@ -162,7 +162,7 @@ class Timeline:
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once); return the verdict on it.
 
-        It costs one step of all filters for the event's row and for each later one.
+        A row is all events of one time; an event costs one step of all filters for its row and for each later one.
 
         Args:
             node: name of the node, or "inputs" of the plant's inputs.
@@ -180,10 +180,10 @@ class Timeline:
         event = screened.event
         verdict, lines = self._fleet.take_event(plant, event, arrival is not None), list[str]()
         if verdict == "used":
-            row, _ = plant.changes[-1]  # that which holds the event now
+            row, _ = plant.changes[-1]  # the row that holds the event now
             why = screened.why if screened.is_empty else self._explain_implausible(event, row)
             if why is not None:
-                # As if it had never arrived.
+                # The event is implausible: undo it, as if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
                 self._fleet.undo_events(plant, clock_before)
                 self._fleet.step([plant])

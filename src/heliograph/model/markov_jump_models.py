@@ -369,10 +369,10 @@ def _read_mode_chain(
     """Return the chain of the modes: made of its transition, given as a chain, or that of another model.
 
     Args:
-        transition: a chain, or P(next mode j | present mode i) (modes, modes); None beside `modes`.
-        initial: law (modes,) of the mode at the first step, beside probabilities alone; None for the stationary law.
-        name: of a chain that models share, beside probabilities alone; None for one of its own.
-        modes: a plant, sensor or link whose chain it is; None beside `transition`.
+        transition: a chain, or P(next mode j | present mode i) (modes, modes); None if `modes` is given.
+        initial: law (modes,) of the mode at the first step, only with probabilities; None for the stationary law.
+        name: name of a chain that several models share, only with probabilities; None for a chain of its own.
+        modes: a plant, sensor or link whose chain is taken; None if `transition` is given.
         count: number of modes that it must have.
 
     Raises:

@@ -41,15 +41,16 @@ def check_turn_invariance(
 ) -> None:
     """Raise ValueError where a full turn of an angle or an attitude changes f(center), but for full turns of results.
 
-    f is computed at the center and at one general state. A change that only other states show is not found. A function
-    of traced numbers has no value to compare: it was compared before, when its numbers were known.
+    A model must not depend on whether an angle is written as 0 or 2 pi, since a filter wraps its angles. f is computed
+    at the center and at one general state; a change that only other states show is not found. A function of numbers
+    that JAX traces has no value to compare: it was compared before, when its numbers were known.
 
     Args:
-        name: of what has the function, for the error.
+        name: name of the model that has the function, for the error.
         function: f.
         center: a state (n,).
-        given: which components of a state are angles and attitudes.
-        results: which components of f(x) are.
+        given: which components of a state are angles, and which are attitudes (rotation vectors).
+        results: which components of f(x) are angles or attitudes.
         rest: further arguments of f, such as inputs.
     """
     if not (given.angles or given.rotations) or is_traced(center):
@@ -66,7 +67,7 @@ def check_turn_invariance(
             EqualStates(general_state, general_state + turns, example_rest),
         ]
         _compare_turned(f"{name} with circular states", function, cases, results)
-    # Attitudes: by the other rotation vector of each.
+    # An attitude has a second rotation vector, the long way round its axis: f must agree at both.
     attitudes = [given.rotations[i : i + 3] for i in range(0, len(given.rotations), 3)]
     turned = [_turn_attitude_long_way_round(general_state, components) for components in attitudes]
     if turned:

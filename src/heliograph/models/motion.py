@@ -33,7 +33,7 @@ def constant_velocity(
         dt: length of every step; by default it is the input "dt".
         axes: names of the positions, or a mapping of them to units; "position" by default.
         initial_mean: mean before the first step (n,); zero by default.
-        initial_covariance: its covariance; by default a variance of 1e8 of each state: nothing is known.
+        initial_covariance: covariance before the first step; by default variances of 1e8: nothing is known.
 
     Raises:
         ValueError: a negative intensity, a step that goes backwards, an initial law of another size.

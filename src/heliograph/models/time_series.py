@@ -128,9 +128,9 @@ def seasonal(
 
     Args:
         period: steps after which it returns, at least 2.
-        variance: of w; 0 for a season that is always the same.
-        initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
-        name: of the component; "season" by default.
+        variance: variance of w; 0 for a season that is always the same.
+        initial_variance: variance of each state before the first step, or `hg.diffuse`; 1e8 by default.
+        name: name of the component; "season" by default.
 
     Raises:
         ValueError: a period below 2, a negative variance.
@@ -139,6 +139,7 @@ def seasonal(
     """
     n = check_count("period", period, 2) - 1
     q, start = scalar("variance of the season", variance, 0.0), _read_initial_variance(initial_variance)
+    # The state holds the last n = period - 1 seasons: the first row is s+ = -(their sum) + w, the others move them on.
     matrix = np.eye(n, k=-1)
     matrix[0] = -1.0
     noise = _make_diagonal([q] + [0.0] * (n - 1))
@@ -161,10 +162,10 @@ def trigonometric_seasonal(
 
     Args:
         period: steps after which it returns, at least 2; it need not be whole.
-        variance: of each wave's noise.
+        variance: variance of each wave's noise.
         harmonics: number of waves; by default all that differ at whole steps.
-        initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
-        name: of the component; "season" by default.
+        initial_variance: variance of each state before the first step, or `hg.diffuse`; 1e8 by default.
+        name: name of the component; "season" by default.
 
     Raises:
         ValueError: a period below 2, more waves than differ, a negative variance.
@@ -177,7 +178,7 @@ def trigonometric_seasonal(
     count = most if harmonics is None else check_count("harmonics", harmonics)
     if not 1 <= count <= most:
         raise fail("harmonics", f"from 1 to {most}, which differ at whole steps", count)
-    # A block, two states (of which the first is seen) and two weights for each wave.
+    # For each wave a block of the plant's matrix, its two states, and the weight of each state in the observed sum.
     q, start = scalar("variance of the season", variance, 0.0), _read_initial_variance(initial_variance)
     named, blocks, states, loading = text("name of a component", name), [], [], []
     for j in range(1, count + 1):
@@ -214,6 +215,7 @@ def cycle(
     factor = scalar("damping", damping, 0.0, STATIONARY)
     name = text("name of a component", name)
     matrix = factor * _make_rotation(2 * np.pi / length)
+    # x+ = damping (rotation) x + w has the variance v = damping^2 v + q.
     stationary_variance = q / (1 - factor**2)
     plant = LinearPlant(matrix, q, np.zeros(2), stationary_variance, states=[name, f"{name}_shifted"])
     return Component(name, plant, loading=[1.0, 0.0])
@@ -270,9 +272,9 @@ def regression(
 
     Args:
         regressors: names of the inputs.
-        variance: of each coefficient's step; 0 by default: constants.
-        initial_variance: of each coefficient before the first step, or `hg.diffuse`; 1e8 by default.
-        name: of the component; "regression" by default.
+        variance: variance of each coefficient's step; 0 by default: constants.
+        initial_variance: variance of each coefficient before the first step, or `hg.diffuse`; 1e8 by default.
+        name: name of the component; "regression" by default.
 
     Raises:
         ValueError: no regressors, a negative variance.
@@ -285,6 +287,7 @@ def regression(
     n = len(inputs)
     q, start = scalar("variance of the coefficients", variance, 0.0), _read_initial_variance(initial_variance)
     states = [f"{regressor}_coefficient" for regressor in inputs]
+    # Coefficients are random walks, which the inputs do not move; they enter as factors in y, with the weights 1.
     plant = LinearPlant(np.eye(n), q, np.zeros(n), start, np.zeros((n, n)), states, inputs)
     return Component(name, plant, np.ones(n), inputs)
 

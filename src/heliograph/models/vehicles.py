@@ -119,10 +119,11 @@ def coordinated_turn(
     Of a known rate take `known_turn`, which is linear.
 
     Args:
-        intensity: variance that each velocity gains in a unit of time; Q as of `constant_velocity`.
+        intensity: variance q that each velocity gains in a unit of time; Q of a position and its velocity is
+            q [[dt^3/3, dt^2/2], [dt^2/2, dt]].
         turn_intensity: variance that the turn rate gains in a unit of time.
         initial_mean: mean before the first step (5,).
-        initial_covariance: its covariance, or the law of its deviation.
+        initial_covariance: covariance before the first step, or the law of the deviation from the mean.
         dt: length of every step; by default the input "dt" says it.
         axes: names of both positions; "x" and "y" by default.
 
@@ -211,10 +212,10 @@ def _make_vehicle_plant(
     Args:
         wheelbase: distance of the axles of a bicycle, steered by the angle of its front wheel; None of a unicycle,
             which is steered by its turn rate.
-        steered_by: name of the input by which it is steered, behind "speed".
-        intensity: S of Q = S dt (3, 3).
+        steered_by: name of the second input, by which the vehicle is steered; the first one is "speed".
+        intensity: noise intensity S (3, 3): over a step of length dt the states gain the covariance Q = S dt.
         initial_mean: mean before the first step (3,).
-        initial_covariance: its covariance, or the law of its deviation.
+        initial_covariance: covariance before the first step, or the law of the deviation from the mean.
         dt: length of every step; None where the input "dt" says it.
         axes: names of both positions.
     """

@@ -315,7 +315,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
         raise fail(name, "a square matrix", f"shape {matrix.shape}")
     if is_traced(matrix):
         return matrix / 2 + matrix.T / 2  # the sum of two large variances may overflow
-    # Symmetry and definiteness are judged of correlations, so that neither depends on units.
+    # Symmetry and definiteness are judged by correlations P_ij / (d_i d_j), so that neither depends on units.
     deviations = standard_deviations(matrix)
     asymmetry = np.abs(matrix - matrix.T)
     if np.any(asymmetry > SYMMETRY_TOLERANCE * np.outer(deviations, deviations)):

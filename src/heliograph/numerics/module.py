@@ -20,8 +20,9 @@ from heliograph.numerics.lazy_exports import refuse_attribute
 def are_same(x: Any, y: Any) -> bool:
     """Return whether two objects that may hold arrays are of the same class, and the same in each part.
 
-    Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
-    same as itself alone.
+    Python's == does not serve, as it compares arrays by element and NaN as different. Here arrays are the same if
+    their shape, kind of number and numbers are; NaN is the same as NaN. An array that JAX traces has no known numbers,
+    and is the same as itself alone.
     """
     if x is y:
         return True

@@ -80,19 +80,21 @@ class _PlantAndSenders(NamedTuple):
 def design_bits(network: Network, total: int) -> BitsDesign:
     """Return the bits of each sender's words, of `total` bits a step, for a small error of the filter of all nodes.
 
-    A word of B bits over a range of 2a, with D = 2a / (2^B - 1), U = D^2 (4^B - 1)/12 and flips of g = 1 - 2p, says as
-    much of y as one measurement of the information j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)). j is convex in B while
-    D^2/12 > R and concave then, so that one more bit may say little where three say much: bits are added greedily,
-    several at once, by the decrease of the error for each. The steady trace is convex in all j; with each j replaced by
-    its concave envelope the best real bits give the bound, by Frank and Wolfe's steps, whose linear part is exact. It
-    is close where steps are no coarser than the noises, and loose where a precise sensor has few bits.
+    A word of B bits rounds y, whose noise has the variance R, to steps of D = 2a / (2^B - 1) in a range of 2a; each bit
+    is flipped with the probability p, g = 1 - 2p, and U = D^2 (4^B - 1)/12. The word says as much of y as one
+    measurement of the information j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)). j is convex in B while D^2/12 > R and
+    concave for more bits: one more bit may say little where three say much. So bits are added greedily, several at
+    once, by the decrease of the error per bit. The steady trace of the covariance is convex in all j. With each j
+    replaced by its concave envelope, the best real numbers of bits give the bound, by Frank and Wolfe's steps, whose
+    linear part is exact. It is close if steps are no coarser than the noises, and loose for a precise sensor with few
+    bits.
 
     Args:
         network: nodes with encoders, whose ranges and links are kept, of one output each.
         total: bits that all nodes together send at a step.
 
     Raises:
-        ValueError: no network of senders of words with one output each behind constant error rates, a sender that
+        ValueError: nodes that do not all send words of one output over links of constant error rates, a sender that
             decides when to transmit, a plant that is not linear or not stable, a range that the steady state leaves in
             more than 1 of 1000 steps, no bit.
 
@@ -101,8 +103,10 @@ def design_bits(network: Network, total: int) -> BitsDesign:
     instance("network", network, Network, "a Network").check_sends_each_step("design of bits")
     senders = _collect_plant_and_senders(network)
     budget, names = check_count("total bits", total), list(network.names)
+    # Bits (nodes,), and the steady trace of the filter's covariance with them.
     bits = _add_bits_greedily(senders, budget)
     error = _compute_steady_error(senders, _information_of_bits(senders, bits))
+    # Encoders with these bits and the ranges of before; nodes without bits send nothing.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     encoders = {
         name: Words(int(count), node.encoder.low, node.encoder.high, "subtracted")

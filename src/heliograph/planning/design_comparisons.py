@@ -51,7 +51,7 @@ def error_over_power(
     Args:
         problem: the design problem; its other limits of power stay.
         totals: total powers, shape (points,), positive.
-        advance: called with a word before each design (by default nothing is).
+        advance: called with a text before each design, to show progress (by default nothing is).
 
     Returns:
         totals in rising order, errors, and bounds below which no error is, each of shape (points,).
@@ -69,6 +69,7 @@ def error_over_power(
         designs.append(design(problem.replace_total(float(total))))
     # A design that was found for less power counts for more power too: the least error so far.
     errors = np.minimum.accumulate([best.error for best in designs])
+    # No bound below all possible errors may be above an error that was reached.
     bounds = np.minimum([best.bound for best in designs], errors)
     return ErrorsOverPower(totals=powers, errors=errors, bounds=bounds)
 

@@ -160,10 +160,10 @@ def make_power_limits(
     """Return the limits that the budget leaves to the free transmitters, while the others send their `powers`.
 
     Args:
-        budget: limits of all transmitters.
-        names: of all transmitters, in the order of the hops.
-        free: which of them are free (hop,).
-        powers: what each sends at present (time, hop); those of free ones do not matter.
+        budget: limits of all transmitters: of the total mean power, of each one's mean, and of each one's peak.
+        names: names of all transmitters, one for each hop, in the order of the hops.
+        free: True for the transmitters whose powers are to be designed (hop,).
+        powers: power that each transmitter sends at present (time, hop). The columns of free transmitters are ignored.
 
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.
@@ -171,7 +171,8 @@ def make_power_limits(
     mean_limit = _list_limits("per_transmitter", budget.per_transmitter, names)
     peak_limit = _list_limits("peak", budget.peak, names)
     total_limit = np.inf if budget.total is None else budget.total
-    # What is not free has to be within the limits, and takes its part of the total.
+    # Transmitters that are not free keep their powers: these must be within the limits themselves, and the mean of
+    # their sum is subtracted from the total that the free ones may use.
     fixed = np.where(free, 0.0, powers)  # (time, hop)
     fixed_mean, fixed_peak = fixed.mean(axis=0), fixed.max(axis=0)
     for name, sent, limit in zip(names, fixed_mean, mean_limit, strict=True):

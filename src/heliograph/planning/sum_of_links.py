@@ -92,14 +92,16 @@ def find_amplitudes_by_formula(links: SummedLinks, total: float, caps: Vector) -
 
 
 def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total: float, caps: Vector) -> Vector:
-    """Return the best amplitudes (links,) where the total power P binds as well as the limits of some amplitudes.
+    """Return the best amplitudes a (links,) where the total power P binds as well as the limits of some amplitudes.
 
-    They are those under the limits of each alone, with D + nu T and N - nu P in place of D and N. The multiplier nu
-    lies between 0 and N / P, where the links send P. It is found by bisection, as the power falls with nu.
+    The best a maximise (b' a)^2 / (a' D a + N) with sum_i T_i a_i^2 <= P. With a multiplier nu of the total, they are
+    those under the single limits alone for D + nu T and N - nu P in place of D and N. nu lies between 0 and N / P, and
+    is found by bisection, as the power sum_i T_i a_i^2 falls with nu.
 
     Args:
-        links: D, T and N.
-        b: gains.
+        links: D (`noise`), covariance of what links add before the sum, diagonal here; T (`unit`), the power at
+            amplitude 1; N (`floor`), variance of the receiver's noise.
+        b: gain of each link (links,).
         variances: the diagonal of D.
         total: P.
         caps: largest size of each amplitude.
@@ -114,6 +116,7 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
         sizes = _cap_amplitudes(np.abs(b), variances + nu * links.unit, links.floor - nu * total, caps)
         return np.asarray(np.sign(b) * sizes)
 
+    # At `low` the links send more than P, at `high` at most P.
     low, high = 0.0, links.floor / total
     for _ in range(HALVINGS):
         nu = (low + high) / 2

@@ -118,7 +118,8 @@ class SumOfLinksTask(NamedTuple):
     def search_amplitudes(self, total: float, starts: int, first: Vector | None = None) -> Vector:
         """Return the amplitudes (links,) of the least error that descents find from `first` and from drawn starts.
 
-        Amplitudes may be negative: their signs matter where noises of links are correlated.
+        The receiver gets the sum of all links' signals, each times its amplitude. Amplitudes may be negative: their
+        signs matter where noises of links are correlated. The error is not convex in them, hence several starts.
 
         Args:
             total: power that the free links may send together.
@@ -146,6 +147,7 @@ class SumOfLinksTask(NamedTuple):
         def error_at(x: Vector) -> float:
             return self.compute_error(amplitudes_at(x))
 
+        # Descend from `first`, if it is given, and from uniform draws in the box; keep the best end.
         generator = np.random.default_rng(self.seed)
         points = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
         if first is not None:

@@ -328,9 +328,8 @@ class RelayedLinks(AbstractDelayLine):
 def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Return links in series, each with its own delay, as one channel; constant delays add up.
 
-    A relay without memory that stores what it received for a constant d equals one that receives it d steps later:
-    gains and noises are independent over time. One that stores it for a random time may forward one value twice, with
-    one noise.
+    A relay that stores what it received for d steps equals one that receives it d steps later, as gains and noises are
+    independent over time. With a random d it may forward one value twice, with one noise, and so needs a store.
     """
     links = check_maps("series", links)
     if not any(link.past for link in links):

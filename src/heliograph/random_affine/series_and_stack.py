@@ -366,7 +366,8 @@ def multiply_moments_of_parts(
 ) -> list[Any]:
     """Return for each monomial z^a of (z, 1) the coefficients of E[z^a | y] as a polynomial in (y, 1).
 
-    z = (z_1, z_2, ...) are the outputs of the maps, independent given y: E[z^a | y] = prod_m E[z_m^(a_m) | y].
+    z = (z_1, z_2, ...) are the outputs of the maps, independent given y: E[z^a | y] = prod_m E[z_m^(a_m) | y]. So the
+    polynomial of a monomial is a product of one polynomial per map.
 
     Args:
         channel: the stack of these maps.
@@ -384,6 +385,7 @@ def multiply_moments_of_parts(
             powers_of_map = powers[start : start + affine.outputs]  # a_m
             start, degree_of_map = start + affine.outputs, sum(powers_of_map)
             if degree_of_map:
+                # E[z_m^(a_m) | y] is the row of the monomial z_m^(a_m) 1^0 of (z_m, 1).
                 row = position(affine.outputs + 1, degree_of_map)[(*powers_of_map, 0)]
                 polynomial_of_map = matrices[degree_of_map][..., row, :]
                 polynomial = multiply(polynomial, degree, polynomial_of_map, degree_of_map, variables)

@@ -137,7 +137,7 @@ class Service:
         if self._exchange.sends:  # a node sends to its neighbours at each step, and needs a message to make the step
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
-        # Rows that become final by `now`, and withdrawn events: those that `now` shows to be dated by a wrong clock.
+        # A row is one time's data; it becomes final once older events are refused. Withdrawn events had a wrong clock.
         due = self._silence.find_plants_due(self.plants.values(), now)  # plants, each with the step that it is by now
         for plant, step in due:
             self.fleet.advance_time(plant, step)
@@ -145,7 +145,7 @@ class Service:
         changed = {each.plant.name: each.plant for each in finalised if each.left}
         entries = [entry for each in finalised for entry in self._write_withdrawn(each.plant, each.withdrawn)]
         entries += self._write_finals(finalised)
-        # Estimates of the present, where they have changed.
+        # Predict silent plants to `now`; publish estimates that have changed; free table rows that are done with.
         self.fleet.pass_silence(due)
         rows = [(plant, plant.silence) for plant, _ in due if plant.silence is not None]
         provisional = self._write_provisional(self._silence.select_for_publication(rows)) if rows else []

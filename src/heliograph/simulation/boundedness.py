@@ -64,7 +64,9 @@ class Boundedness(NamedTuple):
 def certify_boundedness(network: Network) -> Boundedness:
     """Judge whether E P, the mean error covariance of the best linear filter of all nodes' messages, stays bounded.
 
-    The filter knows what arrived. U_i is the part of E P in state i of the losses, and `chain` holds their transitions.
+    The filter knows what arrived. U_i is the part of E P in state i of the losses, and `chain` holds the probabilities
+    of their transitions. A is the plant's matrix, C_i the received rows in state i, K_i a gain, and rho the spectral
+    radius.
 
     Certified: rho of U_j -> sum_i chain[i, j] (A - K_i C_i) U_i (A - K_i C_i)' is below 1 for some gains, which are
     searched first and then certified independently of the search. Only rows of known gain are used: a gain that is
@@ -91,7 +93,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     found = _judge_links(network, a, q, find_joint_links(network, len(a), counts_all=False))
     if not chosen or found.verdict == "certified":
         return found
-    # The other nodes certify nothing. What grows though all nodes sent everything grows in any case.
+    # Nodes that choose by value certify nothing. An error that grows even if they sent everything grows in any case.
     complete = _judge_links(network, a, q, find_joint_links(network, len(a), counts_all=True))
     if complete.verdict == "impossible":
         return complete

@@ -273,6 +273,13 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
 def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) -> Claim:
     """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report.
 
+    A claim is what the covariance is said to be: exact, an upper bound, or nominal. A report is the estimate that a
+    node sends to the centre; with `by_report` the centre models the report's way, its uplink or its quantizer.
+
+    Args:
+        network: the network, whose nodes have filters and claims.
+        fusion: the fusion, or a filter of the centre on all measurements, which has its own claim.
+
     Raises:
         ValueError: a rule that needs the joint covariance of the nodes' errors, which cannot be computed here.
     """
@@ -289,7 +296,8 @@ def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) ->
     parts = network.parts_of(fusion.filter)  # of each node that has a sensor: sensor, channel, filter
     if len(parts) < len(names):
         raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
-    # Where gains depend on data, moments of the errors are followed along the estimates, but not the plant's own.
+    # Where gains depend on data, the errors' moments can be propagated along the data's estimates, but the plant's own
+    # second moment E[x x'], which is needed before any data, cannot.
     needs_plant_moments = fusion.by_report or fusion.rule.needs_plant_moments
     if needs_plant_moments and has_data_dependent_gains(parts):
         _, _, first_filter = next(iter(parts.values()))

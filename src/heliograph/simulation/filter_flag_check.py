@@ -18,13 +18,14 @@ NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
     """Raise ValueError unless the flags that these channels deliver are those of the filter's model.
 
-    A flag is a number received behind the measurement that tells the mode of a link, in this step or the step before
-    (late). A filter that takes one for the other would claim a wrong covariance.
+    A flag is a number that is received after the measurement and tells the mode of a link (such as good or bad), in
+    this step or the step before (late). A filter that took a late flag for one of this step would claim a wrong
+    covariance.
 
     Args:
-        name: of the filter, for the error.
+        name: name of the filter, for the error.
         filter: with all filters inside it.
-        channels: whose outputs it receives, one after another.
+        channels: channels whose outputs the filter receives, one after another.
 
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
@@ -33,7 +34,7 @@ def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[Abs
     channel_of_number = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
     for reader in _find_flag_filters(filter):
         if isinstance(reader, ModeObservedFilter):
-            # All numbers behind the channel's outputs are flags.
+            # All received numbers after the channel's outputs are flags.
             measured, expected = first(reader.channel).outputs, LATE if reader.late else NOW
             flags = channel_of_number[measured : reader.received]
             wrong = [flag for flag in flags if not _reveals_mode(flag, reader.late)]

@@ -260,7 +260,7 @@ class Network(Module):
         check_link(first(sensor), first(channel), len(first(plant).states), late=True)
         find_received_angles(plant, sensor, channel)
         check_forgets("channel of nodes that share it", first(channel))
-        # Each output goes to one node, as many as its filters receive.
+        # Each output goes to one node; a node has as many as its filters receive.
         received = {
             name: max((filter.received for filter in by_name.values()), default=0) for name, by_name in filters.items()
         }

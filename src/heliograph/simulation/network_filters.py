@@ -335,11 +335,11 @@ class AllFilters(Module):
         """Step a centre: return its next state, and the nodes' estimates fused by the joint covariance of their errors.
 
         Args:
-            centre: the centre; its `sources` are (kind, number in the kind) of filters, a kind being one stack of them.
-            state: its state before the step.
-            states: of the nodes' filters by kind before the step, from which the matrices of their steps follow.
+            centre: knows the joint covariance; `sources`: (kind, number in it) of its filters, a kind being a stack.
+            state: state of the centre before the step.
+            states: states of the nodes' filters by kind before the step, from which their steps' matrices follow.
             z: measurements (node, received) by group of nodes.
-            estimates: of the nodes' filters by kind after the step, (filter, node, ...).
+            estimates: estimates of the nodes' filters by kind after the step, (filter, node, ...).
             u, k: inputs of the plant over the step, and its number.
         """
         matrices = []

@@ -58,20 +58,22 @@ class World(Module):
         """Step the world over step k: return its next state, and what is recorded of the step.
 
         Args:
-            carry: state before the step, as `init` returns it.
-            key: of the run.
+            carry: state before the step: x (n,) of the plant, states of the medium (all channels to the nodes), of the
+                filters and of the links between neighbours, and the modes of the plant's memories (Markov chains).
+            key: random key of the run.
             row: (k, inputs of the plant over step k).
 
         Returns:
-            The next state, and "truth" (n,), "measurements" (node, received) by group, "transmissions" by group, and
-            all that `AllFilters.step` puts out, with estimated angles within half a turn of the true ones.
+            The next state, and "truth" (n,), "measurements" (node, received) by group of nodes, "transmissions" by
+            group (why senders with a trigger sent), and all that `AllFilters.step` puts out, with estimated angles
+            within half a turn of the true ones.
         """
         (x, medium, states, edges, modes), (k, u) = carry, row
         # The plant moves, in the present modes of its memories, and its nodes receive.
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
-        # Measurements of which nothing is ever missing are marked, so that native code need not look for NaN.
+        # Measurements that always arrive in full are marked, so that native code need not look for NaN.
         z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
         # Draw which reports and messages between neighbours arrive; then step all filters.
         drawn: dict[str, PyTree] = {

@@ -116,11 +116,20 @@ SmoothChunks = Callable[..., SmoothedChunk | None]
 
 
 def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
-    """Smooth all chunks side by side, then again those whose ends differ from their neighbours'; None without code.
+    """Smooth all chunks side by side, then again those whose ends differ from their neighbours'.
 
     A chunk smooths its `own` rows by a window of these and the `ahead` rows after them. It filters its window and
     passes back from the window's end, beginning with the filtered law instead of the smoothed one. Over the `ahead`
     rows that start is forgotten, so it enters its own rows with the law that all later data give.
+
+    Args:
+        recursion: one step of the filter and of its smoother.
+        begun: for each chunk its first row and a state to begin with, the numbers `own` and `ahead`, and whether
+            covariances have settled there: rows without missing numbers then change only means.
+        rows: measurements and inputs, (rows, ...) each.
+
+    Returns:
+        The smoothed estimates of all rows; None without native code for a chunk.
     """
     total, (own, ahead) = len(rows[0]), begun.lengths
     windows = take_windows(rows, begun.first, own + ahead)

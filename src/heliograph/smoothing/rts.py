@@ -65,6 +65,7 @@ def rts_smoother(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
+    # Many rows of a linear filter in chunks side by side; else one pass of the filter, then one pass back.
     in_chunks = smooth_in_chunks(filter, rows, inputs)
     if in_chunks is not None:
         warn_if_inconsistent("smoothing", in_chunks.sums)

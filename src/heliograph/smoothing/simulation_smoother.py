@@ -26,15 +26,16 @@ def simulation_smoother(
     """Draw paths of the states given all rows, from the law whose moments are the smoothed means and covariances.
 
     The last state is drawn from its filtered law, each one before from its law given the state drawn after it:
-    x_k = m + K (x_{k+1} - m-) + e. So whole paths are right, not each state alone: how long a level was passed, the
-    greatest value, the sum. Of a linear Gaussian model they are exact draws.
+    x_k = m + K (x_{k+1} - m-) + e, with the filtered mean m, the predicted mean m-, the smoother's gain K and a draw e
+    of zero mean. So each path as a whole is a draw, and answers how long a level was passed, or what the greatest
+    value was. For a linear Gaussian model the draws are exact.
 
     Args:
         filter: a filter that can be smoothed; any that keeps a covariance.
         z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
         u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
         draws: number of paths; 1000 by default.
-        seed: of the random numbers; 0 by default.
+        seed: seed of the random numbers; 0 by default.
 
     Returns:
         States (draws, steps, n), angles between -pi and pi.

@@ -114,9 +114,10 @@ def _compare_modes(
 
 
 def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return first and second draws of H = [[G, n], [0, 1]] (samples, outputs + 1, inputs + 1).
+    """Return first and second draws of H = [[G, n], [0, 1]] (samples, outputs + 1, inputs + 1), for z = G y + n.
 
-    The contract of `init`, `draw` and `sample` is tested on the way.
+    On the way it tests the contract of a channel: `init` gives the state of its memory, `draw` the next state and H,
+    and `sample` H alone if there is no memory.
 
     Raises:
         AssertionError: naming what is broken.

@@ -116,7 +116,7 @@ def _list_ways_to_step_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
 def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
     """Check that a filter has a claim and names, and refuses measurements, inputs and steps that do not fit it.
 
-    `inputs`: of the plant, one step's.
+    `inputs`: inputs of the plant over one step (inputs,).
 
     Raises:
         AssertionError: naming what is broken.

@@ -373,10 +373,10 @@ class FunctionWriter:
         return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.write_operand(condition)} to %lanes')}, 0")
 
     def _write_guard(self, guard: Guard) -> None:
-        """Write a guarded block, which is skipped where its condition holds in no lane; its results are zero then."""
+        """Write a guarded block: it is skipped if its condition holds in no SIMD lane; its results are then 0."""
         self.count += 1
         name = f"guard{self.count}"
-        # Jump past the body if no lane needs it.
+        # Jump past the body if no lane needs it. `self.label` is the basic block that is being written.
         any_lane = self._write_any_lane(guard.condition)
         label_before = self.label
         self.line(f"br i1 {any_lane}, label %{name}, label %{name}.end")
@@ -389,8 +389,8 @@ class FunctionWriter:
         self.line(f"br label %{name}.end")
         self.start_basic_block(f"{name}.end")
         self.scopes.pop()
-        # A phi node each: the value behind the body, zero where that was skipped. All phi nodes come first, before
-        # what `_note_name` may write of one.
+        # For each result that is used later a phi node: its value after the body, or zero if that was skipped. All phi
+        # nodes come first, as LLVM demands, before what `_note_name` may write.
         merged = []
         for k, value in zip(used, values, strict=True):
             kind = vector_type(guard.results[k].type)

@@ -18,7 +18,11 @@ from straightline.size_limits import WRITTEN_OUT
 
 
 def _make_scatter_rule(op: str | None) -> Rule:
-    """Return the rule of a scatter: updates are combined with an array's entries by `op`, or replace them if None."""
+    """Return the rule of a scatter: updates are combined with an array's entries by `op`, or replace them if None.
+
+    A rule lowers one primitive of JAX: arrays of graph nodes (one node for each number) go in, and such arrays come
+    out. A scatter writes windows (blocks) of updates into an array at given indices.
+    """
 
     def scatter_updates(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return the array after all updates, in order; places beyond it are dropped or clipped.
@@ -28,7 +32,7 @@ def _make_scatter_rule(op: str | None) -> Rule:
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
         indices = convert_to_32_bits(lowering, indices) if fills_outside(equation) else indices
-        # Axes of the array that a window does not have, along which it has the size 1, and its size along all others.
+        # `removed`: axes of the array that a window lacks; it has size 1 along them. `sizes`: its size along each axis.
         removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
         window_lengths = iter(updates.shape[axis] for axis in numbers.update_window_dims)
         sizes = [1 if axis in removed else next(window_lengths) for axis in range(x.ndim)]

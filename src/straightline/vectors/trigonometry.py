@@ -134,7 +134,8 @@ def atan(x: Vector) -> Vector:
 def _atan_of_positive(x: Vector) -> Vector:
     """Return atan x for x >= 0 as A + atan t, t = (x - tan A) / (1 + x tan A), with a tabulated angle A near atan x.
 
-    atan t = t - t^3 p(t^2), with a polynomial p of coefficients ATAN, for the small |t| that remains.
+    atan t = t - t^3 p(t^2), with a polynomial p of coefficients ATAN, for the small |t| that remains. A vector holds
+    one number for each SIMD lane.
     """
     # A large number stands for infinity, since infinity times 0 is NaN.
     x = select(x > 2.0**66, 2.0**66, x)

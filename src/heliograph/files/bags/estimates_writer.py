@@ -255,12 +255,12 @@ def _make_odometry(
     pose: Pose,
     types: Any,
 ) -> object:
-    """Return an odometry message.
+    """Return an odometry message of ROS: position, orientation and velocities, with their covariances.
 
     Args:
-        stamp: its time in nanoseconds since 1970.
+        stamp: time of the estimate in nanoseconds since 1970.
         mean: mean of the states.
-        covariance: their covariance; None where none is claimed.
+        covariance: covariance of the states; None where none is claimed.
         places: by axis the index of the state that is along or about it, of the pose and of the twist (its velocity),
             as `Pose.places` returns them.
         pose: names of the frames.

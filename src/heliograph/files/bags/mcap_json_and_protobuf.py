@@ -67,13 +67,13 @@ def holds_messages(path: Path) -> bool:
 def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterator[FileMessage | InputError]:
     """Yield the messages of an MCAP file in its order, each with the moment when it was logged.
 
-    Messages in other encodings have no content; one that its schema does not fit is an error.
-
-    Where the file is damaged or cut off the last is a `CutOffError`.
+    Contents in JSON and Protocol Buffers are decoded; messages in other encodings have the content None. A message that
+    does not fit its schema is yielded as an error. If the file is damaged or cut off, the last thing yielded is a
+    `CutOffError`, so that the messages before it can be used.
 
     Args:
         path: the file.
-        sources: sources, whose topics are in JSON or Protocol Buffers; None for all topics.
+        sources: the sources, of whose topics alone contents are decoded; None for all topics.
 
     Raises:
         ValueError: a topic of the sources that is in another encoding; one line.
@@ -83,6 +83,7 @@ def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterat
         file.seek(len(MAGIC))
         try:
             for count, channel, logged, data, types in _yield_stored_messages(path, file, sources):
+                # Decode only what the sources read.
                 where = f"{path}, message {count}"
                 wanted = sources is None or bool(sources.of(channel.topic))
                 payload = _decode_payload(where, channel, types, data) if wanted else None
@@ -196,10 +197,13 @@ def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
 
 
 def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of each record up to the end of the data or the summary; records of chunks by themselves.
+    """Yield kind and content of each record of an MCAP file, up to the end of its data; chunks are unpacked.
+
+    A record is one byte for its kind, its size, and its content. A chunk is a record that holds others, compressed:
+    these are yielded in its place.
 
     Raises:
-        BagDamagedError: a record that is longer than what is left.
+        BagDamagedError: a record that is longer than the rest of the file.
         Exception: whatever else damage leads to.
     """
     from rosbags.rosbag2.storage_mcap import decompress
@@ -216,6 +220,7 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
         if kind != CHUNK:
             yield kind, content
             continue
+        # A chunk: size and checksum of what it holds, name of the compression, then the size of the compressed bytes.
         _, _, whole, checksum = PART.unpack_from(content)
         compression, at = _read_sized_text(content, PART.size)
         (packed,) = SIZE.unpack_from(content, at)

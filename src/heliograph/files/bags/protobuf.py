@@ -236,16 +236,17 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
-    """Return the values of a field as they stand: of a packed list several.
+    """Return the encoded values of a field: one, or several for a packed list, whose values share one block of bytes.
 
     Args:
-        field: the field, as the schema has it.
-        wire: how the message has its value: the wire type that stands before it.
-        value: the value as it stands there.
+        field: the field, as the schema declares it.
+        wire: wire type in the message: how the value is encoded (an integer, a fixed number of bytes, or sized bytes).
+        value: the encoded value in the message: an integer, or bytes.
 
     Raises:
         ValueError: a field of a type that is not read, or of another one than the schema's.
     """
+    # A single value has the wire type of the schema.
     expected = _find_wire_type(field)
     if wire == expected:
         return [value]

@@ -226,33 +226,37 @@ def _append_messages(
     table: EventTable,
     strict: bool,
 ) -> Counter[str]:
-    """Append the events of messages one after another; what cannot be read is refused alone.
-
-    Returned is by topic how many say that something read of them has no value.
+    """Append the events of messages one after another; a message that cannot be read is counted and left out.
 
     Args:
         path: the bag, for errors.
-        reader: its reader.
-        sources: the sources.
-        batch: the messages.
+        reader: decodes its messages.
+        sources: which fields of which topic are a node's measurement.
+        batch: the messages: connection (topic and type), time of logging, and bytes.
         done: how many messages of the sources' topics were read before.
         table: where the events go.
         strict: whether the first message that cannot be read is an error.
+
+    Returns:
+        By topic, the number of messages which say themselves that a value in them is not valid.
     """
     marked = Counter[str]()
     for number, (connection, logged, data) in enumerate(batch, done + 1):
         topic, kind = connection.topic, connection.msgtype
+        # Decode the message; a decoder may raise any error at bad bytes.
         try:
             content = reader.deserialize(data, kind)
         except Exception as error:
             where = f"{path}, {topic}, logged at {format_moment(logged)}"
             table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
+        # Fields that the message itself marks as not valid become NaN, except where a source asks for none ({}).
         marked[topic] += blank_message(
             kind,
             content,
             {f for single in sources.of(topic) if single.source.valid != {} for f in single.source.fields},
         )
+        # Each source of the topic makes an event of it, or says why it cannot.
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):
                 where = f"{path}, message {number}, logged at {format_moment(logged)}"

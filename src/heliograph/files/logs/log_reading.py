@@ -107,22 +107,32 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
 
 
 def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -> list[str]:
-    """Return the units of the signals that sources read, as lines "topic.signal in unit".
+    """Return the units of the log's signals that are read, as lines "topic.signal in unit", to be shown to the user.
 
-    Topics of a log are its messages. A topic of the sources with a wildcard (+ or #) need not be there.
+    A log holds messages, each with signals. A source says which signal of which message is a measurement; a topic is
+    the name of a message. A topic of the sources with a wildcard (+ or #) need not be in the log.
+
+    Args:
+        place: what is read, to begin the text of errors.
+        path: the log, or a folder of several.
+        log: the units of its signals, by message.
+        sources: the sources, by topic.
 
     Raises:
         ValueError: a message or a signal that is not in the log, a signal of another unit in another log.
     """
     remedy = f"heliograph inspect {path} lists what there is"
     for topic in sources.topics:
+        # Each topic that is named without a wildcard has to be a message of the log.
         if topic not in log.units and not set("+#") & set(topic):
             hint = "; dbc= of LogSources names their database" if not log.units else f"; {remedy}"
             raise fail(place, f"a message {topic!r} of the sources", f"{_suggest_names(topic, log.units)}{hint}")
-    used = dict[str, None]()
+    used = dict[str, None]()  # the lines, as keys: each once, in order
+    # Each field that a source reads has to be a signal of its message, or the time stamp that every message has.
     for topic, signals in log.units.items():
         for mapped in sources.of(topic):
             for path_in_message in mapped.source.fields:
+                # A path "a.b" is the signal of that name, or part b of the signal "a".
                 name = path_in_message if path_in_message in signals else path_in_message.split(".")[0]
                 if name not in signals and name != STAMP:
                     got = f"{_suggest_names(path_in_message, signals)}; {remedy}"

@@ -95,9 +95,16 @@ def read_events(
     strict: bool,
     ignore_unknown: bool,
 ) -> EventTable:
-    """Return the events of a bag, a log, a file or a folder, or of a store's table.
+    """Return the events of a bag, a log, a file or a folder, or of a store's table; an event is one node's values.
 
-    The arguments are those of `read_messages`, but for `source`: the recording's path, or the table of a store.
+    Args:
+        source: path of the recording, or the table of a store.
+        network: the network whose nodes the events are of.
+        sources: which field of which topic is a node's measurement; None for messages in our own form, which have the
+            columns node, sequence, time and values.
+        progress: called with the numbers of messages read and to be read; None for no calls.
+        strict: whether the first message that cannot be read is an error; otherwise it is counted and left out.
+        ignore_unknown: whether columns in our own form that the network does not know are left out.
     """
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
@@ -118,6 +125,7 @@ def read_events(
         events = _read_table_of_own_format(source, network, strict, ignore_unknown)
     else:
         events = _read_by_topic(source, network, checked, strict)
+    # Note what the sources left out, and judge the events as a whole, such as time stamps that were never set.
     if checked is not None:
         _note_left_out(source, checked, events)
     events.finish(str(source), strict)

@@ -53,7 +53,7 @@ class TopicReader:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
-        """Check a table of sources, by topic, against a network; `others`: nodes whose messages are left out."""
+        """Check the sources by topic (fields that are measurements) against a network; `others`: nodes left out."""
         self.network, self.others = network, others
         # What is counted and noted of the messages that come.
         self.senders, self.clocks = SenderCounter(), TopicClocks()

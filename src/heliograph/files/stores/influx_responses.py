@@ -18,6 +18,13 @@ Row = Mapping[str, Any]
 def parse_influxql_response(address: StoreAddress, answer: bytes) -> Answer:
     """Return the table of an answer to InfluxQL; several series, as of GROUP BY, become one, with tags as columns.
 
+    Args:
+        address: the store that was asked, for errors and for the name of the table.
+        answer: the answer of the server, in JSON.
+
+    Returns:
+        The name of the measurement (InfluxDB's table), and its columns.
+
     Raises:
         ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
     """

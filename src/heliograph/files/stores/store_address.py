@@ -123,14 +123,15 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
     Args:
         store: the store, for errors.
         options: the options, "table=NAME&org=NAME"; of PostgreSQL others are the server's.
-        is_influx: whether the store is InfluxDB, which has no others.
-        asks: whether the URL has a statement, beside which no table may stand.
+        is_influx: whether the store is InfluxDB, which has no other options than these two.
+        asks: whether the URL has a statement (a query); then no table may be named.
 
     Raises:
         ValueError: an option that InfluxDB has not, several tables, a table beside a statement.
     """
     from heliograph.numerics.check import fail
 
+    # The table's option, and all others, one of which may be InfluxDB's organisation.
     decoded = [unquote(option) for option in options.split("&") if option]
     tables = [option.removeprefix("table=") for option in decoded if option.startswith("table=")]
     others = [option for option in decoded if not option.startswith("table=")]

@@ -90,18 +90,19 @@ def open_text(path: Path) -> Iterator[TextIO]:
 
 
 def read_line_blocks(path: Path, size: int, progress: Progress | None = None) -> Iterator[bytes]:
-    """Yield the lines of a file of text in UTF-8, whatever it is in: whole ones, about `size` bytes of them at a time.
+    """Yield the lines of a text file, converted to UTF-8, in blocks of whole lines of about `size` bytes.
 
-    Bytes that are no text stay as they are, out of UTF-16 as U+FFFD.
+    Bytes that are no valid text stay as they are; in a file in UTF-16 they become U+FFFD.
 
     Args:
-        path: the file, packed or not.
-        size: bytes.
+        path: the file, packed by gzip or not.
+        size: bytes of a block, before conversion.
         progress: called with how many bytes of the file are read, and of how many (default none).
 
     Raises:
-        CutOffError: a packed file that is damaged or cut off, behind the lines before that.
+        CutOffError: a packed file that is damaged or cut off; raised after the lines before the damage were yielded.
     """
+    # `rest`: the begin of a line whose end is in the next block.
     total, rest, ended, damage = path.stat().st_size, b"", False, None
     with path.open("rb") as file, _open_unpacked(file) as unpacked:
         try:
@@ -110,6 +111,7 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
             raise _describe_damage(path, error) from None
         while not ended:
             part, ended, damage = _read_bytes_of_part(unpacked, size)
+            # Whole lines end at the last line feed; at the end of an undamaged file the last line needs none.
             text = rest + decode(part, ended and damage is None)
             end = len(text) if ended and damage is None else text.rfind(b"\n") + 1
             if progress is not None:

@@ -236,13 +236,13 @@ class EventFilter(AbstractSizedFilter):
         """Return the sum over (x, r) given silence of sender s: it sent nothing, or what it sent was lost.
 
         Args:
-            xry: Gaussians of the plant's state x, the senders' reference r and their signal y.
+            xry: K Gaussians of the state x, and the senders' references r and signals y; one sends if |y - r| > delta.
             channel: the link, by mode.
             losses: 1 if the sender reports that its value was lost, 0 if none was; NaN if nothing is reported.
             s: number of the sender.
             has_sent: whether the sender has a reference to compare y with.
         """
-        # Probabilities (K, M, A, C) of the status (link mode, steps since sent, losses) and of a cause of silence:
+        # Probabilities (K, M, A, C) of Gaussian, link mode, steps since sent and number of losses, for each cause:
         #   unsent: y was not sent;  dropped: y was sent by the rule |y - r| > delta, and lost;
         #   forced: y had to be sent wherever it lay (first value or heartbeat), and was lost.
         unsent, must_send = split_by_obligation(xry.label[:, s], has_sent, self.trigger.heartbeat)

@@ -145,14 +145,18 @@ class StochasticEventFilter(AbstractSizedFilter):
     ) -> Innovation:
         """Return a value's innovation given that it was sent; as it is where a component of the value is missing.
 
+        The sender is silent with a probability that falls with the distance of y from the reference r, so that sending
+        says something of y: it changes mean and covariance of the predicted value, and adds log P(sent | z) to its
+        log-likelihood. -log P(sent), the same for all z, is not added here.
+
         Args:
-            innovation: of the value, as if it were sent always.
+            innovation: innovation of the value, as if values were always sent.
             link: E G (m, p) and Cov of (G, n) (m, m, p + 1, p + 1), for z = G y + n.
             signal: moments of y before the value.
             reference: r, with which the sender compares y (m,).
             log_silent: log P(silent) before the value.
         """
-        # If a component is missing, the innovation stays, and any numbers may stand in for it.
+        # If a component is missing, the innovation is returned unchanged; 0 and I only stand in for NaN here.
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._find_moment_changes_given_sent(link, signal, reference, log_silent)

@@ -184,19 +184,21 @@ def correct_signal(
     """Condition the state on z = G y + n, where the signal y = E y + slopes xi + v comes from x = m + L xi.
 
     Args:
-        signal: moments of y, and the prior of x.
-        channel: second moments of G and n.
-        rule: how the error covariance is bounded if the law of G is uncertain.
+        signal: mean and slopes of y, and the prior of x: its mean m and factor L.
+        channel: second moments of the random gain G and the noise n.
+        rule: how the error covariance is bounded if the law of G is uncertain, as one of a set of laws.
         z: measurement (m,), NaN where a component did not arrive. If none arrived, the prior is returned.
         angles: which components of z are angles.
-        moments_for_gain: moments of y that gain and covariance use, by default `signal`.
+        moments_for_gain: moments of y that gain and covariance use, by default `signal`; a linear filter gives those
+            before any data, so that its gains depend on no data.
 
     Returns:
         The posterior of x, and the innovation with the covariance and density of the nominal law of G, its center.
     """
     moments_for_gain = signal if moments_for_gain is None else moments_for_gain
     expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)  # E z = M E y + E n
-    # The Kalman update by the nominal law: z = E z + M slopes xi + noise.
+    # The Kalman update by the nominal law: z = E z + M slopes xi + noise, M = E G. The noise has the covariance of all
+    # else in z: of (G - M) y, of M v and of n.
     slopes = jnp.asarray(channel.mean_gain) @ moments_for_gain.slopes
     noise = make_received_noise(moments_for_gain, channel)
     nominal, innovation = condition_on_measurement(moments_for_gain.prior, slopes, noise, z, expected, angles)

@@ -140,7 +140,8 @@ class MixtureFilter(AbstractSizedFilter):
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching.
 
         A combination is one choice of the values of all gains and noises of finite support: it is a gain, an offset and
-        a Gaussian noise.
+        a Gaussian noise. The state holds the law of the links' modes and one Gaussian of x, which after the correction
+        has the mean and covariance of the mixture of all updates (moment matching).
         """
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
         prior = state.law[c.mode] * jnp.asarray(c.weight)  # P(combination) = P(mode) P(combination | mode)
@@ -162,7 +163,8 @@ class MixtureFilter(AbstractSizedFilter):
             return _CombinationUpdate(posterior, log_likelihood, certain, value=value, covariance=covariance)
 
         updates = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
-        # Posterior weights of the combinations; `excluded` where none of them can produce z: the state stays.
+        # Posterior weights prior * likelihood. A combination that determines more of z exactly has an infinitely larger
+        # density, so that only those with the most count. `excluded`: none can produce z, and the state stays.
         log_likelihood = drop_below_point_mass(updates.log_likelihood, updates.certain)
         weight, density, excluded = posterior_weights(prior, log_likelihood)
         # Innovation of the mixture, angles near that of the most probable combination.
@@ -266,11 +268,17 @@ def _list_combinations(
 ) -> AtomCombinations:
     """Return all combinations of values of the gains and noises of z = G (C x + v) + n at one step, mode after mode.
 
+    Gains and noises have finite support, or noises are mixtures of finitely many Gaussians. An atom is one combination:
+    z = gain x + offset + noise with a Gaussian noise, and a weight, its probability in the mode.
+
     Args:
         sensor: C and v.
         modes: the links' modes, each with its law of G and n.
-        modes_before: those of the step before, which hold the transition to this step.
+        modes_before: modes of the step before, which hold the transition to this step.
         added_variance: variance that is added to each component of each noise.
+
+    Raises:
+        ValueError: more than COMPONENT_LIMIT combinations.
     """
     assert isinstance(sensor, LinearSensor)  # checked before
     # In each mode the atoms of sensor and link in series; those of probability 0 are left out where it is known.

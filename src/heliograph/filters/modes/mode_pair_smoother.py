@@ -71,13 +71,16 @@ def move_pairs(
 ) -> MovedPairs:
     """Return the Gaussian of each mode i moved by the plant of each mode j, [i, j], and the smoother gain back.
 
+    A smoother of a plant that switches between modes needs each pair of successive modes: the law of the next state,
+    and for the backward pass the law of the state given the next one.
+
     Args:
-        plants: the different plants.
-        plant_of: [j], number of the plant of mode j.
-        transform: of moments, for a nonlinear plant.
+        plants: the different plants; several modes may share one.
+        plant_of: [j], number in `plants` of the plant of mode j.
+        transform: how moments pass through a nonlinear plant, such as by cubature.
         gaussians: the Gaussian of each mode (M, n).
         u: input.
-        initial_power: E[x_i^2] before any data (n,), on which rounding acts.
+        initial_power: E[x_i^2] before any data (n,); rounding is in proportion to it.
     """
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
@@ -86,6 +89,8 @@ def move_pairs(
         f(x, u) is described by its slopes in x and the covariance that they do not explain. `transform` gives these for
         a nonlinear f. u is the input. `initial_power` is E[x_i^2] at the start, for rounding.
         """
+        # With x = m + L xi, the next state is mean + slopes xi + (what xi does not explain: error of f's linearisation
+        # and noise).
         image = find_transition_moments(plant, transform, x, u)
         unexplained = sum_unexplained(image, factor_process_noise(plant, u, initial_power))
         mean = image.mean + plant.noise_mean()

@@ -387,11 +387,11 @@ def gpb2_filter(
         transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
-    Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small. With almost no noise in plant and link squared errors were 17 times the claim.
+    Claim: "nominal". With few modes that the data distinguish the filter is close to the best one; behind slow fading
+    of many modes its covariance is too small. With almost no noise in plant and link squared errors were 17 times it.
 
     Raises:
-        ValueError: as for `imm_filter`.
+        ValueError: parts that do not fit, too many modes to list, a mode whose output is certain among others.
 
     Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
     """

@@ -164,10 +164,11 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Correct with the components of z that arrived: z = common + H zeta + v, with a bound on Cov v.
 
-        zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1). The sensor sends y~ = (y, 1) = C~ x~ + noise. In mode j,
-        z = G y~ with a random G of mean Hbar_j, whose last column is the noise of the link. H = (Hbar_1 C~, Hbar_2 C~,
-        ...), and Cov v = sum_j p_j V_j with V_j = E[(G - Hbar_j) E[y~ y~'] (G - Hbar_j)' | j] + Hbar_j R~ Hbar_j'. The
-        law p of the modes is known up to its bounds, so this sum is bounded over all p between them.
+        The state holds zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1), of which z is linear. The sensor sends
+        y~ = (y, 1) = C~ x~ + noise of covariance R~. In mode j, z = G y~ with a random G of mean Hbar_j, whose last
+        column is the noise of the link. So H = (Hbar_1 C~, Hbar_2 C~, ...), and Cov v = sum_j p_j V_j with
+        V_j = E[(G - Hbar_j) E[y~ y~'] (G - Hbar_j)' | j] + Hbar_j R~ Hbar_j'. The law p of the modes is known up to
+        its bounds, so this sum is bounded over all p between them.
         """
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         gains, (C, R) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)  # Hbar_j, C~ and R~
@@ -180,7 +181,8 @@ class UncertainModalFilter(AbstractJointModalFilter):
         matrix, common = subtract_mean_output(gains @ C, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * signal_moment)
         noise = join_columns(rounding, factor_spread(noise_bound))
-        # The mean of zeta counts x from 0, the model of z from the centre: `deviation` is the mean of products of x~.
+        # state.gaussian is about (x, 1) 1{mode = j}, with x from 0, but H acts on x~, from the centre: `deviation` is
+        # E[x~ 1{mode = j}], mode after mode.
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         model = MeasurementModel(concatenate_modes(matrix), common, noise)
         corrected, innovation = condition_modes_on_received(state.gaussian, deviation, model, z)

@@ -51,6 +51,10 @@ def sum_mixtures(
 ) -> ReceivedSums:
     """Return weighted sums over particles and their Gaussians of the innovations of z, less a reference innovation.
 
+    With the weight w of a particle times the probability of one of its Gaussians, and d its innovation less the
+    reference, they are sum w, sum w d and sum w (d d' + covariance): mean and covariance of the innovation follow. The
+    reference keeps d small, so that angles can be averaged and little is lost by cancellation.
+
     Args:
         base: the reference innovation (m,).
         weight: weights of B particles before z is known, of any sum.
@@ -59,7 +63,9 @@ def sum_mixtures(
         angles: components of z that are angles.
     """
     present, m = ~jnp.isnan(z), len(z)
+    # d (B, Gaussians, m) = (z - expected) - base; then particles and Gaussians become one axis.
     d = wrap_near(z - predicted.expected - base, jnp.zeros(m), angles)
+    # Gaussians without a finite innovation get the weight 0, and zeros in place of NaN.
     is_valid = jnp.all(jnp.isfinite(d) | ~present, axis=-1)
     w = jnp.where(is_valid, weight[:, None] * predicted.share, 0.0).ravel()
     d = jnp.where(is_valid[..., None], d, 0.0).reshape(-1, m)

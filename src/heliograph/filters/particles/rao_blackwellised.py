@@ -132,11 +132,11 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Draw the mode and some states of B particles before a step; return the Gaussian in each mode after it.
 
         Args:
-            particles: Gaussian of x in each mode, and log probabilities of the modes. After a correction, where z drew
-                both, they have one mode, and drawn states without variance: the draws here then change nothing.
-            numbers: indices of the particles (B,), which have draws of their own; None for all.
+            particles: for B particles the Gaussian of x in each of M modes, and the modes' log probabilities. If a
+                correction drew mode and states already, these are certain, and the draws here change nothing.
+            numbers: indices of the particles (B,), which select their random draws; None for all.
             key: two keys, of the states and of the modes.
-            u: input.
+            u: input of the plant.
             k: step.
             moved: False at the first step: modes keep their initial law, and x_0 stays Gaussian if plants are linear.
         """
@@ -334,10 +334,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def _expect_received(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, x: Gaussian, log_mode: jax.Array
     ) -> ExpectedMixture:
-        """Return the Gaussians that a particle expects of z, one for each mode and atom, to first order in h.
+        """Return the Gaussians that a particle expects of z, one for each mode and atom, with y = h(x) linearised.
 
-        `x`: Gaussian of the state in each mode; `log_mode`: log P(mode, what arrived). An atom is one Gaussian of the
-        mixture that z is given h(x).
+        `x`: Gaussian of the state in each mode; `log_mode`: log P(mode, which components arrived). Given h(x) and the
+        mode, z is a mixture of Gaussians gain y + offset + noise (`received`, by mode); an atom is one of these.
         """
 
         def expect_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:

@@ -280,14 +280,15 @@ def _bound_error(
 ) -> float:
     """Return a bound on the change of the rms error by overloads, relative to the rms error that the filter claims.
 
-    It is the largest over states i and steps k of sum_j |((I - K H) A)^j K s|_i / sqrt(P_ii), over overloads j steps
-    ago, where P is the filter's covariance and s the rms of what an overload adds to z at each output.
+    An overload is a signal beyond the range of a codeword, which is then cut off. The bound is the largest over states
+    i and steps k of sum_j |((I - K H) A)^j K s|_i / sqrt(P_ii), over overloads j steps ago: A moves the state, K is the
+    filter's gain, H the measurement, P the filter's covariance, and s the rms of what an overload adds to each output.
 
     Args:
         system: plant, sensor and links.
-        rms_excess: rms of the steps by which a codeword misses the signal beyond the range, at each step k.
+        rms_excess: rms of the distance by which a codeword misses a signal beyond its range, at each step k.
         links: moments of the channel at each step.
-        places: component of each output of the channel.
+        places: for each output of the channel, the component of the signal that it carries.
     """
     gains = lmmse(system).gains
     largest, n = 0.0, system.mean.size

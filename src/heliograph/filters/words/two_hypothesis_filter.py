@@ -155,13 +155,13 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         Returns:
             The hypotheses given codeword i, unchanged if it did not arrive, and the codeword's probability.
         """
-        # Four Gaussians [h, a] and their probabilities (2, 2): hypothesis h before, and codeword i right (a = 0) or
-        # not.
+        # Four Gaussians [h, a] and their probabilities (2, 2): h = 0 or 1 is the hypothesis so far, and a = 0 if the
+        # leading bits of codeword i are right, 1 if not. P[h, a] = P(h) P(a, codeword i | h).
         gaussians, probability = jax.lax.map(lambda x: self._split_by_answer(x, i, words), joint.parts)
         probability = probability * joint.weights[:, None]
         total = jnp.sum(probability)
-        # All are right: codeword i, and under hypothesis 0 those before it. The first codeword of a message counts
-        # alone: both hypotheses are then on the message before.
+        # all_right[h, a]: codeword i is right (a = 0), and so are those before it in this message (h = 0). At the first
+        # codeword of a message h is about the message before, so that a = 0 alone decides.
         all_right = jnp.array([[True, False], [True, False]])
         all_right = all_right & jnp.stack([jnp.asarray(True), ~some_word_was_used])[:, None]
         four_gaussians = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), gaussians)
@@ -178,6 +178,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             shares = jnp.where(sum_of_chosen > 0, chosen_shares, all_shares)
             return merge_mixture(four_gaussians, shares), sum_of_chosen
 
+        # New hypothesis 0 merges the Gaussians in which all are right, new hypothesis 1 the others.
         merged, weights = jax.vmap(merge_chosen)(jnp.stack([all_right, ~all_right]))
         is_used = words.present[i] & (total > 0)
         corrected = Hypotheses(merged, weights / jnp.where(total > 0, total, 1.0))

@@ -133,11 +133,11 @@ def sum_words_near_prior(
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
         weights: probabilities of the combinations.
         received: number of the received codeword.
-        grid: all codewords.
-        prior: of y.
-        dither: of the encoder.
+        grid: the codewords low + i step, i = 0, ..., 2^bits - 1.
+        prior: mean and standard deviation of y before the codeword.
+        dither: kind of dither (random shift before rounding) of the encoder.
     """
-    count = WINDOW * 2**BLOCK
+    count = WINDOW * 2**BLOCK  # codewords in the window
     lowest = prior.mean - REACH * prior.deviation
     # The first codeword of the block in which `lowest` lies; at the ends of the range the window is moved inwards.
     start = jnp.floor((lowest - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK

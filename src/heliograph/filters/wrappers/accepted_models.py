@@ -21,10 +21,12 @@ P = ParamSpec("P")
 
 
 def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take plants whose states have limits, by a `LimitedFilter` of what it makes.
+    """Decorate a function that makes a filter, so that it accepts plants whose states have limits.
+
+    The filter is made for the plant without limits, and a wrapper keeps its estimates within the limits.
 
     Args:
-        make: a function of a plant and more, whose filter keeps Gaussians or particles.
+        make: a function of `plant` and other arguments, whose filter keeps Gaussians or particles.
     """
     parameters = inspect.signature(make)
 
@@ -34,11 +36,13 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 
         `make` is the function that makes the filter, and `parameters` its signature.
         """
+        # Without limits, or without a plant (the function itself refuses that), nothing is changed.
         bound = parameters.bind(*args, **kwargs)
         plant = bound.arguments.get("plant")
         start = first(plant)
         if not isinstance(start, AbstractPlant) or not start.limits:
             return make(*args, **kwargs)
+        # Imported only where there are limits.
         from heliograph.filters.wrappers.state_limits import build_limited_filter, without_limits
 
         bound.arguments["plant"] = without_limits(cast(Any, plant))

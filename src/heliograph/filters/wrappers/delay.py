@@ -149,10 +149,10 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, relay: RelayLine)
 def enlarge_by_relays(
     plant: AnyPlant, sensor: AnySensor, channel: RelayedLinks
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[RelayLine, ...]]:
-    """Enlarge the plant's state x by the delay lines of past signals: the sensor's, then one of each relay.
+    """Enlarge the plant's state x by the delay lines of past signals (newest first): the sensor's, then each relay's.
 
-    `channel.stages` are the links: from the sensor to relay 0, from relay 0 to relay 1, ..., to the receiver. Stage i +
-    1 sends from the line of relay i, which so holds as many signals as that stage's delay may need (`past`).
+    `channel.stages` are the links: from the sensor to relay 0, from relay 0 to relay 1, ..., to the receiver. Stage
+    i + 1 sends from the line of relay i, which holds the newest and `past` older signals, as that stage may be late.
 
     Returns:
         The larger plant, a sensor that outputs the last relay's line, the link from there to the receiver, and for each

@@ -71,6 +71,7 @@ def mean_error_bound(
     Source: Jensen's inequality.
     """
     check_count("steps", steps)
+    # A ToldFilter corrects with each message as if the link had the gain, or noise, that the message reports.
     if not (isinstance(filter, ToldFilter) and isinstance(filter.base, LinearFilter)):
         got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
         raise fail("filter", "a linear_filter behind a link without memory that tells numbers", got)

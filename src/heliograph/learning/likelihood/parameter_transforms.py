@@ -35,9 +35,15 @@ def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> F
 
 
 def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
-    """Return the number, of this shape, whose coordinates on the line are x (size,), as `map_to_line` makes them.
+    """Return the number, of this shape, whose unbounded coordinates are x (size,): the inverse of `map_to_line`.
 
-    JAX can trace it; plain coordinates of an interval give a plain number.
+    A fit searches over unbounded coordinates, so that every step of it gives a number inside its domain. JAX can trace
+    x; plain coordinates of an interval give a plain number.
+
+    Args:
+        domain: probabilities that sum to 1 ("simplex"), a covariance, or an interval from `low` to `high`.
+        shape: shape of the number.
+        x: its coordinates (size,).
     """
     if domain.kind == "simplex":
         return _map_to_simplex(shape, x)

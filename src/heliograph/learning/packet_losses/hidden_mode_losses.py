@@ -40,6 +40,9 @@ class HiddenModeLosses(AbstractLossLaw):
     def fit(fates: object, intervals: bool = True) -> "HiddenModeLosses":
         """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
 
+        A hidden Markov chain is good or bad; packets are lost with another probability in each mode. The four shares
+        are searched by their logits x (4,).
+
         Args:
             fates: a stretch of packets, 0 (arrived), 1 (lost) or NaN (unknown), or several.
             intervals: whether to compute the intervals; their ends are NaN otherwise.
@@ -143,9 +146,10 @@ class FateRuns:
     def _compute_log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
         """Return the log-likelihood of all stretches for several sets of shares, (sets,); shares may be complex.
 
-        It is the log of 1' (T' A)^n ... (T' A)^m p, a product over runs of equal fates: the first has m packets, the
-        last n. A has the probabilities of a run's fate in each mode, T is the transition of the modes, and p their
-        stationary law.
+        A stretch is a sequence of packets, and a run in it has one fate (arrived, lost, unknown). The likelihood is
+        1' (T' A)^n ... (T' A)^m p, a product over runs: the first has m packets, the last n. A is the diagonal of the
+        probabilities of the run's fate in each mode, T is the transition of the modes, and p their stationary law.
+        Complex shares give derivatives: the imaginary part of l(x + i h) is h dl/dx for a tiny h.
 
         `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover.
         """
@@ -167,7 +171,8 @@ class FateRuns:
             power, scale = _raise_matrices(step, lengths)
             matrices[:, runs], scales[:, runs] = power[:, length_of_run], scale[:, length_of_run]
         product, scale = _multiply_runs(matrices)
-        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p sums one.
+        # Each stretch begins with a START, whose matrix is p 1'. So all columns of the product are (...) p, and the
+        # sum of one column is 1' (...) p.
         probability = product.sum(axis=-2)[..., 0]
         return np.asarray(np.log(probability) + scale + scales.sum(axis=1))
 

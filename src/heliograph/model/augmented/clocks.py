@@ -100,7 +100,7 @@ def with_clocks(
     # States: those of the plant, then offset and drift of each clock.
     total = n + 2 * len(clocks)
     offsets = {name: n + 2 * i for i, name in enumerate(clocks)}
-    # The clocks are a plant beside that of x, which they do not drive: a coupling of zeros.
+    # The clocks are a plant of their own that does not act on x: a coupling of zeros.
     larger = append_driving_plant(plant, _make_clock_plant(clocks, step), np.zeros((n, 2 * len(clocks))))
     return larger, {
         name: _make_stamped_sensor(sensor, moving, n, total, offsets.get(name)) for name, sensor in sensors.items()

@@ -50,6 +50,8 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
 def _append_delay_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     """Return the plant of (x, y_k, ..., y_{k-past}): x+ = A x + B u + w, y+ = C x+ + v, and older outputs move on.
 
+    A message that is late by d steps carries y_{k-d}. With past outputs in the state it is a linear measurement.
+
     Args:
         plant: the linear plant of x.
         sensor: the linear sensor, C and v.
@@ -68,8 +70,8 @@ def _append_delay_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     input_matrix = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
     # (w, v) enters x+ and y+ = C w + v.
     noise_matrix = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
-    # Nothing was sent before the start: all outputs are zero there. x_0 is a center and a draw of a law, whose mean is
-    # not counted twice.
+    # Nothing was sent before the start: all outputs are zero there. x_0 = initial_mean - law.mean + (a draw of `law`):
+    # the draw brings the law's own mean, which is therefore subtracted first.
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     output_names = [
         rename(name, f"{name}_{d}_ago" if d else f"{name}_sent") for d in range(past + 1) for name in sensor.outputs

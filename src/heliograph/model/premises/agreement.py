@@ -292,9 +292,10 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
     """
     if are_same(a, b):
         return True
-
+    # Numbers under JAX tracing cannot be compared; maps of other sizes, or of `past` outputs (delays), never agree.
     if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:
         return False
+    # Alike in structure, with all laws of b possible under a; or alike in each of several maps in parallel.
     if a.covers(b, lambda x, y: _same_noise(x, y, order)):
         return True
     maps_of_a, maps_of_b = a.in_parallel, b.in_parallel

@@ -226,10 +226,13 @@ class WordReader(NamedTuple):
     def read_words(self, encoder: Words, outputs: int, numbers: jax.Array) -> jax.Array:
         """Return the received codewords and flags, in the order of the channel, then dithers that are to be subtracted.
 
-        A codeword is q = low + D i, i = sum_j 2^j b_j, whose bit b_j is received as the sign s_j = 1 - 2 b_j.
+        A codeword is q = low + D i, i = sum_j 2^j b_j, whose bit b_j is received as the sign s_j = 1 - 2 b_j. A flag is
+        a number that is no codeword. `components` has for each number of the result the index in y of its codeword, or
+        -1 for a flag.
 
         Args:
-            encoder: encoder of the codewords.
+            encoder: encoder of the codewords: low, the step D, the number of bits, and whether the receiver subtracts
+                the dither, a random shift that was added before rounding.
             outputs: length of y.
             numbers: what the channel delivers: for each codeword its signs, and its dither if the receiver subtracts
                 it; for each flag one number.
@@ -242,9 +245,10 @@ class WordReader(NamedTuple):
                 values.append(numbers[start])
                 start += 1
                 continue
+            # q = low + D sum_j 2^j (1 - s_j) / 2
             signs = numbers[start : start + encoder.bits]
             values.append(low[component] + step[component] * jnp.sum(powers * (1 - signs)) / 2)
             if encoder.subtracts:
                 dithers.append(numbers[start + encoder.bits])
-            start += encoder.carried
+            start += encoder.carried  # the bits, and 1 more with a dither
         return jnp.stack(values + dithers)

@@ -44,9 +44,10 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
 def find_clock_set_back(time: np.ndarray) -> int | None:
     """Return the first row by which a clock of local time was set back by an hour, as when summer time ends; else None.
 
-    Dates then go from 02:50 to 02:00, if a row comes every ten minutes: back by an hour less a step. It is so on a
-    Sunday, to an hour before three, wherever summer time is known. Of rows an hour apart two have one time then, which
-    rows may have for other reasons too: they count on the last Sunday of October, and the first of November and April.
+    Dates then go from 02:50 to 02:00, if a row comes every ten minutes: back by an hour less a step. Wherever there is
+    summer time, it ends on a Sunday, and the clock is set back to an hour before three. If rows come every hour, two
+    rows have the same time then. Equal times have other causes too, so that they count only on the last Sunday of
+    October and the first Sundays of November and April.
 
     Args:
         time: dates in the order of the rows, datetime64[ns].

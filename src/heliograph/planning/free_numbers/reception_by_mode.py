@@ -131,12 +131,15 @@ def check_time_variation(network: Network, error: Error) -> None:
 def make_mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
     """Return the system of a network's best linear filter over the steps of an error, by the modes that it observes.
 
-    Noises are exact, or upper bounds where probabilities are uncertain.
+    A mode is a state of the links' Markov chains, such as which packets are lost. The system has for each step the
+    plant's A and Q, the transition and law of the modes, and by mode H and N of z = H x + n, Cov n = N. Noises are
+    exact, or upper bounds where probabilities are uncertain.
 
     Args:
         network: the network at some values of its free numbers, which may be traced.
         error: says over which steps: a period that repeats for ever, or a horizon.
-        young: the scalar b of Young's inequality at each step, (steps,) or (); None where the mean gains are known.
+        young: scalar b of Young's inequality at each step, (steps,) or (), for mean gains that are uncertain; None
+            where they are known.
 
     Raises:
         ValueError: a channel with memory whose mode is not observed, more than MOST_MODES modes together.
@@ -145,8 +148,8 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     plants = [at(network.plant, k) for k in range(steps)]
     a = jnp.stack([jnp.asarray(plant.matrix) for plant in plants])
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
-    # What each node receives, from the second moments E (x, 1)(x, 1)' of the state. They are steady where the steps
-    # repeat for ever.
+    # What each node receives: H = E[G] C and the noise N by mode. Random gains make N depend on the second moment
+    # E (x, 1)(x, 1)' of the state, which is steady where the steps repeat for ever.
     seconds = [steady_moment_with_one(plants[0])] * steps if forever else moments_with_one_over(network.plant, steps)
     states = jnp.stack([jnp.asarray(second) for second in seconds])
     b = None if young is None else jnp.broadcast_to(young, (steps,))

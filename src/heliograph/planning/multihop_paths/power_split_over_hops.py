@@ -111,13 +111,16 @@ def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
 
 
 def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
-    """Return the split of each path's power over its free hops that is best, with the path's information and slope.
+    """Return the split of each path's power P over its free hops that is best, with the path's information j and dj/dP.
 
-    With the noise factor D = A prod_h (1 + alpha_h / p_h) of a path its information is j = 1 / (D - t). It is greatest
-    where the powers p_h are those of one Lagrange multiplier l, by which they sum to P; then dD/dP = -l D.
+    A path is a chain of relays that amplify; p_h is the power that free hop h sends, and alpha_h its noise variance in
+    units of sent power. With D = A prod_h (1 + alpha_h / p_h) the path's information on the measured signal is
+    j = 1 / (D - t). It is greatest where all d log D / dp_h equal -l, with a Lagrange multiplier l for sum_h p_h = P;
+    then dD/dP = -l D.
 
     Args:
-        whole: A (`full`), t (`signal`) and alpha of the paths.
+        whole: A (`full`), which is D at infinite powers, and t (`signal`), of each path at each step (time, path); and
+            alpha (time, path, hop), 0 where a path has fewer hops than another.
         total: the power P of each path at each step (time, path).
     """
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below

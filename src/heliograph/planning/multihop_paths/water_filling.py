@@ -145,6 +145,13 @@ def _find_level(
 
     A power is min([min(y, highest) rise - ground]^+, peak): it is 0 up to the level ground / rise, then grows by
     `rise` for each unit of the level, until it has reached `peak` or the level `highest`.
+
+    Args:
+        rise: growth of each power with the level (k,), 0 for a power that stays 0.
+        ground: rise times the level at which each power begins (k,).
+        peak: largest value of each power (k,), may be infinite.
+        highest: level above which each power stays (k,), may be infinite.
+        total: the sum that is wanted.
     """
     grows = rise > 0
     rise, ground, peak, highest = rise[grows], ground[grows], peak[grows], highest[grows]

@@ -16,15 +16,16 @@ def compute_innovation_medians(
 ) -> Float[np.ndarray, " received"]:
     """Return the median of an innovation under the node's own law, by received number; 0 where the law is symmetric.
 
-    The innovation is taken for M (v - E v), the noise v through the mean gain M of the link, plus a Gaussian number,
-    independent, that makes its variance the claimed one; drawn with a fixed key.
+    A skewed noise has a median other than 0, which is no sign of a constant error. The innovation is taken for
+    M (v - E v) + e: the sensor's noise v through the mean gain M of the link, and an independent Gaussian number e that
+    makes the variance the claimed one. The median is that of draws with a fixed key.
 
     Args:
         network: the network.
         node: name of the node; of a filter of the centre, the nodes' numbers one after the other.
         variance: claimed variance of each innovation.
     """
-    # A filter of the centre: each node's numbers by its own law.
+    # The filter of the centre receives all nodes' numbers: each node's part by its own law.
     if node == Network.FUSED:
         ends = np.cumsum([network.nodes[name].received for name in network.names])
         of_nodes = zip(network.names, np.split(variance, ends[:-1]), strict=True)
@@ -32,17 +33,18 @@ def compute_innovation_medians(
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):
         return np.zeros(receiver.received)
-    # Medians are 0 of symmetric laws; behind links that remember, or tell more than values, they are taken for 0.
+    # The median of a symmetric law is 0. It is taken for 0 too behind a link with memory, with delayed outputs
+    # (`past`), or with other outputs than the received numbers, where M (v - E v) does not describe the innovation.
     noise, channel = first(receiver.sensor).noise, first(receiver.channel).condition_on_arrival()
     if noise.is_symmetric or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
     # M (v - E v) of drawn noises, (draws, received), with the mean gain M.
     with jax.enable_x64(True):
         noises = np.asarray(jax.vmap(noise.sample)(jax.random.split(jax.random.key(0), DRAWS)))
-        # Of the mean of the channel's map the block from inputs to outputs; the rest belongs to the constant 1.
+        # M is a block of the mean of the map from (y, 1) to (z, 1): the rows of z and the columns of y.
         gain = np.asarray(channel.moments(1).matrix)[: channel.outputs, : channel.inputs]
     received = (noises - np.asarray(noise.mean)) @ gain.T
-    # A Gaussian number beside it, of what is left of the claimed variance.
+    # Var e is the claimed variance minus that of M (v - E v), at least 0.
     rest = np.sqrt(np.maximum(variance - received.var(axis=0), 0.0))
     drawn = received + rest * np.random.default_rng(0).standard_normal(received.shape)
     return np.asarray(np.median(drawn, axis=0))

@@ -175,7 +175,9 @@ class Health:
         """Yield sentences on how the innovations of a filter contradict its model, the gravest first.
 
         These are: outputs left out, a constant error, variances reported with messages (`declared`), an impossible
-        innovation in a short recording, sizes other than claimed, and correlation in time (memory).
+        innovation in a short recording, sizes other than claimed, and correlation in time (memory). A doubt that
+        explains later ones ends the list. `health` holds the innovations of one filter of a node and their tests:
+        `test` is that of size and whiteness, None with too few rows.
         """
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
@@ -186,7 +188,8 @@ class Health:
                 return
         said = say_declared_variances_are_off(health.declared, health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
-        if health.test is None:  # too few rows, of which one may still be more than any law allows
+        # Too few rows for a test: still, one innovation may be larger than chance allows among all numbers judged.
+        if health.test is None:
             numbers = sum(filter.numbers for filter in self.filters)
             found = find_impossible_innovation(health.white, FALSE / numbers) if numbers else None
             if found is not None:

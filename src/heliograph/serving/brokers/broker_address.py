@@ -83,6 +83,7 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
     is_offered = not is_known and bool(scheme) and find_plugin(BROKERS, scheme) is not None
     if not (is_known or is_offered) or not host or parts.query or parts.fragment:
         raise fail("broker", shape, f"{scheme}://{host or ''}")
+    # User and password, where the environment has precedence; the topic.
     user = environment.get(USER) or (unquote(parts.username) if parts.username else None)
     password = environment.get(PASSWORD) or (unquote(parts.password) if parts.password else None)
     path = unquote(parts.path).strip("/")

@@ -136,11 +136,12 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
     """Simulate a link: return the events that arrive, in order of arrival. Inputs arrive at once and are never lost.
 
     Losses form a two-state Markov chain per node: P(loss | loss) = 1 - 1/run, and P(loss | no loss) such that the
-    stationary probability is `loss`.
+    stationary probability is `loss`. Messages that arrive have exponential delays, and may arrive twice.
 
     Args:
         events: the events as they are sent.
-        link: the model of the link.
+        link: probability of a loss (`loss`), mean number of losses in a row (`run`), mean delay, and probability that
+            a message is duplicated.
         seed: seed of the random numbers, not negative.
 
     Raises:

@@ -91,11 +91,15 @@ def _collect_crossings(watch: ServiceWatch) -> Metric:
 
 
 def _collect_links(watch: ServiceWatch) -> Iterable[Metric]:
-    """Return the metrics of the nodes' messages: by verdict, lost, what was refused by reason, and timeouts.
+    """Return the Prometheus metrics of the nodes' messages: by verdict, lost, values refused by reason, and timeouts.
 
-    Nodes whose messages carry no count have no number of lost ones.
+    The verdict on a message says what became of it, such as used or a duplicate. Lost messages are known by gaps in a
+    node's sequence numbers; a node whose messages carry no such number has no metric of lost ones.
+
+    Args:
+        watch: the counts of the running service: `links()` by node, and `outputs.left_out` by node and filter.
     """
-    # The metrics, with the labels of each.
+    # The metrics, still without values, with the labels of each.
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
     of_refused = "Values that count as not arrived, by reason; of flag and counter messages. A gate is of a filter."
@@ -104,7 +108,8 @@ def _collect_links(watch: ServiceWatch) -> Iterable[Metric]:
     timeouts = CounterMetricFamily("heliograph_timeouts", of_timeouts, labels=["node"])
     of_held = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
     held = CounterMetricFamily("heliograph_held", of_held, labels=["node"])
-    # Their values, by node, where a count may be None; what a gate left out by filter.
+    # Their values, by node; a count may be None where it cannot be known. A gate leaves out measurements that are
+    # improbable under a filter's prediction, so that its counts are by filter.
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict] or 0)

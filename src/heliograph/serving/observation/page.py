@@ -108,7 +108,12 @@ def make_application(
 ) -> Starlette:
     """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics.
 
-    Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
+    Args:
+        watch: the counts and states of the running service.
+        token: secret that each request must show; None for a page that needs none.
+        stopped: set when the service stops, so that open streams of views end.
+        hosts: names under which the page may be asked for, beside those of this machine. Without a token, or where
+            `hosts` are given, requests for other names are refused, so that no foreign page can lead here.
     """
     counts = ServiceMetrics(watch)
     overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))

@@ -27,9 +27,9 @@ def check_error_decay(
         what: name of the fusion.
         graph: whom each node receives.
         shares: c_ij of node i for its neighbour j (node, degree), zero for the node itself.
-        arrival: probability of every edge's message (edge,), receiver after receiver.
-        plant: A and Q.
-        squares: H_j' R_j^-1 H_j (node, n, n).
+        arrival: probability that the message of each edge (neighbour to node) arrives (edge,), receiver after receiver.
+        plant: the plant's matrix A and noise covariance Q.
+        squares: information H_j' R_j^-1 H_j of each node's measurement (node, n, n).
 
     Raises:
         ValueError: errors that grow, by the name of the node where they are largest.
@@ -61,12 +61,14 @@ class _ErrorMaps(NamedTuple):
 def _make_error_maps(
     graph: Graph, shares: np.ndarray, plant: tuple[np.ndarray, np.ndarray], squares: np.ndarray
 ) -> _ErrorMaps:
-    """Return one step of the errors e_i, with the gains that fixed shares have in the long run.
+    """Return the matrices that move the nodes' errors e_i over one step, with the gains that they have in the long run.
 
-    A node predicts, corrects by its own measurement, and by each message of a neighbour j: by its measurement, and by
-    the share c_ij of its estimate. With S_j = H_j' R_j^-1 H_j and F_i = I - P_i sum_j S_j
+    A node predicts (A), corrects by its own measurement, and by each message of a neighbour j: by its measurement, and
+    by the fixed share c_ij of its estimate. With the covariance P_i, S_j = H_j' R_j^-1 H_j and F_i = I - P_i sum_j S_j
 
       e_i+ = (A - P_i S_i A) e_i + sum_j [c_ij F_i A (e_j - e_i) - P_i S_j A e_i].
+
+    The sum is over the messages that arrive. Noises are left out: only growth or decay of errors is to be judged.
 
     Args:
         graph: whom each node receives, itself first.
@@ -84,6 +86,7 @@ def _make_error_maps(
     for _ in range(STEPS):
         root = observe_information(np.concatenate([a @ root, process], axis=-1), information).root
     p = covariance_of_root(root)
+    # Message j adds of_sender e_j + of_receiver e_i, of_receiver = -c_ij F_i A - P_i S_j A.
     of_sender = shares[:, :, None, None] * ((np.eye(n) - p @ information) @ a)[:, None]  # c_ij F_i A
     return _ErrorMaps(
         without_messages=a - p @ squares @ a,

@@ -80,19 +80,20 @@ class StackedFusions(Module):
         """Fuse the filters' estimates of step k.
 
         Args:
-            states: of the quantizers before the step, (fusion, node, ...).
-            estimates: of the filters by kind, (filter, node, ...).
+            states: states of the quantizers before the step, (fusion, node, ...). A quantizer rounds the mean that a
+                node sends to the fusion centre.
+            estimates: estimates of the filters by kind (filters of one structure, stacked), (filter, node, ...).
             k: number of the step.
 
         Returns:
             The quantizers' states after the step, the fused estimates by name of the fusion, and by that name which
-            components "saturated" a quantizer and how many "symbols" it sent, (node, n).
+            components were beyond a quantizer's range ("saturated") and how many "symbols" it sent, (node, n).
         """
         # Means and covariances in the order of each fusion's nodes.
         means = self._gather_by_fusion([e.mean for e in estimates])
         covariances = self._gather_by_fusion([e.covariance for e in estimates])
         uplinks: dict[str, PyTree] = {}
-        # Quantized means, and covariances widened by the quantizers' errors.
+        # Quantized means, and covariances enlarged by the bounds of the quantizers' errors.
         if self.quantizers is not None:
             fusions, nodes = self.order.shape
             send_one_mean = map_all(lambda quantizer, state, mean: at(quantizer, k).step(state, mean), nodes)

@@ -166,14 +166,18 @@ def _compute_gains_by_pattern(
 def _average_joint(
     mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
-    """Return J+ (N, N): of two nodes by products of mean gains, of one node by the mean over its patterns.
+    """Return J+ (N, N), the covariance of all nodes' errors after a step, averaged over which messages arrive.
+
+    J has blocks J_ij = E[e_i e_j'] (n, n) of the errors e_i of the nodes' estimates; N = nodes times n. Messages arrive
+    independently at different nodes, so for two nodes the mean of a product of gains is the product of the means. For
+    one node the products are averaged over its patterns, a pattern being the set of its messages that arrive.
 
     Args:
-        mesh: the fusion between neighbours.
+        mesh: the fusion between neighbours; `senders` (node, degree) are those whom each node receives, itself first.
         joint: J (N, N).
-        blocks: of J at each neighbourhood (node, degree, n, degree, n).
-        patterns: what may arrive.
-        gains: of each pattern.
+        blocks: parts of J for the neighbourhood of each node (node, degree, n, degree, n).
+        patterns: for each row r the node, which messages arrive, and the probability p_r.
+        gains: gains of the node in each row's pattern.
         step: the plant over the step, and the measurements' information S_l = H_l' R_l^-1 H_l.
     """
     count, degree = mesh.senders.shape
@@ -184,8 +188,8 @@ def _average_joint(
         weighted = values * patterns.probability.reshape(-1, *[1] * (values.ndim - 1))
         return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
 
-    # Of every pattern r: M_r (the node itself first), F_r, and the weights W_rl of H_l' R_l^-1 z_l for what arrived, so
-    # that K_rl = W_rl H_l' R_l^-1 and K_rl R_l K_rl' = W_rl S_l W_rl'.
+    # In pattern r the node's error becomes e+ = sum_j M_rj e_j + F_r w - sum_l K_rl v_l, with w of covariance Q and v_l
+    # of R_l. `w` holds W_rl, 0 where nothing arrived: K_rl = W_rl H_l' R_l^-1, so K_rl R_l K_rl' = W_rl S_l W_rl'.
     m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.correction_map)
     w = np.asarray(measurement_weights(gains.gain, patterns.present))
     # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.

@@ -69,13 +69,13 @@ class MeshEdges(Module):
         """Draw what arrives at step k of the run with this key, in each round of exchange.
 
         Args:
-            states: of the channels before the step, one for each of `groups`.
-            key: of the run.
+            states: states of the channels before the step, one for each group (a stack of channels of one structure).
+            key: random key of the run.
             k: number of the step.
 
         Returns:
-            The channels' states after the step, and which messages arrive (node, rounds, degree): flags, or their ages
-            in steps and -1 of none where messages may be late. A node's own message, at 0, always arrives.
+            The channels' states after the step, and what arrives (node, rounds, degree): flags or, if messages may be
+            late, the ages of messages in steps, -1 if none arrives. A node's own message, at 0, always arrives.
         """
         arrivals_by_round = []
         # One exchange after another; the channels go on from one to the next.
@@ -96,7 +96,12 @@ class MeshEdges(Module):
     ) -> tuple[PyTree, jax.Array]:
         """Send one message over each channel of a group: return their next states, and flags or ages of what arrives.
 
-        `count`: how many messages each edge sent before, which seeds the draws.
+        Args:
+            group: channels of one structure from neighbour to neighbour, stacked along a leading axis of edges.
+            state: states of these channels, with the same axis.
+            key: random key of the run.
+            k: number of the step, which selects the channel if it varies over time.
+            count: how many messages each edge sent before, which seeds the draws.
         """
 
         def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:

@@ -161,6 +161,9 @@ class NodeFilter(AbstractSizedFilter):
 def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """Return the filter of one node of a fusion between neighbours, on what its neighbours send.
 
+    In such a fusion there is no centre: each node corrects its estimate by its own measurement and by its neighbours'
+    messages. The filter does this for one node, with messages as measurements, so each node can be another process.
+
     Args:
         network: the network.
         fusion: name of its fusion between neighbours.
@@ -172,8 +175,10 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     _check_can_filter_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
+    # The graph of this node alone: itself first, then its neighbours, which only send.
     mesh = _build_one_node_mesh(network, fusion, node)
-    # What the filter receives: the node's own measurement, then a message of each neighbour.
+    # The filter receives the node's own measurement, then a message of each neighbour: the neighbour's mean (n),
+    # covariance (n, n) and measurement.
     sizes = tuple(network.nodes[name].received for name in mesh.nodes)
     own, *of_neighbours = sizes
     filter = NodeFilter(
@@ -186,7 +191,8 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         inputs=network.inputs,
         received=own + sum(_count_message_numbers(len(network.states), size) for size in of_neighbours),
     )
-    # The claim is that of the whole network, which stands here for the node's own part of it.
+    # The claim (what the covariance is said to be: exact, upper bound or nominal) is that of the whole network. The
+    # premise, attached here, holds the models under which it is true: plant, and the node's sensor and channel.
     return with_premise(filter, find_premise(network, node))
 
 

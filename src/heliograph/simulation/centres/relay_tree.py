@@ -162,7 +162,8 @@ def _propagate_block(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> tuple[A
     """Propagate the errors of a block of leaves (nodes with sensors) over all steps, and fuse them at their relays.
 
     Args:
-        leaves: the plant, the filter's name, the function that makes a leaf, and the number of leaves of a relay.
+        leaves: the plant, the filter's name, the function that makes a leaf, and the number of leaves of a relay
+            (`degree`).
         numbers: arguments of that function, arrays with a leading axis of leaves.
         u: inputs of the plant (step, inputs).
 
@@ -170,8 +171,9 @@ def _propagate_block(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> tuple[A
         Covariances of the leaves' errors (leaf, n, n), weights of each relay for its children's estimates (relay, n,
         child, n), and the errors of the relays' fused estimates.
     """
-    errors = _propagate_leaves(leaves, numbers, u)
-    # Relays with `degree` children at once, then the last relay if it has fewer.
+    errors = _propagate_leaves(leaves, numbers, u)  # every array has a leading axis of leaves
+    # A relay fuses the estimates of the next `degree` leaves. First all relays with `degree` children at once, then the
+    # last relay if it has fewer; its weights are padded with 0 for the children that it lacks.
     count, degree = len(errors.independent), leaves.degree
     count_in_full = count - count % degree
     errors_by_relay = jax.tree.map(lambda a: a[:count_in_full].reshape(-1, degree, *a.shape[1:]), errors)

@@ -292,15 +292,15 @@ def _classify_rows(
 
 
 def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
-    """Return the bias of each output that fits beside the scales; None where it is not significant, at 1 %."""
+    """Return the slowly varying bias of the outputs that fits beside scaled white noise; None if not significant."""
     filter = declared.filter
-    # A bias is a further state: not for models that vary over time, nor for values that are no outputs one by one.
+    # A bias is a further state: it needs a model constant over time, and a link whose values are outputs one by one.
     varies = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
     if varies or declared.place.outputs is None:
         return None
     best = refit_with_bias(declared, scales)
     gain = best.likelihood - scales.likelihood
-    # With two numbers more and no bias in truth, twice the gain is chi-squared of two degrees of freedom.
+    # With two numbers more and no bias in truth, twice the gain is chi-squared (two degrees of freedom; tested at 1 %).
     if gain < scipy.special.gammainccinv(1, LEVEL):
         return None
     # best.logs: scale of each class, then the bias's deviation over the root of its memory, then the memory.
@@ -308,7 +308,7 @@ def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
     rate, time = np.exp(best.logs[count:])
     at_memory = count + 1
     time_low, time_high = (float(np.exp(find_interval_end(declared, best, at_memory, sign))) for sign in (-1, 1))
-    # A scale s = (white / declared deviation)^2: declared over white is s^-1/2, smallest for the largest s.
+    # A scale is s = (deviation of the white noise / declared deviation)^2. The ratio declared / white is s^-1/2.
     largest = np.max(best.logs[:count])
     largest_end = max(find_interval_end(declared, best, number, 1) for number in range(count))
     return DeclaredBias(

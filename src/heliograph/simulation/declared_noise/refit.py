@@ -293,12 +293,14 @@ def find_median_step(declared: DeclaredRows) -> float:
 def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: int) -> float:
     """Return an end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
 
-    At the end the likelihood, the other numbers at their best, is 1.92 nats (REACH) below its maximum.
+    The numbers are scales of the noise that messages declare, and with a bias its deviation and memory. At the end the
+    likelihood, with the other numbers at their best (profile likelihood), is 1.92 nats (REACH) below its maximum: half
+    the 95 % point of chi-squared with one degree of freedom.
 
     Args:
         declared: the filter and the recording.
-        best: the maximum.
-        number: which of the numbers.
+        best: the logarithms of the numbers at the maximum, and the log-likelihood there.
+        number: index of the number in these logarithms.
         sign: 1 for the upper end, -1 for the lower one.
     """
     constrained = best
@@ -332,10 +334,12 @@ def _maximise_likelihood(
 ) -> Refit:
     """Return the maximum of the likelihood that a search finds from a start.
 
+    Messages declare variances of their noise; the true ones are these times a scale, one for each class of messages.
+
     Args:
         declared: the filter and the recording.
-        start: logarithms of the scale of each class of messages. With a bias two more: of its deviation over the root
-            of its memory, and of its memory.
+        start: logarithms of the scales. With a slowly varying bias of the outputs two more: of the bias's deviation
+            over the root of its memory, and of its memory (time constant).
         fixed: index of a logarithm that stays; None if all are free.
     """
     # Every logarithm is searched from -FARTHEST to FARTHEST; that of a bias's memory, the last, from FAST steps to SLOW

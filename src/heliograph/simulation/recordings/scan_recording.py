@@ -189,10 +189,12 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
 def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return the outputs of all filters for all rows, smoothed if the task has a smoother, by XLA some rows at a time.
 
-    Weights between neighbours that depend on nothing but what arrives are computed for the rows of a part at once.
+    It serves networks whose fusions between neighbours native code cannot compile. There each node weighs its
+    neighbours' messages; weights that depend only on which messages arrive are computed for the rows of a part at once.
 
     Args:
-        task: the filters, inputs and arrivals; rows of a network with fusions between neighbours continue no others.
+        task: the filters, the smoother or None, inputs (steps, inputs), and which messages arrive, by fusion. The rows
+            begin the recording: the filters start from their initial states.
         z: measurements (steps, node, received) by group.
         judged: True to leave out measurements that filters judge implausible.
     """

@@ -92,7 +92,8 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
         fill, none_failed = labels.fill_from_results, np.full(steps, np.nan)
         claimed = fill("deviation", lambda score: take_variances(score.claimed()))
         fields = {
-            # Sums by batch, from which the statistics can be restored.
+            # Sums over the runs of each batch (a part of the runs), from which the statistics can be restored. Sums of
+            # e_i e_j are held for i <= j; `expand_pairs` makes matrices of them.
             "runs": first.count,
             "errors": fill("errors", lambda score: expand_pairs(score.pairs)),
             "claimed": fill("claimed", lambda score: expand_pairs(score.claimed_pairs)),

@@ -139,16 +139,21 @@ class Statistics(AbstractReducer[StatisticsByName]):
         )
 
     def finish(self, carry: RunSums, collected: PyTree, network: Network) -> StatisticsByName:
-        """Return the statistics by node and filter, from the sums over all runs; nothing is collected.
+        """Return the statistics by node and filter, from the sums over all runs.
 
-        `carry`: what `summed` returned.
+        Args:
+            carry: the sums over runs, of products of errors, of NEES and of claimed covariances, with all estimates
+                along one axis.
+            collected: not used, as no single run is kept.
+            network: the network, which tells which estimate is whose.
         """
-        # Sums of each kind (a stack of filters of one structure) and of each fused estimate, then by name.
+        # Split the axis of estimates into kinds (stacks of filters of one structure) and fused estimates.
         all_kinds = network.kinds + network.mesh_kinds
         count, sums = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
         sums_of_kinds, sums_of_fused = sums[: len(all_kinds)], sums[len(all_kinds) :]
         named = {"estimates": sums_of_kinds, "fused": dict(zip(sorted(network.fused), sums_of_fused, strict=True))}
-        # Each sum by node and filter. Of a sum (..., filter, node, pair) the axis of filters is -3, without pairs -2.
+        # Each sum by node and filter. The axis of filters is -3 in a sum (..., filter, node, pair) of products e_i e_j,
+        # and -2 in a sum (..., filter, node).
         filter_axes = _FilterSums(pairs=-3, nees=-2, claimed=-3, failed=-2, failed_runs=-2)
         sums_by_name = [split_by_name(network, named, itemgetter(i), axis) for i, axis in enumerate(filter_axes)]
         # Statistics with their claims, then those of the quantizers.

@@ -263,7 +263,8 @@ class Record(SavableResults):
         """
         check_title(dataset, RECORD)
         lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], read_labels(dataset, "node")
-        # Estimates by name, of the nodes for which any are kept.
+        # `lead` are the leading axes of all values. "estimated" is true for nodes whose estimates were recorded, and
+        # "length" is how many numbers each node receives.
         measurement, length = read_values(dataset, "measurement", lead), read_values(dataset, "length", lead)
         estimated = np.flatnonzero(read_values(dataset, "estimated", lead))
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in estimated}

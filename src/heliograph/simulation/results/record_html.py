@@ -57,7 +57,7 @@ def write_record_html(record: DrawableRecord) -> str:
     Returns:
         HTML that fetches nothing, runs nothing, and fits any width.
     """
-    # Title; of Monte Carlo runs the first.
+    # The title; of a record of Monte Carlo runs the first run is drawn (`one`).
     node = next((name for name, filters in record.estimates.items() if filters), None)
     rows, runs = len(record.time), record.runs
     title = f"{type(record).__name__}: {rows} row{'s' * (rows != 1)}"
@@ -65,7 +65,7 @@ def write_record_html(record: DrawableRecord) -> str:
     if node is None or rows == 0 or runs == 0:
         return f"<div>{title}, no estimates</div>"
     one = record if runs is None else record.of_run(0)
-    # At most so many filters, rows and states, with notes on what is left out.
+    # At most FILTERS filters, POINTS rows and PANELS states are drawn, with notes on what is left out.
     filters = dict(list(one.estimates[node].items())[:FILTERS])
     chosen = np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).round().astype(int))
     left_out = {"filters": len(one.estimates[node]) - len(filters), "states": len(one.states) - PANELS}
@@ -106,7 +106,7 @@ def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state:
         state: number of the state.
         chosen: rows that are drawn.
     """
-    # Means and ends of the bands of each filter, the truth, and the range of all.
+    # For each filter the mean and both ends of its band (rows,); the truth; and the range that holds all of them.
     curves = [_read_curve(estimate, state, chosen) for estimate in filters.values()]
     truth = None if record.truth is None else np.asarray(record.truth)[chosen, state]
     low, high = _find_range([part for curve in curves for part in curve] + ([] if truth is None else [truth]))

@@ -24,11 +24,16 @@ _Places = dict[_Key, list[int]]  # of columns
 def make_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
     """Return the table of a record: a row for each time, or run and time; columns labelled as in LEVELS.
 
-    `fields`: the record's, by name. `runs`: number of its runs; None without an axis of runs.
+    The labels of a column are node, filter, quantity, component and another one, "" where one does not apply.
+
+    Args:
+        fields: the record's fields by name: truth (runs, times, states), measurements by node, estimates by node and
+            filter, uplinks by name of the fusion, names of the states, and the times.
+        runs: number of runs; None for a record of one run, whose arrays have no axis of runs.
     """
     import pandas as pd
 
-    # Columns (run, time) by label: truth, measurements, estimates, uplinks.
+    # Columns (run, time) by label: truth, measurements, estimates, and for uplinks what quantizers sent of each state.
     columns: dict[Column, np.ndarray] = {}
     if fields["truth"] is not None:
         columns |= {("", "", "truth", s, ""): fields["truth"][..., i] for i, s in enumerate(fields["states"])}

@@ -24,20 +24,20 @@ def blame_nodes_for_implausible_rows(
 ) -> dict[str, dict[int, str]]:
     """Give each row that all central filters find implausible to one of the nodes that have a value there.
 
-    It is the node without whose values the filters find the row plausible, as `Judgement.find_culprit` chooses it.
+    A row is blamed on a node without whose values the filters find it plausible; `Judgement.find_culprit` chooses.
 
     Args:
         filters: the central filters, which receive from all nodes.
-        before: their states before each row, with a leading axis of rows.
+        before: states of these filters before each row, with a leading axis of rows.
         z: measurements by node, in the order in which the filters receive them, NaN where one is missing.
         u: inputs by row.
         why: rows that are implausible, with the reason.
-        nodes: those that no filter of their own judges.
+        nodes: nodes without a filter of their own that judges their values.
 
     Returns:
         The rows of each node that is to blame, with the reason.
     """
-    # One trial for each implausible row and each of these nodes that has a value in it: the row without the node's.
+    # One trial for each implausible row and each node with a value in it: the row without the values of this node.
     removals = [_RowWithoutNode(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
     rows = np.array([removal.row for removal in removals], dtype=int)
     without = {name: values[rows] for name, values in z.items()}

@@ -72,14 +72,16 @@ class FilterColumns(NamedTuple):
 
 
 def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterColumns, ...]:
-    """Return the columns of each filter's outputs in rows that are laid out so.
+    """Return for each filter the columns of its mean, covariance and other outputs in a row of all outputs.
 
-    They are found from a row 0, 1, 2, ...: taken apart by name as outputs are, it gives the columns in their places.
+    `outputs` is the layout of a row: which output lies where. The columns are found from a row 0, 1, 2, ...: if it is
+    taken apart by node and filter like any row of outputs, each entry is the number of its own column.
     """
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
     # The axis of filters is the third from last of means (filter, node, n), the fourth of covariances.
     mean = split_by_name(network, numbered, attrgetter("mean"), axis=-3)
     covariance = split_by_name(network, numbered, attrgetter("covariance"), axis=-4)
+    # Columns of judgements, of weighed innovations, of mode probabilities (first, last + 1), and of a centre's tests.
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     modes = {
         name: (int(columns[0]), int(columns[-1]) + 1)

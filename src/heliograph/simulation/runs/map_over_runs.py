@@ -48,7 +48,10 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
 
 
 def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
-    """Return the function's results (run, ...) of `values` (run, ...), by XLA, at most `width` runs in parallel."""
+    """Return the function's results (run, ...) of `values` (run, ...), by XLA, at most `width` runs in parallel.
+
+    The runs are shared among the cores; each core computes its share in blocks of `width` runs, a vectorised program.
+    """
     # Each core computes `blocks` times `width` runs: such that all cores are busy and little is padding. Numbers of
     # both are rounded up, -(-a // b).
     runs, cores = len(values[0]), os.cpu_count() or 1

@@ -50,19 +50,23 @@ def filter_step(
 
     Args:
         filter: the filter.
-        state: before the step.
+        state: state of the filter before the step.
         z: measurement (received,), NaN where a component is missing.
         u: inputs of the plant over the step.
         k: number of the step.
-        smooths: put out a smoother step too.
-        judges: put out a judgement of the data too.
-        skip: code of the reason not to use z, 0 if there is none: then nothing of it arrived, and where the prediction
-            itself is no number the state before it stays. None: use z.
+        smooths: put out a smoother step too: what the backward pass of a smoother needs of this step.
+        judges: put out a judgement too: whether the data were plausible under the prediction.
+        skip: code of the reason not to use z, 0 if there is none. With a reason, z counts as not arrived; if the reason
+            is that the prediction is not finite, the state before it stays. None: use z.
+
+    Returns:
+        The next state, and the estimate with what was asked for; `weighed` is the innovation by component, for a filter
+        that gives unlikely components a smaller weight.
     """
     # Data that are not used count as not arrived.
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
     judgement, weighed = None, None
-    # With a smoother step; it has no judgement of its own, which is made by a step beside it.
+    # With a smoother step, which returns no judgement: this comes from a second step from the same state.
     if smooths:
         if judges:
             *_, judgement, innovation = step_with_judgement(filter, state, z, u, k)

@@ -63,11 +63,16 @@ def simulate_trajectories(
 
 
 def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
-    """Apply a function of one run's values to all runs.
+    """Apply a function of one run's values to all runs, and compute once what all runs share.
 
-    `values` have a leading axis of runs: of length `runs`, or 1 for a value that all runs share. So do the results: a
-    result that depends on shared values alone is computed once, and is shared too.
+    Args:
+        function: from the values of one run to its results.
+        values: arrays with a leading axis of runs, of length `runs`, or of length 1 for a value that all runs share.
+
+    Returns:
+        The results, with a leading axis of runs too: of length 1 if a result depends on shared values alone.
     """
+    # `traced`: the function of one run as a jaxpr of flat arguments. `shape`: the tree of its results.
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]

@@ -64,11 +64,13 @@ def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
 
 
 def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mapping[str, np.ndarray]) -> NodeGroup:
-    """Return the nodes of a group, stacked.
+    """Return the nodes of a group with their arrays stacked along a leading axis, so that JAX maps over the nodes.
+
+    A memory is a random mode of a sensor or channel that lasts over steps, such as a Markov chain of losses.
 
     Args:
         network: the network.
-        nodes: those of the group, of one structure, by name.
+        nodes: the nodes of the group by name, whose sensors and channels have one structure.
         memories_of: by node, the numbers that seed the draws of its sensor's and its channel's memories.
     """
     first_name, first_node = next(iter(nodes.items()))

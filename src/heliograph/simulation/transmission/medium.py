@@ -152,10 +152,11 @@ class SeparateChannels(AbstractMedium):
         """Return the links' next states, and what each node receives of its measurement of x through its own channel.
 
         Args:
-            state: of the links by group of nodes, before the step.
-            x: the plant's state after the step.
-            u: inputs of the plant over the step.
-            key: of the run.
+            state: states of the links (memory of the channel, of the trigger and of the sensor) before the step, by
+                group; a group is a stack of nodes of one structure.
+            x: the plant's state after the step (n,).
+            u: inputs of the plant over the step (inputs,).
+            key: random key of the run.
             k: number of the step.
 
         Returns:

@@ -82,9 +82,9 @@ _by_xla = quickly_compiled(_transmit_all)
 def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     """Return what was received in one run, (node, sequence, time, values, arrival), in the order of arrival.
 
-    Times are steps from 0. A value belongs to the step at which it was sent, which is its sequence number too: by a
-    constant delay, or by its time stamp. A value that is received twice has one number, and two channel noises.
-    Values received before the first was sent, and lost ones, are left out.
+    Times are steps from 0. A value belongs to the step at which it was sent, which is its sequence number too. This
+    step is known from the channel's constant delay, or from the value's time stamp. A value that is received twice has
+    one number, and two channel noises. Values received before the first was sent, and lost ones, are left out.
 
     Args:
         record: the record.
@@ -103,6 +103,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, least=0)]
         values, delays = _separate_delays(name, network.nodes[name], values)
+        # A row arrived if any of its numbers did, and its delay is known; it was sent at step k - delay.
         arrived = ~np.isnan(values).all(axis=1) & ~np.isnan(delays)
         for k in np.flatnonzero(arrived):
             sent = int(k - delays[k])
