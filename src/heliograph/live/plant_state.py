@@ -181,8 +181,7 @@ class PlantState:
     def undo_leap(self, leap: ClockLeap, longest_gap: float, names: Sequence[str]) -> bool:
         """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
 
-        A leap is a gap in time that one clock alone shows, as by a wrong stamp. Returns False, and changes nothing, if
-        the row before the leap is not known any more.
+        Returns False, and changes nothing, if the row before the leap, a gap in time by one clock, is no longer known.
 
         Args:
             leap: the leap, or an earlier one that it follows.

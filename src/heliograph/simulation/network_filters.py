@@ -377,8 +377,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
     Each node's filter sends its estimate as a report. The measurement joins the reports of this step, node after node
     in the network's order; if links may be late, those of the step before follow, and so on. Numbers that did not
-    arrive are NaN. A quantizer enters by the bound on its error. The claim (what the covariance is said to be) is the
-    fusion's.
+    arrive are NaN. A quantizer enters by the bound on its error. The claim of its covariance is the fusion's.
 
     Args:
         network: the network.

@@ -349,7 +349,7 @@ def gpb1_filter(
 
     A mode is a value of what the link remembers from step to step, such as good or bad. At each step the Gaussian is
     corrected in each of the M modes, the modes are weighted by the likelihood of what arrived, and the M posteriors are
-    merged into one Gaussian of the same mean and covariance. The correlation of state and mode is lost so.
+    merged into one Gaussian of the same mean and covariance, without the correlation of state and mode.
 
     Args:
         plant: the plant, n states.

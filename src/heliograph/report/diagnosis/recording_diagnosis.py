@@ -207,10 +207,9 @@ class Health:
     def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
         """Yield a sentence on the outputs whose innovations are larger than claimed, and one on those that are smaller.
 
-        A filter claims a covariance of its innovations; squares that are larger than claimed mean overconfidence. Each
-        output is judged by itself, since a mean over outputs hides the one that is wrong; all are judged together where
-        none is wrong by itself. `health`: the filter's innovations. `test`: of these over all outputs, with their mean
-        square `power` and its standard error.
+        Each output is judged by itself, since a mean over outputs hides the one that is wrong; all are judged together
+        where none is wrong by itself. `health`: the filter's innovations. `test`: of these over all outputs, with their
+        mean square `power` and its standard error.
         """
         # `level`: probability of a false alarm that one test may have.
         name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
@@ -327,8 +326,7 @@ def _examine_filter(
     `white` (time, m): innovations L^-1 (z - E z), with L L' the claimed covariance. If the claim (what the covariance
     is said to be) holds they have variance 1 and no correlation over time, which `test` examines. Both are None for a
     filter that claims no covariance, or receives nothing. `expected`: mean square of `white` that the model expects in
-    this recording, which random gains may move from 1. `declared`: tests of noise variances that are reported with
-    messages. `listener` holds the filter, its names, and the measurements that it received.
+    this recording, which random gains may move from 1. `declared`: tests of noise variances reported with messages.
     """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
     # Without a claim there is nothing to test; 1 is the mean square that a true claim gives.

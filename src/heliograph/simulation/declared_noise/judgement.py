@@ -262,8 +262,7 @@ def _classify_rows(
 ) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
     """Divide the rows with messages of a link into classes by the mean logarithm of the variances that they declare.
 
-    It is to be tested if errors grow with the noise variances that messages report. `link`: its number among the links
-    that report numbers. `z`, `u`: measurements and inputs.
+    `link`: its number among the links that report numbers with each message. `z`, `u`: measurements and inputs.
 
     Returns:
         The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
