@@ -258,9 +258,8 @@ def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
 def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
 
-    A program is evaluated for many runs side by side; what is equal in all of them needs to be computed once only. A
-    node is a number that is computed, a buffer is memory, a guard is code that runs under a condition. The input
-    buffers are in the result. From each item that differs, all items that are computed from it are found.
+    A program is evaluated for many runs side by side; what is equal in all of them is computed once. A node is a number
+    that is computed, a buffer is memory, a guard is a conditional block. The input buffers are in the result.
     """
 
     @cache
@@ -346,8 +345,8 @@ def find_crossing_items(items: Iterable[Any], differing: set[Any]) -> set[Any]:
 def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:
     """Return the items on which a node, buffer or statement depends: it differs between runs if one of them does.
 
-    Nodes are operations on numbers. A store, a guard (conditional block) and a loop are statements. `list_owners`
-    returns the loops and guards around a block on whose conditions its contents depend.
+    Stores, guards (conditional blocks) and loops are statements. `list_owners` returns the loops and guards around a
+    block on whose conditions its contents depend.
     """
     # Memory inside other memory differs with it.
     if isinstance(item, Buffer):

@@ -113,8 +113,7 @@ class NodeEvents:
     def describe_doubtful_count(self, name: str) -> list[str]:
         """Return a line if a count begins at 0 again sooner than its bits say, and one if it stands still.
 
-        Each message has a running count, which shows lost ones. It begins sooner than after `self.period` messages if
-        it fell three times (FEWEST_FALLS) or more, each time from the largest number, 2^b - 1. `name`: of the node.
+        It begins sooner than its `period` if it fell three times or more, each time from 2^b - 1. `name`: of the node.
         """
         if not self.period or not len(self.time):
             return []

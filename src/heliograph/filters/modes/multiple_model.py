@@ -347,9 +347,8 @@ def gpb1_filter(
 ) -> MultipleModelFilter:
     """Return the first-order generalised pseudo-Bayes filter behind links with memory: one Gaussian, and modes' law.
 
-    A mode is a value of what the link remembers from step to step, such as good or bad. At each step the Gaussian is
-    corrected in each of the M modes, the modes are weighted by the likelihood of what arrived, and the M posteriors are
-    merged into one Gaussian of the same mean and covariance, without the correlation of state and mode.
+    A mode is a value of what the link remembers, such as good or bad. In each step the Gaussian is corrected in each of
+    M modes, these are weighted by the likelihood of what arrived, and the M posteriors merged into one Gaussian.
 
     Args:
         plant: the plant, n states.

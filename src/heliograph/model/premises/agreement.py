@@ -39,10 +39,9 @@ ENCODER = "encoder"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
-    """Return the names of the models on which a filter's belief and its place in a network differ.
+    """Return the names of the models that differ: those a filter was made for (`believed`), and its node's (`own`).
 
-    A filter's claim (that its covariance is exact or a bound) holds only in the world for which it was made. `believed`
-    has the models that it was made for, such as plant, sensor and channel; `own` has those of the node where it runs.
+    Models are plant, sensor, channel and relays. Its claim holds only in the world for which it was made.
     """
     # `order`: the moments of noises that the filter uses; None for their laws. Past signals may be states of both.
     order, own = believed.order, _enlarge_world_by_past(believed, own)

@@ -278,8 +278,6 @@ class Mesh(Module):
     ) -> PyTree:
         """Return function(rule, estimates of the neighbours, *rest, precomputed) with a leading axis of nodes.
 
-        Each node fuses estimates by a rule. Nodes of about as many neighbours form a bucket, computed by one `vmap`.
-
         Args:
             function: computation at one node; its result has a field `neighbour_factors`, one row for each message.
             covariance: of all estimates (row, n, n), one row for each node unless `senders` says otherwise.
@@ -292,7 +290,7 @@ class Mesh(Module):
         information, traces = jax.vmap(invert_positive_definite)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         # The axis of nodes is the last one of a rule's arrays, and the first one of all other arguments.
         over_nodes = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
-        by_bucket = []  # nodes of about as many neighbours together
+        by_bucket = []  # nodes of about as many neighbours form a bucket, computed by one `vmap`
         for bucket, bucket_weights in zip(self.buckets, precomputed or [()] * len(self.buckets), strict=True):
             rows, width = bucket.rows, bucket.width
             # What these nodes received, without the padding beyond the bucket's width.
