@@ -234,8 +234,8 @@ def accumulate(
 ) -> SummingProgram:
     """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
 
-    Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
-    The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+    A Monte Carlo simulation is such a function: the run's number makes its random key. Sums take no more memory for
+    more runs. The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
 
     Args:
         function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what
@@ -252,10 +252,12 @@ def accumulate(
         ValueError: a function that returns no pair.
     """
     find_processor_features()  # refuses a processor that LLVM does not know
+    # The arrays of all arguments, and of some the entries that are constants of the code.
     leaves = jax.tree.leaves(examples)
     known_numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
     # The last argument is the number of the run.
     program = lower_function(function, *examples, make_placeholder((), np.uint32), known=known_numbers, single=single)
+    # The results are a pair: its first part is summed, its second collected.
     summed_leaves = _count_summed_leaves(program.tree)
     summed = tuple(n < summed_leaves for n in range(len(program.outputs)))
     return SummingProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))

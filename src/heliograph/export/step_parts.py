@@ -40,8 +40,16 @@ class PartOfStep(NamedTuple):
 def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
     """Return the functions to export: one step or, if `apart`, prediction and correction, for numbers of type `real`.
 
-    Each has example arguments, of which only shapes count, and the names of its results `beside` state and estimate.
+    C code is later written from these JAX functions. Each has example arguments, of which only shapes count, and the
+    names of its results `beside` state and estimate: "implausible" says that the estimate lost its digits and must not
+    be used, "spoilt" that an input has too few digits.
+
+    Args:
+        filter: the filter.
+        real: "double" or "float".
+        apart: whether prediction and correction are functions of their own.
     """
+    # Examples: the arrays of the state, a measurement, inputs and the number of a step.
     leaves, tree = jax.tree.flatten(filter.init())
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
     flags = ("implausible", "spoilt")

@@ -34,10 +34,11 @@ def read_parquet_blocks(
     import pyarrow.parquet as pq
 
     try:
-        # Buffered ahead, what was read is kept until the file is closed: 24 bytes a row of three columns.
+        # Without `pre_buffer`: that would keep what was read until the file is closed, 24 bytes a row of three columns.
         with pq.ParquetFile(path, pre_buffer=False) as file:
             check_distinct(path, file.schema_arrow.names)
             count, total = 0, file.metadata.num_rows
+            # Batch by batch: `first` is the number of its first row, counted from 1.
             for batch in file.iter_batches(batch_size=rows):
                 first, count = count + 1, count + batch.num_rows
                 if progress is not None:

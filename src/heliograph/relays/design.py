@@ -179,7 +179,7 @@ def _make_gains(
     """Return s+ = (A - K B) s + K z + a - K b of one filter as gains over time; its estimate is its state s.
 
     Args:
-        steps: of the network, with A, a and, over what all filters receive, B and b.
+        steps: the network's, with A, a and B, b: all filters' received numbers are predicted from s as B s + b.
         gain: K.
         received: which of the received numbers are the filter's z.
         covariance: of its error after each step.

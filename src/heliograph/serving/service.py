@@ -315,7 +315,7 @@ class Service:
     def _commit(self, touched: dict[str, PlantState], entries: Sequence[Entry], malformed: int) -> list[Output]:
         """Commit the changed plants and entries; return the outputs to publish.
 
-        If that fails, the plants are forgotten in memory: what the store has is true.
+        If it fails, the plants are dropped from memory and later read again from the store, whose content is true.
 
         Args:
             touched: the changed plants, by name.

@@ -130,7 +130,11 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
     """Estimate each step's state given up to `lag` later steps.
 
     For each step k there is a short backward pass, from the filtered law after step k + lag to that after step k. All
-    these passes run in parallel, `lag` steps of each.
+    these passes run in parallel, `lag` steps of each. A law is a mean and a covariance.
+
+    Args:
+        steps: the filter's steps (leading axis: time): each has its filtered law, and passes a smoothed law one back.
+        lag: number of later steps whose data an estimate may use.
     """
     last = len(steps.mean) - 1
     k = jnp.arange(last + 1)

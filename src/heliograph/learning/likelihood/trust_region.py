@@ -41,8 +41,7 @@ class OpenEnds(NamedTuple):
     """Coordinates by which an end of a domain is at infinity.
 
     A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
-
-    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
+    Shapes (p,). single: numbers whose end can be tried alone.
     """
 
     low: Bool[np.ndarray, " p"]
@@ -374,8 +373,9 @@ def _correct_by_secant(
 ) -> np.ndarray:
     """Return B + r r' / (r' p) with r = y - B p (the symmetric rank-one update, SR1), (lanes, p, p).
 
-    It maps the step p to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays
-    where the gradient after the step is not finite, or r' p is rounding.
+    Lanes are searches for a maximum side by side; B is each one's model of minus the Hessian. The new B maps the step p
+    to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays where the gradient
+    after the step is not finite, or r' p is rounding.
 
     Args:
         model: B (lanes, p, p).

@@ -85,15 +85,18 @@ def _make_gauss_markov(
 ) -> LinearPlant:
     """Return the plant of Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2.
 
+    Such a process models a sensor's bias that drifts slowly and stays bounded; the processes are independent.
+
     Args:
         plant: the plant that they drive or are measured with, for the names of its inputs.
-        names: of the processes.
-        deviation: standard deviation of each at all times, or one for all.
-        time: T of each, or one for all.
+        names: names of the processes.
+        deviation: standard deviation of each process at all times, or one for all.
+        time: T, after which a bias is forgotten, of each process or one for all.
         dt: length of a step, or the name of the input that says it.
     """
     count, what = len(names), "deviation of a bias"
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
+    # 1 / T of each.
     rates = [_invert_time_constant(x) for x in _broadcast_to_biases("time of a bias", time, count)]
     # Deviation and 1 / T of each bias, as arrays (biases,).
     sd, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))

@@ -42,9 +42,12 @@ class HopChain(NamedTuple):
 def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "time hop"]]:
     """Return a network's independent paths, as the best linear filter of all that its nodes receive has them.
 
+    A path is the chain of hops (transmitters that amplify) from one sensor to the receiver. A planner of powers needs
+    the gain and noise of each path, and the second moment of the signal that it carries.
+
     Args:
         network: nodes with linear sensors behind chains of hops.
-        error: over which steps: steady unless it has a period or a horizon.
+        error: over which steps the planner counts the error: steady unless it has a period or a horizon.
 
     Returns:
         The paths, and the power that each transmitter sends at present, shape (time, hop).
@@ -53,6 +56,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         ValueError: a network that is not of independent paths, a plant that is not linear or, without a horizon, not
             stable.
     """
+    # What is asked for has to be of independent paths from linear sensors.
+    # Check that the plant is linear and every node a plain one, of a linear sensor behind hops.
     instance("network", network, Network, "a Network")
     plant, steps = network.plant, instance("error", error, Error, "an Error").steps
     start_plant = require_design_plant(plant)

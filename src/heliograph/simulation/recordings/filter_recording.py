@@ -185,11 +185,12 @@ def _make_forecast_origin(network: Network, record: Record, state: PyTree, u: np
 
     Args:
         network: the network.
-        record: of all rows.
-        state: of all filters after the last row.
+        record: estimates and times of all rows.
+        state: states of all filters after the last row.
         u: inputs of the plant (steps, inputs).
         spacing: usual time between rows; a plant with the input dt takes the median of that instead.
     """
+    # Estimates by node and filter, only the last of each; then the median step, without the first row, which has none.
     last_estimates = {
         node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in by_filter.items()}
         for node, by_filter in record.estimates.items()
