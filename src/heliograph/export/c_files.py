@@ -240,10 +240,10 @@ def _run_command(*command: str, folder: Path) -> str:
 def _generate_timer_program(name: str, received: int, inputs: int, real: Real) -> str:
     """Return a C program that prints the nanoseconds of a step, by the fastest of REPEATS rounds of STEPS steps.
 
-    Where a step is refused, as past the end of a schedule, it starts again.
+    Exported filters are timed by it. Where a step is refused, as past the end of a schedule, the filter starts again.
 
     Args:
-        name: of the filter's header, and the prefix of its functions.
+        name: name of the filter's header, and the prefix of its functions.
         received: count of z's components, which get numbers from 0.
         inputs: count of u's components, which are 0.1.
         real: type of numbers.

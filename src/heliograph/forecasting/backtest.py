@@ -361,10 +361,11 @@ def _forecast_from_each_row(
 ) -> PyTree:
     """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 
-    They are (rows, places, K, ...), of mixtures of K parts, with variances in the place of covariances.
+    They are (rows, places, K, ...), of mixtures of K parts, with variances in place of covariances. A backtest scores
+    them by the later rows.
 
     Args:
-        predictor: predicts the filter's state step by step without data.
+        predictor: predicts the filter's state, and from it the states' and measurements' moments, without data.
         z: measurements (rows, received).
         u: inputs (rows, inputs).
         windows: inputs of the rows ahead of each row (rows, ahead, inputs).

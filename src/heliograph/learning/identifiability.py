@@ -299,9 +299,15 @@ KINDS = ("mean gain", "gain variance", "noise")
 def describe_identified_links(solution: "Solution") -> list[str]:
     """Return a sentence on each output of which the data identify mean gain, gain variance or noise.
 
-    Such as "The received y has mean gain 0.8 (0.7 .. 0.9), 95 %, the sensor's noise included." There is none where the
+    An example is "The received y has mean gain 0.8 (0.7 .. 0.9), 95 %, the sensor's noise included." Single parameters
+    may not be identified (a gain only as the product of two) while these moments are. There is no sentence where the
     sensor or channel varies over time, or depends on inputs or the past.
+
+    Args:
+        solution: the maximum of the likelihood, with the point x, the covariance of its active coordinates (not at an
+            end of their domain), and the network as a function of x.
     """
+    # The sensor and channel of all nodes together, at the starting point, to see of what kind they are.
     description = solution.surface.objective.description
     _, sensor, channel = join_all_nodes(description.start)
     if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):

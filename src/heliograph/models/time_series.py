@@ -227,13 +227,13 @@ def arma(
 ) -> Component:
     """Return an ARMA process y = ar_1 y_1ago + ... + e + ma_1 e_1ago + ..., stationary from the start.
 
-    States: NAME and what of later values is known, "NAME_1_ahead", ...
+    The plant's states are the present value, NAME, and the parts of later values that are known now, "NAME_1_ahead", ...
 
     Args:
         ar: coefficients of past values (p,); to estimate them take `stationary(x)` of free x.
         ma: coefficients of past noises (q,).
-        variance: of e.
-        name: of the component; "arma" by default.
+        variance: variance of the noise e.
+        name: name of the component; "arma" by default.
 
     Raises:
         ValueError: coefficients that are not stationary, a negative variance.

@@ -275,9 +275,8 @@ class MultipleModelFilter(AbstractSizedFilter):
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> PairSmootherTerms:
         """Return what a smoother by pairs (mode i before the step, mode j after it) needs of a step.
 
-        The Gaussian and the probability of each pair, the smoother gain back to mode i, and the Gaussian of each mode j
-        without later data, with which a smoothed one is compared. `step`: states before and after step k, with u and z.
-        `after`: probability and Gaussian of each mode after the correction.
+        These are Gaussian and probability of each pair, the smoother gain back to mode i, and the Gaussian of each mode
+        j without later data. `step`: states around step k, u and z. `after`: law by mode after the correction.
         """
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = list_mode_models(at(self.plant, k)), second_moments_at_start(self.plant)

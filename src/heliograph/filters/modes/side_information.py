@@ -137,8 +137,9 @@ class SideInformationFilter(AbstractSizedFilter):
     ) -> tuple[SideInformationBelief, Innovation]:
         """Weight the modes by the flag and by which components arrived, then project zeta on (1, s, z).
 
-        zeta holds the products of (x - c, 1) and the modes' indicators, and s is its estimate before. z: what the
-        channel delivers (m,), NaN for what did not arrive, and then the number of the flag, if `flagged`.
+        A mode of the link decides its losses and noise; a flag, or which components arrived, tells of the mode (side
+        information). zeta holds the products of (x - c, 1) and the modes' indicators, and s is its linear estimate
+        before. z: what the channel delivers (m,), NaN for what did not arrive, and then the flag's number if `flagged`.
         """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))

@@ -158,6 +158,9 @@ def find_received_density(
 ) -> ReceivedDensity:
     """Return the density of z given h(x), as atoms by mode and by set of components that arrive.
 
+    An atom is a Gaussian law of z = G (h(x) + v) + n for one value of the gain G and one branch of the noise v, with
+    its probability. A particle filter weighs its particles by this density.
+
     Args:
         sensors: the sensor of each mode.
         channels: the channel of each mode, without memory.

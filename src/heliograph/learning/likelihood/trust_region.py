@@ -159,9 +159,7 @@ def maximise_from_starts(
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
     """Return the state of all lanes before the first step, at the points `start` (lanes, p).
 
-    A lane is done from the beginning where the log-likelihood, or a derivative in a coordinate that moves (`moving`,
-    (lanes, p)), is not finite there. For `domains` and `close` see `maximise_from_starts`.
-    """
+    A lane is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite."""
     total, gradient, information = evaluate(start)
     state = _Lanes(
         x=start.copy(),
@@ -265,12 +263,13 @@ def _accept_or_reject_steps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which lanes accept their step, and the radius for the next one, (lanes,) each.
 
-    A step is accepted where the log-likelihood l rises by a share of the gain that the model foretold. Where that gain
-    is below the rounding of l, the gradient decides: the step is accepted if it fell, or if the step went to the edge
-    of the region, as across a plateau, and l did not fall by more than rounding.
+    Lanes are searches side by side. A step is accepted where the log-likelihood l rises by a share of the gain that the
+    model foretold. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
+    gradient fell, or if the step went to the edge of the region, as across a plateau; and l must not fall by more than
+    rounding.
 
     Args:
-        state: the lanes before the step.
+        state: the lanes before the step, with l (`total`), the radius, and `done` for lanes that go no further.
         total: l at the end of the step.
         length: of the step in the units of the radius.
         foretold: gain of l by the model.
@@ -292,10 +291,10 @@ def _accept_or_reject_steps(
 def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
     """Return the state in which each lane (climb) a is ended that goes to the same top as a higher lane b.
 
-    Both are within JOINED standard errors of a top and of each other, by the information I of either, and less than
-    NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b - x_a, the log-likelihood l is concave:
-    l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and (g_a - g_b)' d >= BENT d' I d. `moving`:
-    coordinates that move (lanes, p).
+    Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
+    information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
+    x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
+    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (lanes, p). `domains`: which are logarithms or logits.
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)

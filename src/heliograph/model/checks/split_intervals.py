@@ -75,6 +75,8 @@ def _predict_over_intervals(
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
     """Return the mean, transition matrix and noise covariance after some intervals of time, passed one after another.
 
+    If a span of time gives the same whether it is cut or not, data may add steps in between.
+
     Args:
         plant: the plant.
         dt: number of the input that is the length of an interval; all other inputs are 1.
@@ -94,9 +96,11 @@ def _predict_over_intervals(
         n = len(x)
         mean, matrix, covariance = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in intervals:
+            # The step over one interval: F = df/dx at the mean, with angles kept continuous.
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
             F, predicted = jax.jacfwd(plant.make_motion_about(u, mean))(mean), plant.transition(mean, u)
             mean = plant.manifold.settle(predicted, predicted + plant.noise_mean())
+            # F F_before, and F P F' + Q of the noise so far.
             matrix, covariance = F @ matrix, F @ covariance @ F.T + plant.noise_covariance(u)
         return mean, matrix, covariance
 

@@ -230,8 +230,16 @@ class _PathsOfStep(NamedTuple):
 def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _PathsOfStep:
     """Return the paths of all nodes at step k: what each carries, its powers, and its hops.
 
-    `state`: E (x, 1)(x, 1)' of the plant's state at this step.
+    A path carries a number c x + v from a sensor over a chain of hops, each a radio that amplifies what it receives,
+    g sent + m. A planner of powers needs of each path c, s = E y^2 and t = s - Var v, and of each hop
+    kappa = E g^2 / (E g)^2, alpha = Var m / E g^2 and the power that is sent.
+
+    Args:
+        nodes: nodes by name, each a linear sensor and a channel.
+        k: the step.
+        state: E (x, 1)(x, 1)' of the plant's state at this step.
     """
+    # Lists, filled path by path and hop by hop.
     step = _PathsOfStep(rows=[], second=[], signal=[], kappa=[], alpha=[], powers=[], names=[], path=[])
     for name, node in nodes.items():
         if node.informed_by is not None:

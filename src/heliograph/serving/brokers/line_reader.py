@@ -49,8 +49,9 @@ class LineReader:
 
         Args:
             network: the network.
-            translator: the sources of the network's file; None if it has none.
-            path: the file that is redirected, whose name may be a topic; None of any other pipe.
+            translator: reads messages that other programs make, by the sources (where which value stands) in the
+                network's file; None if it has none.
+            path: the file that standard input is redirected from, whose name may be a topic; None for any other pipe.
             ignore_unknown: whether columns that the network does not know are left out.
         """
         instance("network", network, Network, "a Network")
@@ -59,7 +60,7 @@ class LineReader:
         path = None if path is None else file_path("path", path)
         ignore_unknown = flag("ignore_unknown", ignore_unknown)
         self.source = "standard input" if path is None else str(path)
-        # Readers of what lines may be: messages that others make, and the topic of those that name none; messages in
+        # Readers of the kinds of lines: messages that others make, and the topic of those that name none; messages in
         # our own form; a table.
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)

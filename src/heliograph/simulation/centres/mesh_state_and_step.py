@@ -186,12 +186,13 @@ def propagate_joint(
 
     Args:
         joint: J before the step.
-        step: the plant over it, its gains and its measurements' information.
-        arrived: which messages arrive.
-        senders: of whom each node receives (node, degree).
-        present: where it has a neighbour (node, degree); the other places only pad.
+        step: the plant's motion F and Q, the nodes' gains (`gains.gain` is W), and S_l of the nodes' measurements.
+        arrived: which messages of a node's neighbours arrive.
+        senders: numbers of the neighbours from which each node receives (node, degree).
+        present: True for a neighbour (node, degree); all other places only pad the rows to one length.
     """
     gains, motion, size = step.gains, step.motion, joint.shape[0] * joint.shape[1]
+    # W of the measurements that arrived, else 0.
     weights = measurement_weights(gains.gain, jnp.asarray(arrived))
     # M, W S and W as matrices (N, N), N = nodes n, from their blocks (node, degree, n, n).
     blocks = error_transitions(gains, motion.matrix), weights @ step.data.information[senders], weights

@@ -311,16 +311,16 @@ def simulate_natively(
         network: the network.
         inputs: of the plant (horizon, inputs).
         key: of all runs.
-        reducer: says what is collected of the runs.
+        reducer: says which statistics or series are collected from the runs.
         first_run: number of the first run, which seeds its draws.
-        runs: how many.
-        chunk: how many between two reports of progress.
+        runs: number of runs.
+        chunk: number of runs between two reports of progress.
         progress: is called with how many runs are done, and of how many.
         smoothing: the part of the network that is smoothed; None if nothing is.
-        precision: in which runs are computed.
+        precision: type of numbers in which runs are computed.
 
     Returns:
-        None where native code does not support the network or the reducer.
+        The reducer's result; None where native code does not support the network or the reducer.
     """
     # Many nodes that share nothing go in parts, where the reducer has a method of its own to join their results.
     can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)
