@@ -119,7 +119,12 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
     """Return the function of the correction by a measurement, with its innovation as further results.
 
-    `tree`: structure of the filter's state, which the function takes and returns as a list of arrays.
+    C code is written from this JAX function, so that it takes and returns only arrays.
+
+    Args:
+        filter: the filter.
+        tree: structure of the filter's state, which the function takes and returns as a list of arrays.
+        real: type of numbers in C, "double" or "float"; a measurement is judged by their rounding.
     """
 
     @jax.jit
@@ -131,6 +136,7 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         """
         prior = jax.tree.unflatten(tree, arrays)
         after, innovation = filter.correct(prior, z, k)
+        # Estimates before and after z; judged by them are e' S^-1 e of the innovation, and how many numbers arrived.
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
         judgement = Judgement.judge_correction(
             filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, filter.angles_used()

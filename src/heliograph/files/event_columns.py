@@ -145,11 +145,11 @@ class NodeEvents:
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
     def drop_unset_stamps_in_place(self, name: str) -> UnsetStampNotes:
-        """Remove the events whose stamps were not set; return what is to be said of that. `name`: of the node.
+        """Remove the events whose stamps were not set; return what is to be said of that. `name`: name of the node.
 
-        A stamp that is more than a year before its arrival was not set. Where most are, stamps and arrivals are of two
-        clocks: then nothing is removed, and each event arrives when it was measured. Where no arrivals are known a
-        stamp was not set that is more than a year away from those before and after it, which are near each other.
+        A stamp (time of measuring) that is more than a year before its arrival was not set. Where most are, stamps and
+        arrivals are of two clocks: nothing is removed, and each event arrives when it was measured. Where no arrivals
+        are known, a stamp was not set if it is more than a year away from both neighbours, which are near each other.
         """
         time, arrival, _ = self.arrays()
         delays, year = arrival - time, YEAR / SECOND if self.numbers else YEAR  # numbers are seconds

@@ -227,7 +227,7 @@ def arma(
 ) -> Component:
     """Return an ARMA process y = ar_1 y_1ago + ... + e + ma_1 e_1ago + ..., stationary from the start.
 
-    The plant's states are the present value, NAME, and the parts of later values that are known now, "NAME_1_ahead", ...
+    The plant's states are the present value, NAME, and the parts of later ones that are known now, "NAME_1_ahead", ...
 
     Args:
         ar: coefficients of past values (p,); to estimate them take `stationary(x)` of free x.

@@ -169,7 +169,8 @@ class BatchIntake:
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> MessageOutcome:
         """Give a message to its plant; the outcome has no plant if one would begin with a refused message.
 
-        `number`: of the message in the batch. `wall`: the time by this machine's clock.
+        A message is one event (a node's values, or the plant's inputs), or both. The outcome says whether it is used,
+        or why not. `number`: number of the message in the batch. `wall`: the time by this machine's clock.
         """
         plant = self._find_plant(message, wall)
         timed = self._read_events(message, plant, wall)

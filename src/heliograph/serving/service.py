@@ -85,7 +85,7 @@ class Service:
         self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
-        # What is said of plants: doubts by `_doubt`, the first implausible message by `_say`, which then becomes None.
+        # Watches for warnings on plants: `_doubt` says doubts, `_say` the first implausible message, then it is None.
         self._angles, self._remarks, self._held = AngleWatch(fleet), RemarkWatch(fleet), FleetRepeatWatch(fleet)
         self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage

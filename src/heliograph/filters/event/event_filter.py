@@ -118,9 +118,7 @@ class EventFilter(AbstractSizedFilter):
         return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
 
     def _pad_sum(self, single: GaussianSum) -> GaussianSum:
-        """Return the one Gaussian of `single` with copies of weight 0: for known references first, then for lost ones.
-
-        All steps then have as many Gaussians."""
+        """Return the one Gaussian of `single`, then copies of weight 0, so that all steps have as many Gaussians."""
         count = self._known_reference_count + self.reference_may_be_lost * self.lost
         copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
         return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))

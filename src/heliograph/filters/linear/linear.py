@@ -362,7 +362,7 @@ def memoryless_filter(
         assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
         return _claim_nominal(filter) if is_memory_relevant else filter
 
-    # Delays: the same filter for the system enlarged by past signals.
+    # A channel that delivers late: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(memoryless_channel)])[0].past:
         return wrappers.build_behind_delays(plant, sensor, memoryless_channel, make)
     return make(plant, sensor, memoryless_channel)

@@ -309,6 +309,9 @@ def side_information_filter(
 ) -> SideInformationFilter:
     """Return the linear filter with side information on the modes: which packets arrived, and a flag with each.
 
+    A channel's mode, such as good or bad, follows a Markov chain, and decides gain, noise and losses. The flag is a
+    number that comes with z and whose probabilities depend on the mode, such as a signal strength in classes.
+
     Args:
         plant: a linear plant, n states.
         sensor: a linear sensor, m outputs.
@@ -325,6 +328,7 @@ def side_information_filter(
 
     Source: the filter of Costa (1994) with moments conditional on the side information.
     """
+    # Initial law of the modes, the channel by mode and pattern of arrivals at each step, and if all laws are known.
     check_linear("side-information filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
     initial, steps, is_known = _describe_channel_by_mode(channel)

@@ -127,15 +127,15 @@ def maximise_from_starts(
     its error (SR1), whichever foretold the last gain better. A step is taken where l rises by a share of what was
     foretold; else the radius falls. So l never falls, and the units of the numbers do not matter.
 
-    A lane has converged when g' I^-1 g, twice the gain of the step without bounds, is nothing: less than rounding sees.
-    Coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all, do not count.
+    A lane has converged when g' I^-1 g, twice the gain of the step without bounds, is less than rounding sees. This
+    leaves out coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all.
 
     Args:
         evaluate: l (lanes,), its gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
         start: points at which to begin (lanes, p).
         active: coordinates that move, the others stay (lanes, p); all unless given.
         watch: called with the best so far before each step.
-        domains: coordinates whose domains end at infinity; plain real numbers unless given.
+        domains: coordinates whose domains end at infinity (logarithms, logits); plain real numbers unless given.
         close: g' I^-1 g at which a lane has arrived.
         joining: whether a lane ends where another, higher one climbs to the same top.
     Source: Moré and Sorensen (1983) for the step; Dennis, Gay and Welsch (1981) for the choice of the model; Conn,
@@ -159,7 +159,8 @@ def maximise_from_starts(
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
     """Return the state of all lanes before the first step, at the points `start` (lanes, p).
 
-    A lane is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite."""
+    A lane is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite.
+    """
     total, gradient, information = evaluate(start)
     state = _Lanes(
         x=start.copy(),
@@ -294,7 +295,7 @@ def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
     Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
     information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
     x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
-    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (lanes, p). `domains`: which are logarithms or logits.
+    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (lanes, p). `domains`: which are plain real numbers.
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)

@@ -151,12 +151,13 @@ class DrivenTransition(Module):
 def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
     """Return the plant of [x; b]: x+ = f(x, u) + E b + w and b+ = F b + B u + xi, linear if f is.
 
-    x and b start independently of each other, and w and xi are independent.
+    b may be a slow disturbance that drives x, which a filter then estimates with x. x and b start independently of each
+    other, and w and xi are independent.
 
     Args:
         plant: the plant of x.
         bias: the plant of b, whose inputs are some of those of x.
-        coupling: E (n, biases).
+        coupling: E (n, biases), how b enters x.
 
     Raises:
         ValueError: a plant of b with another input, a coupling to attitudes.
@@ -184,7 +185,8 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
             raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
         move = DrivenTransition(plant, bias, coupling, places)
         return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
-    inputs_of_bias = np.eye(len(plant.inputs))[list(places)]  # takes those of b out of all inputs
+    # Both are linear: the matrices of [x; b]. `inputs_of_bias` @ u is the inputs of b.
+    inputs_of_bias = np.eye(len(plant.inputs))[list(places)]
     matrix, input_matrix = _make_driven_matrices(plant, bias, coupling, inputs_of_bias)
     return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 

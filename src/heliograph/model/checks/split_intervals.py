@@ -45,8 +45,9 @@ def find_indivisible_part(
 def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     """Explain how a plant's prediction over an interval differs from that over its parts; "" if it does not.
 
-    f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
-    test these around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
+    Data at irregular times cut an interval anywhere, and the prediction must not depend on that. With the motion f, its
+    Jacobian A and the noise covariance Q: f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)'
+    + Q(t). These are tested around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
 
     Args:
         plant: the plant, whose time step is an input.
@@ -56,6 +57,7 @@ def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + spread):
+        # f, A and Q over s + t at once, and over s and then t, for every cut (s, t).
         whole = _predict_over_intervals(plant, dt, x, cuts.sum(axis=1, keepdims=True))
         parts = _predict_over_intervals(plant, dt, x, cuts)
         for i, (s, t) in enumerate(CUTS):

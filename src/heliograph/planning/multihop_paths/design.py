@@ -293,7 +293,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 
 def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
-    _check_reachable(task, target)
+    _check_reachable(task, target)  # the target is possible at all within each transmitter's own limit
     # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.
     limits = task.problem.limits
     unlimited = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))

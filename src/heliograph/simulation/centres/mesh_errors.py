@@ -111,8 +111,8 @@ def mesh_errors(
 ) -> MeshErrors:
     """Compute the covariances of all nodes' errors for one pattern of arrivals, whatever the rule.
 
-    J+ = M J M' + F Q F' + sum_l K_l R_l K_l' with the gains of these arrivals, by sparse M: up to 2,000 nodes. All
-    measurements reach their own node.
+    Nodes exchange estimates with neighbours and mix them by M. J+ = M J M' + F Q F' + sum_l K_l R_l K_l' with the gains
+    of these arrivals, by sparse M: up to 2,000 nodes. All measurements reach their own node.
 
     Args:
         network: the network.

@@ -271,9 +271,9 @@ def _filter_without_implausible_data(
     Args:
         network: the network.
         z: measurements by node (steps, received); what is refused is taken out.
-        left_out: numbers of the reasons why readings do not count, by node (steps, received); those of what is refused
-            are added.
-        task: filters and all else that the recording is filtered with.
+        left_out: number of the reason why a reading does not count, by node (steps, received), 0 if it does; reasons of
+            refused readings are added.
+        task: all that the recording is filtered with but measurements: filters, a smoother if any, and inputs.
     """
 
     def group_measurements() -> tuple[np.ndarray, ...]:

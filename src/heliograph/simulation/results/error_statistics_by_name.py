@@ -179,14 +179,14 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
             ValueError: a node, filter or state that there is not, another number of axes.
             ModuleNotFoundError: without matplotlib (extra "report").
         """
-        # What is drawn, on which axes.
+        # The filters and states that are drawn, over steps 1, 2, ..., on one axes for each state.
         node, filters = choose_filters(self, node, filters)
         places = find_state_places(states, self.states)
         time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
         drawn = make_panels(axes, len(places), time, self.units)
         for panel, i in zip(drawn, places, strict=True):
             for number, name in enumerate(filters):
-                # Solid: actual; dashed: claimed.
+                # Solid: actual; dashed: claimed, the root of the variance that the filter states.
                 score, colour = self[node][name], choose_colour(number)
                 claimed = score.claimed()[:, i, i]
                 panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=quote_for_figure(name))
