@@ -180,12 +180,13 @@ def _make_gains(
 
     Args:
         steps: the network's, with A, a and B, b: all filters' received numbers are predicted from s as B s + b.
-        gain: K.
-        received: which of the received numbers are the filter's z.
-        covariance: of its error after each step.
-        predicted: of its error before each correction.
-        innovation: of its innovation.
+        gain: K of the filter at each step.
+        received: which of the numbers that all filters receive are this filter's z.
+        covariance: covariance of its error after each step.
+        predicted: covariance of its error before each correction.
+        innovation: covariance of its innovation z - (B s + b).
     """
+    # B and b of this filter's z, then A - K B and a - K b; the estimate is s+, so that its maps are those of s.
     rows, constants = steps.predict_maps()
     b_matrix, b = rows[:, received], constants[:, received]
     used_gain = gain * np.asarray(steps.receives_in_slot)[:, None, received]  # zero on what nobody transmits

@@ -52,16 +52,14 @@ class Service:
     """A network's filters for any number of plants, fed with messages in whatever order they arrive.
 
     The service knows no transport: `take` uses a batch and returns the outputs to publish, after the commit. It is
-    called by one thread at a time. `malformed` counts messages that could not be read, `known` duplicates and late
-    ones.
+    called by one thread at a time. `malformed` counts unreadable messages, `known` duplicates and late ones.
 
     Args:
         fleet: the plants of the network.
         store: where the state is committed.
         say: called with a line of text when the first message is refused as implausible, when an angle is first
             known less well than its filter can use, and each time that a gate gives in.
-        every: seconds after which the estimate of a plant whose senders are silent is published again although it has
-            hardly changed; None for never.
+        every: seconds after which a hardly changed estimate is published again while senders are silent; None: never.
         forecast: how far ahead provisional estimates are accompanied by forecasts; None for not at all.
         thresholds: levels of which forecasts have the probability that they are passed; none by default.
     """
@@ -75,7 +73,11 @@ class Service:
         forecast: Spans | None = None,
         thresholds: Thresholds = (),
     ):
-        """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings."""
+        """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings.
+
+        A fleet has all plants of one network and its compiled filters. `every`: after how many seconds the estimate of
+        a silent plant is published again. `forecast`, `thresholds`: how far ahead, and levels that may be passed.
+        """
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
@@ -269,8 +271,7 @@ class Service:
     ) -> tuple[list[Entry], int, int]:
         """Return refusals of messages that were not used, or not wholly; how many were malformed, and how many known.
 
-        Known are duplicates and late messages: they may have been used before a restart. `outcomes`: what became of
-        each message. `payloads`: what each was read from.
+        Known are duplicates and late messages, perhaps used before a restart. `payloads`: what each was read from.
         """
         entries, malformed, known = list[Entry](), 0, 0
         for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):

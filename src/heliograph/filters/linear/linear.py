@@ -349,6 +349,7 @@ def memoryless_filter(
 
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
+    # The channel with its modes drawn anew at each step, and whether its memory correlates mean gains over time.
     check_linear("memoryless filter", plant, sensor)
     memoryless_channel, is_memory_relevant = without_memory(channel), memory_matters(channel)
 

@@ -78,8 +78,7 @@ class PathProblem(NamedTuple):
     def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
         """Return a problem whose error is at most this one's, and equal at `powers`; then its value and gradient there.
 
-        Its error is linear in the covariance P: the tangent of this problem's criterion at the P of these powers. The
-        gradient is by the powers (time, free).
+        Its error is linear in P: the criterion's tangent at the P of these powers. The gradient is (time, free).
         """
         problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
@@ -230,8 +229,7 @@ def make_power_task(
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
     """Return the total power of starts if no total is given: the sum over transmitters of what each may send.
 
-    That is what its limits of peak and mean allow. Without limits it is ten times the largest alpha, where alpha is the
-    power at which half of what arrives is noise, so that more power hardly helps.
+    Its limits are of peak and mean. Without any it is ten times the largest alpha, where half of what arrives is noise.
     """
     largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
     without_limit = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
@@ -241,9 +239,8 @@ def _choose_total(limits: PowerLimits, paths: Paths) -> float:
 def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
     """Return a mask (steps, free) for each start of a search: which free hops send power at which step.
 
-    In the first all hops send. In each other one some whole paths send at each step: every choice of paths and steps if
-    there are at most `starts`, else random choices. A convex problem has one minimum, and needs the first start only.
-    `path`: number of the path of each free hop.
+    In the first all hops send. In each other one some whole paths send at each step: every choice if there are at most
+    `starts`, else random ones. A convex problem needs the first only. `path`: number of the path of each free hop.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):
@@ -292,7 +289,10 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 
 
 def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
-    """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
+    """Return the powers (time, free) of the least total that reaches the target error, and the certificate.
+
+    It says how much less power any allocation needs at least. `task`: paths, limits, free hops, starts of the search.
+    """
     _check_reachable(task, target)  # the target is possible at all within each transmitter's own limit
     # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.
     limits = task.problem.limits
