@@ -241,8 +241,8 @@ def accumulate(
         function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what
             is summed (real numbers, in a tree) and what is collected run by run (a tree, such as `()`).
         examples: the arguments without the number; shapes and types count alone, but for what is known.
-        batches: sums that are kept apart, run r in that of r mod `batches`, from which the mean has an error; 1 by
-            default.
+        batches: number of sums that are kept apart, run r in sum r mod `batches`; their scatter gives the standard
+            error of a mean; 1 by default.
         known: of examples by their number among the leaves, which entries (a mask) are the example's in every call,
             such as zeros; they are constants of the code. None by default.
         single: whether numbers are float32, and draws those of JAX by default; double unless so. Sums are double.

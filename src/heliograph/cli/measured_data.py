@@ -104,7 +104,7 @@ def read_measured_plants(
     """
     from heliograph.numerics.check import fail
 
-    # Messages are events, of which each plant's own are put in rows of time; a table of rows has one plant only.
+    # Messages are events, put in rows of time for each plant; a table of rows (no events) has one plant only.
     path = open_path_or_store(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:

@@ -40,7 +40,7 @@ class PartOfStep(NamedTuple):
 def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
     """Return the functions to export: one step or, if `apart`, prediction and correction, for numbers of type `real`.
 
-    C code is later written from these JAX functions. Each has example arguments, of which only shapes count, and the
+    C code is later written from these JAX functions. Each has example arguments, whose shapes alone count, and the
     names of its results `beside` state and estimate: "implausible" says that the estimate lost its digits and must not
     be used, "spoilt" that an input has too few digits.
 

@@ -31,7 +31,7 @@ def take_derivatives_from(plain: Likelihood, differentiated: Likelihood, argumen
     Args:
         plain: the log-likelihood as it is computed best.
         differentiated: the same by a program that can be differentiated; it is traced only for a derivative.
-        arguments: filter, measurements and inputs, of which some numbers are traced.
+        arguments: filter, measurements and inputs; some numbers in them are traced by JAX.
     """
     # The arguments as a list of numbers and arrays; only traced ones may have derivatives, known ones stay constants.
     leaves, form = jax.tree.flatten(arguments)

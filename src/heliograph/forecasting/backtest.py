@@ -316,9 +316,9 @@ def _score_number(
         first: first row from which a forecast counts.
         is_angle: whether it is an angle.
     """
-    # The forecasts that count, and what came `horizon` rows later.
+    # The forecasts that count, and the values that came `horizon` rows later.
     law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
-    # An angle is taken within half a turn of what was expected.
+    # An angle is taken within half a turn of its forecast.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
     # Nothing was forecast yet where the start is unknown (infinite variances).
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)

@@ -95,7 +95,7 @@ def solve_factored_weights(
     # F' P^-1 E by the lemma.
     inner = jnp.linalg.cholesky(jnp.eye(sources) + f_l.T @ f_l)
     f_p_e = f_e - f_l @ jax.scipy.linalg.cho_solve((inner, True), f_l.T @ f_e)
-    # E' P^-1 E, and P^-1 E (nodes, n, n), with the axes of the latter moved so that it is E' P^-1 (n, nodes n).
+    # E' P^-1 E, and P^-1 E (nodes, n, n), whose axes are then moved to give E' P^-1 (n, nodes n).
     information = f_e.T @ f_p_e
     p_e = jax.lax.linalg.triangular_solve(factors, f_p_e.reshape(nodes, n, n), left_side=True, lower=True,
                                           transpose_a=True)  # fmt: skip

@@ -283,7 +283,7 @@ def _add_growth(
         ("d", y, "e", h.error[k]),
     ]
     for (value_name, size, argument_name, constant), multiplier in zip(conditions, multipliers, strict=True):
-        # - lambda I in the block of the value, + lambda a^2 I in that of the argument.
+        # - lambda I in the block of the value, + lambda a^2 I in the block of the argument.
         value = slice(at[value_name], at[value_name] + size)
         argument = slice(at[argument_name], at[argument_name] + n)
         phi[value, value] -= multiplier * np.eye(size)

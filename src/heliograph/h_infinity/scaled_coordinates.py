@@ -252,7 +252,7 @@ def _rescale_step(
         state_scales: diag(S1, S2), the scales of (x, e) after the step: x = S1 times scaled x, e = S2 times scaled e.
         received_scales: a scale for each received number.
         form_scales: a scale for each growth form, a diagonal quadratic form that bounds an unknown function.
-        nominal: K0: the error's matrix becomes E - K0 U, with U the matrix of what is received.
+        nominal: the gain K0: the error's matrix becomes E - K0 U, where U maps eta to the received numbers.
     """
     n = step.state.shape[0]
     s1, s2, per_received = state_scales[:n, :n], state_scales[n:, n:], received_scales[:, None]

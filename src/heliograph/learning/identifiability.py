@@ -325,7 +325,8 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     with jax.enable_x64(True):  # compiled: operation by operation the compiler is called two hundred times
         moments, slopes = map(np.asarray, quickly_compiled(differentiate_moments)(jnp.asarray(solution.x)))
     slopes = slopes[:, :, solution.active]
-    # Intervals of what is identified: a function with the derivatives g has the variance g' C g.
+    # An interval for each moment that is identified: its estimate has the variance g' C g, with its derivatives g by x
+    # and the covariance C of x.
     covariance, freedom = solution.covariance()
     names = sensor.outputs if len(sensor.outputs) == len(moments) else [f"z{i}" for i in range(len(moments))]
     lines = []

@@ -65,10 +65,10 @@ def find_confounded(
 ) -> list[ConfoundedNumbers]:
     """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
 
-    The data may tell a product or a sum of two numbers, but not each. Flat directions are those along which the
-    likelihood does not change; only points with the fewest of them count. Directions of the coordinates x become those
-    of the numbers v by dv/dx, and of log |v| by d log |v| / dx. A sum of v is identified if it does not change along
-    the flat directions of v, and a product if its logarithm does not change along those of log |v|.
+    The data may tell a product or a sum of two numbers, but neither of the two. Flat directions are those along which
+    the likelihood does not change; only points with the fewest of them count. Directions of the coordinates x become
+    those of the numbers v by dv/dx, and of log |v| by d log |v| / dx. A sum of v is identified if it does not change
+    along the flat directions of v, and a product if its logarithm does not change along those of log |v|.
 
     Args:
         parameters: the free numbers.

@@ -240,7 +240,7 @@ def _propagate_errors(
 ) -> tuple[Float[np.ndarray, " next"], Float[np.ndarray, "next next"]]:
     """Return mean and covariance of (y+, s+, x - xhat) after a step from those of (y, s) before it.
 
-    The error of a filter of fixed gains is so known before any data, also under another model than its own. The system
+    So the error of a filter of fixed gains is known before any data, also under another model than its own. The system
     is y+ = A y + a + w, z = C y+ + c + v and x = W y+ (`projection`); the filter, of state s, is the schedule of gains
     s+ = F s + K z + f and xhat = L s + J z + d. Put together,
 

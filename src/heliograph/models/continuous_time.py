@@ -99,7 +99,7 @@ class ContinuousSystem(Module):
             for _ in range(int(count)):
                 parts = _double_step(*parts)
         growth, squared, integral, noise = parts
-        # There are two answers for F. I + (F - I) loses what is small beside 1, while the squared F is off by 2^count
+        # There are two answers for F. I + (F - I) loses numbers small beside 1, while the squared F is off by 2^count
         # roundings of itself: it is the better one where F is small enough.
         decayed = xp.max(xp.abs(squared)) * 2**count < 1
         matrix = xp.where(decayed, squared, np.eye(len(a)) + growth)

@@ -91,7 +91,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     doubled = sorted({str(name) for name in states if states.count(name) > 1})
     if doubled:
         raise fail("states of joined plants", "each name once (components and axes take another name)", doubled)
-    # All inputs, each once, and where among them those of each plant are.
+    # All inputs, each once, and the indices of each plant's own inputs among them.
     inputs = list(dict.fromkeys(name for plant in parts for name in plant.inputs))
     places = tuple(tuple(inputs.index(name) for name in plant.inputs) for plant in parts)
     # Laws of the initial state (a fixed center and a law of the deviation from it), and of the noises: one law, or, if

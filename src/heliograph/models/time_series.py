@@ -240,7 +240,7 @@ def arma(
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 3.3 and 4.1.3.
     """
-    # Harvey's state: the present value, and what is known of later ones; the first column of F has the coefficients.
+    # Harvey's state: the present value, and the known parts of later ones; the first column of F has the coefficients.
     phi, theta = array("ar", ar, (None,)), array("ma", ma, (None,))
     q = scalar("variance of the noise", variance, 0.0)
     size = max(len(phi), len(theta) + 1)

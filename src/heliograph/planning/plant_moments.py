@@ -99,7 +99,7 @@ def moments_with_one_over(
 ) -> list[Float[Array, "n1 n1"]]:
     """Return E (x, 1)(x, 1)' at each step from the plant's initial law on, the first after x_0 has moved once.
 
-    Planners need it for the power of signals, and for noise that grows with the signal behind random gains.
+    Planners need it for the power of signals, and for the noise behind random gains, which grows with the signal.
 
     Args:
         plant: a linear plant, which may vary in time.

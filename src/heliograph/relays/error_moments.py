@@ -224,8 +224,9 @@ def gain_hessian(
     """Return half the Hessian of the later cost in the free gains, with damping on its diagonal, and that damping.
 
     The cost is tr(Lam P) with P = [I -(0; K)] Z [I -(0; K)]', the covariance of (x, e_1 .. e_F) after a correction by
-    the gains K. Z = `predicted` is that of (x, e_1 .. e_F before it, innovations), and Lam = `ahead` is the gradient of
-    the cost of later steps by P. An entry of K is free if it multiplies a number that the filter receives itself.
+    the gains K. Z = `predicted` is the covariance of (x, e_1 .. e_F before it, innovations), and Lam = `ahead` is the
+    gradient of the cost of later steps by P. An entry of K is free if it multiplies a number that the filter receives
+    itself.
 
     Newton's method in the gains uses it; damping keeps it invertible.
 

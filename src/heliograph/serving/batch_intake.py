@@ -188,7 +188,7 @@ class BatchIntake:
             nothing_is_plausible = why and (timed.inputs is None or why_inputs)
             if nothing_is_plausible:
                 return MessageOutcome(verdict="implausible", why=why)
-            # Its first moment counts as a leap in time, by one clock that may be wrong: that of arrivals where given.
+            # Its first moment counts as a leap in time, by one clock that may be wrong: of arrivals, or of the sender.
             has_arrival = message.arrival is not None
             leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
             plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
@@ -288,7 +288,7 @@ class BatchIntake:
             return plant
         # Times as numbers since the plant's origin (a date, if its times are dates).
         at = self._time_as_number(message.time, plant.origin, plant.name)
-        # The clock that decides: that of arrivals, where one was given, else the sender's; and what it says.
+        # The clock that decides (of arrivals, where an arrival was given, else the sender's), and the time it shows.
         clock, clock_time = message.node, at
         if message.arrival is not None:
             clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)

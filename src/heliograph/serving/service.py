@@ -57,8 +57,7 @@ class Service:
     Args:
         fleet: the plants of the network.
         store: where the state is committed.
-        say: called with a line of text when the first message is refused as implausible, when an angle is first
-            known less well than its filter can use, and each time that a gate gives in.
+        say: called with a line at the first implausible message, the first vague angle, and each gate that gives in.
         every: seconds after which a hardly changed estimate is published again while senders are silent; None: never.
         forecast: how far ahead provisional estimates are accompanied by forecasts; None for not at all.
         thresholds: levels of which forecasts have the probability that they are passed; none by default.

@@ -89,8 +89,8 @@ def check_encoder(
         filters: the node's filters, by name.
 
     Raises:
-        ValueError: a range for another count of components, angles, words that are amplified, a trigger whose ends do
-            not share what it compares with, a filter that is fed back.
+        ValueError: a range for another count of components, angles, words that are amplified, a trigger that compares
+            with a value that sender and receiver do not share, a filter that is fed back.
     """
     # Sensor, filters and channel.
     check_type("encoder", encoder, Words)

@@ -69,8 +69,8 @@ RULES |= {"platform_index": _select_platform}
 def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower JAX's `cond`, the choice of a branch by an index (`inputs[0]`), and return the branch's results.
 
-    To lower is to add single operations (nodes) to a graph. A constant index takes one branch. Otherwise SIMD lanes,
-    each of which computes another run of the program, may take different branches: all branches are computed, and each
+    To lower is to add single operations (nodes) to a graph. A constant index takes one branch. Otherwise SIMD lanes may
+    take different branches, since each lane computes another run of the program: all branches are computed, and each
     lane selects its results.
 
     Args:

@@ -152,10 +152,10 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
     """Lower a product of arrays in memory as a loop.
 
     The product (JAX's `dot_general`) becomes a loop in the graph of operations, since written out it would be too long.
-    As JAX calls them, batch axes are those of both arguments and of the result, contracted ones are summed over, and
-    free ones are of one argument and of the result. The loop is over the first batch axis, else over the first free
-    axis of a, else over that of b: each turn computes a row of the result. Where there is no such axis, the loop is
-    over the first contracted one, and turns are summed.
+    As JAX calls them, batch axes are common to both arguments and the result, contracted axes are summed over, and free
+    axes belong to one argument and the result. The loop is over the first batch axis, else over the first free axis of
+    a, else of b: each turn computes a row of the result. Where there is no such axis, the loop is over the first
+    contracted one, and turns are summed.
 
     Args:
         lowering: translates JAX's operations to nodes of a graph.

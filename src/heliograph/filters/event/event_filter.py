@@ -186,7 +186,7 @@ class EventFilter(AbstractSizedFilter):
             posterior, mean_of_value, covariance_of_value = self._condition_on_sender(
                 xry, channel, received, reported_losses, s, has_sent[s]
             )
-            # The weights, normalised; their sum was p(what came from s | what came before).
+            # Normalise the weights; their sum was p(value or silence of sender s | data before).
             log_likelihood_of_sender = log_total_weight(posterior.log_weight)
             log_likelihood += log_likelihood_of_sender
             mixture = posterior.scale_weights(-log_likelihood_of_sender)

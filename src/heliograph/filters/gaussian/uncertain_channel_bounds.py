@@ -86,7 +86,7 @@ def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInn
     a = 1 + beta_1 and b = 1 + beta_2: of the prior a P by the innovation times a, with the noise
     a^2 Omega - a M H P H' M' (a sum of positive terms below).
 
-    `scalars` (2,) are beta_1 and beta_2, NaN for those of least trace.
+    `scalars` (2,) are beta_1 and beta_2, NaN to choose the values whose bound has the least trace.
     """
     prior, present = signal.prior, z.present
     # M H, M H P H' M' and M R M'.

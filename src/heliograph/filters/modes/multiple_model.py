@@ -273,7 +273,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> PairSmootherTerms:
-        """Return what a smoother by pairs (mode i before the step, mode j after it) needs of a step.
+        """Return the terms of a step for a smoother by pairs (mode i before the step, mode j after it).
 
         These are Gaussian and probability of each pair, the smoother gain back to mode i, and the Gaussian of each mode
         j without later data. `step`: states around step k, u and z. `after`: law by mode after the correction.

@@ -149,8 +149,8 @@ class SideInformationFilter(AbstractSizedFilter):
         flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
-        # Moments given the side information: those of mode j times weight_j = P(j | side information) / P(j). `excess`,
-        # the weights times weight_j - 1, is what this adds.
+        # Moments given the side information: moments of mode j times weight_j = P(j | side information) / P(j).
+        # `excess`, the weights times weight_j - 1, is what this adds.
         _, x, weights = split_columns(state)
         weight = weight / (weight @ mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)

@@ -268,7 +268,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     programs = _compile_programs(filter, z, u, (noise_keys, proposal_keys))
     if programs is None:
         return None
-    # The particles before the first row: drawn, or those of the state.
+    # The particles before the first row: drawn, or taken from the state.
     loop = _ParticleLoop(filter, programs)
     if state is None:
         numbers = programs.memory.numbers[: filter.particles]

@@ -89,7 +89,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         Gaussians: the leading bits of the last codewords were right, or not. Each codeword splits both hypotheses, by
         whether its leading bits are right, and the four Gaussians are merged to two.
         """
-        # Which codewords arrived, and how probable each bit makes what was sent.
+        # Which codewords arrived, and for each received bit its probabilities if 0 or 1 was sent.
         base, z, n = self.base, jnp.asarray(z), len(self.states)
         words = base.identify_received_words(z, at(base.links, k))
 

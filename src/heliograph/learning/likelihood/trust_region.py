@@ -299,10 +299,10 @@ def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)
-    # d' I d: the greater of those by the information of a and of b; `squared` is [c, a, b], by that of lane c.
+    # d' I d: the greater of the two values by the information of a and of b; `squared` [c, a, b] uses I of lane c.
     squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
     distance = np.maximum(squared[lanes, lanes, :], squared[lanes, :, lanes].T)
-    # [a, b]: l_b - l_a; what it is of a quadratic; and the fall of the slope, (g_a - g_b)' d.
+    # [a, b]: l_b - l_a; the same if l were quadratic; and the fall of the slope, (g_a - g_b)' d.
     gain = state.total[None] - state.total[:, None]
     gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
     slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])

@@ -136,7 +136,7 @@ class LinkCounts:
         # A second copy of a message says nothing that the first did not.
         if verdict in ("duplicate", "conflict"):
             return
-        # A time that may be wrong says nothing of the order: take that of the newest, so that it means no restart.
+        # A time that may be wrong says nothing of the order: take the newest's time, so that it means no restart.
         if verdict in ("future", "implausible", None):
             time = self.at
         # The first message; or a smaller number at a later time, since the sender was restarted: count from here.

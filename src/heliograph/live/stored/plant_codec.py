@@ -79,7 +79,7 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
         plant: times, message counts and rows of one plant; a row says by `slot` where its state is.
         fleet: holds the states of all plants' rows in one table, a slot (row of the table) for each.
     """
-    # As JSON: times, counts by node, and what a clock did.
+    # The head, as JSON: times, counts by node, and a leap if a clock showed one.
     head = {
         "now": plant.now,
         "forced": plant.forced,

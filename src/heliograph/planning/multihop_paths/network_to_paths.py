@@ -253,7 +253,7 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
         chains = find_hop_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
-        # Each chain is a path that carries chain.row @ (y, 1). Its number is that of its row in the list.
+        # Each chain is a path that carries chain.row @ (y, 1). Paths are numbered by their rows in the list.
         for chain in chains:
             weights = chain.row[:-1]  # of y alone
             step.rows.append(weights @ np.asarray(sensor.matrix))

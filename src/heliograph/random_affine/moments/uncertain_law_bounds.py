@@ -77,7 +77,7 @@ def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.n
     gain_size = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
     noise_size = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
     cross_size = xp.sqrt(xp.einsum("iiaa->ia", gain_size))[:, None, :] * noise_size[:, None]
-    # The s_v with what they leave, and N_max; then whether the three conditions hold.
+    # The s_v with the errors of their fit, and N_max; then whether the three conditions hold.
     multiples, residual = _fit_multiples(gains, shape)
     largest, noise_is_largest = _find_largest_noise(noises)
     gains_are_multiples = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)

@@ -180,9 +180,9 @@ def propagate_joint(
     """Return the joint covariance J+ = M J M' + F Q F' + sum_l W_l S_l W_l' of all nodes' errors after a step.
 
     The errors e_i = x - xhat_i of all nodes, one below the other, become M e + F w - sum_l W_l H_l' R_l^-1 v_l. w is
-    the plant's noise, Cov w = Q; F_i = I - W_i S (`step.gains.correction_map`) is what the correction of node i leaves
-    of an error. v_l is the noise of node l's measurement, Cov v_l = R_l, weighted by W_l at the nodes that receive it;
-    S_l = H_l' R_l^-1 H_l. M mixes the estimates.
+    the plant's noise, Cov w = Q; the correction of node i multiplies an error by F_i = I - W_i S
+    (`step.gains.correction_map`). v_l is the noise of node l's measurement, Cov v_l = R_l, weighted by W_l at the nodes
+    that receive it; S_l = H_l' R_l^-1 H_l. M mixes the estimates.
 
     Args:
         joint: J before the step.

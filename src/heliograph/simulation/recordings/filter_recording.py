@@ -263,14 +263,15 @@ def _filter_without_implausible_data(
 ) -> PyTree:
     """Return the results of filtering a recording without implausible data, and warn of these.
 
-    If there are any, the recording is filtered first with judgements: at each step a filter leaves out what it finds
-    implausible. The rows that all filters of a node refuse are then taken out, and the rest is filtered again as a
-    recording that never had them, until no new row is refused. Of a row that central filters refuse one node is to
-    blame, and the others' values are judged again without it.
+    Data are implausible if they are too far from a filter's prediction to be right. If there are any, the recording is
+    filtered first with judgements: at each step a filter leaves out the values that it finds implausible. The rows that
+    all filters of a node refuse are then taken out, and the rest is filtered again as a recording that never had them,
+    until no new row is refused. If central filters refuse a row, one node is to blame, and the other nodes' values are
+    judged again without it.
 
     Args:
         network: the network.
-        z: measurements by node (steps, received); what is refused is taken out.
+        z: measurements by node (steps, received); refused rows are taken out.
         left_out: number of the reason why a reading does not count, by node (steps, received), 0 if it does; reasons of
             refused readings are added.
         task: all that the recording is filtered with but measurements: filters, a smoother if any, and inputs.

@@ -61,7 +61,7 @@ class NetworkSmoother(Module):
             outputs: all that the filters' steps put out (time, ...): measurements and true states, and the terms of
                 the backward pass, by kind ("smoother_steps") and of filters at the centre by name ("central_steps").
         """
-        # Terms of the backward pass, and apart from them what the filters themselves put out.
+        # Terms of the backward pass, and apart from them the filters' own outputs.
         steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
         # Smoothed estimates of nodes and central filters, then their fusions. Steps of one kind are

@@ -120,7 +120,7 @@ def draw_modes(
     """Draw the probabilities of the modes of a node's filters: a colour for each filter, a style for each mode.
 
     Args:
-        estimates: by node and filter; those of a filter that weighs modes have probabilities `modes` (..., time, mode).
+        estimates: by node and filter; if a filter weighs modes, they have probabilities `modes` (..., time, mode).
         node: name of the node; None: the first with a filter that weighs modes.
         filters: names of its filters; None: all that weigh modes.
         axes: to draw on; None: new ones.

@@ -108,8 +108,9 @@ def memory_test(
     """Return a test of data for memory of the links that a filter ignores.
 
     A link with memory loses data in bursts, or has a gain that depends on its last one. If a filter ignores that, its
-    innovations, scaled to unit variance (w_k), are correlated in time; those of the best linear filter are not, but
-    they need not be independent. Standard errors allow for correlated products w_k w_(k+t) (Newey and West).
+    innovations, scaled to unit variance (w_k), are correlated in time. The best linear filter's innovations are
+    uncorrelated, but need not be independent, so that standard errors allow for correlated products w_k w_(k+t) (Newey
+    and West).
 
     Args:
         data: measurements of the filter (steps, received), or innovations if there is no filter; NaN where missing.

@@ -48,7 +48,7 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     y = array("signal", signal, shape, missing=True).reshape(-1, inputs)
     if not len(y):
         raise fail("signal", "at least one step", "none")
-    # A channel that varies over time is known for so many steps only; then draw all steps, in native code or by XLA.
+    # A channel that varies over time may cover fewer steps than the signal. Then draw all steps, natively or by XLA.
     check_horizon(len(y), steps_covered(channel))
     arguments = channel, y, np.asarray(check_seed("seed", seed))
     return np.asarray(compute_once(_transmit_all, _by_xla, arguments))
