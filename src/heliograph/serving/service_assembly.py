@@ -339,7 +339,7 @@ def _print_to_stderr(what: str) -> None:
 async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService, parts: int) -> None:
     """Serve the parts that this process leases, as one of several processes; `wrap` shows services on the page.
 
-    The plants are divided into `parts` parts. Each process takes its share of them for some time (a lease, a row in the
+    The plants are divided into `parts` parts. Each process takes its share of them for some time (a lease, noted in the
     common store), so that the parts of a process that ends go to others.
     """
     from heliograph.serving.storage.database import open_database

@@ -32,7 +32,7 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     try:
         with MDF(path) as file:
             names = _name_groups(file)
-            # Signals by group; frames of a bus as raw bytes cannot be read here.
+            # Signals by group; raw frames of a bus cannot be read without the database that describes them.
             channels = {name: _list_channels(file, i) for i, name in enumerate(names)}
             if any(RAW in signals for signals in channels.values()):
                 raise fail(str(path), "dbc= of LogSources, for its frames of CAN", "none")

@@ -187,7 +187,7 @@ def polynomial_filter(
 
     It takes linear plants and sensors behind any channel, and noises of any law with moments up to order 2 degree. The
     powers of state and measurement up to `degree` follow a linear system of their own (a lift), in which the best
-    linear filter is the best polynomial one. It estimates the whole state, with a bias that follows the plant's motion,
+    linear filter is the best polynomial one. It estimates the whole state, a bias with dynamics of its own included,
     and recomputes its covariance where z has gaps. For many complete runs `scheduled_polynomial_filter` does the same
     with saved gains. Behind a known gain moments are about the mean.
 

@@ -70,7 +70,6 @@ def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
         depends_on_inputs = isinstance(sensor, AbstractSensor) and bool(sensor.inputs)
         if not depends_on_inputs:
             return make(*args, **kwargs)
-        # Imported here, as that module imports this one's.
         from heliograph.filters.wrappers.sensor_inputs import build_filter_of_inputs
 
         plant, sensor = given.pop("plant"), given.pop("sensor")

@@ -291,7 +291,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least total that reaches the target error, and the certificate.
 
-    It says how much less power any allocation needs at least. `task`: paths, limits, free hops, starts of the search.
+    The certificate has a bound of the power that any allocation needs. `task`: paths, limits, free hops, starts.
     """
     _check_reachable(task, target)  # the target is possible at all within each transmitter's own limit
     # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.

@@ -56,7 +56,6 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         ValueError: a network that is not of independent paths, a plant that is not linear or, without a horizon, not
             stable.
     """
-    # What is asked for has to be of independent paths from linear sensors.
     # Check that the plant is linear and every node a plain one, of a linear sensor behind hops.
     instance("network", network, Network, "a Network")
     plant, steps = network.plant, instance("error", error, Error, "an Error").steps

@@ -37,9 +37,9 @@ def name_of_process() -> str:
 def own_store(location: str, process: str) -> Iterator[None]:
     """Own a store for a block, for services of one name; the operating system, or the server, ends it with the process.
 
-    Two services that write one store (the database of all plants' states) would overwrite each other's states, so the
-    second is refused. A file is locked by the operating system through a file beside it, which contains the owner's
-    name; a database of PostgreSQL by an advisory lock of a connection, for which nothing is written.
+    A store (the database of all plants' states) has one service of each name; a second one is refused, and told whose
+    it is. A file is locked by the operating system through a file beside it, which contains the owner's name; a
+    database of PostgreSQL by an advisory lock of a connection, for which nothing is written.
 
     Args:
         location: a path, or a URL of PostgreSQL.
