@@ -159,8 +159,7 @@ class NodeEvents:
             self.arrival = array(self.time.typecode, self.time)
             two_clocks = "stamps and arrivals are of two clocks: each event arrives when it was measured"
             return UnsetStampNotes(note=f"{name}: {two_clocks}")
-        # Where arrivals are not known each is the event's own time.
-        are_arrivals_known = bool(delays.any())
+        are_arrivals_known = bool(delays.any())  # else each arrival is the event's own time
         unset = delays > year if are_arrivals_known else find_unset_stamps(time, year)
         count = int(np.count_nonzero(unset))
         if not count:

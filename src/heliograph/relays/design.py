@@ -186,9 +186,8 @@ def _make_gains(
         predicted: covariance of its error before each correction.
         innovation: covariance of its innovation z - (B s + b).
     """
-    # B and b of this filter's z, then A - K B and a - K b; the estimate is s+, so that its maps are those of s.
     rows, constants = steps.predict_maps()
-    b_matrix, b = rows[:, received], constants[:, received]
+    b_matrix, b = rows[:, received], constants[:, received]  # B and b of this filter's z
     used_gain = gain * np.asarray(steps.receives_in_slot)[:, None, received]  # zero on what nobody transmits
     transition = steps.transition - used_gain @ b_matrix
     offset = steps.drift - np.einsum("kir,kr->ki", used_gain, b)

@@ -74,8 +74,7 @@ class Service:
     ):
         """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings.
 
-        A fleet has all plants of one network and its compiled filters. `every`: after how many seconds the estimate of
-        a silent plant is published again. `forecast`, `thresholds`: how far ahead, and levels that may be passed.
+        `fleet`: all plants of a network. `every`: seconds until a silent plant is published again. `forecast`: spans.
         """
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
@@ -270,7 +269,8 @@ class Service:
     ) -> tuple[list[Entry], int, int]:
         """Return refusals of messages that were not used, or not wholly; how many were malformed, and how many known.
 
-        Known are duplicates and late messages, perhaps used before a restart. `payloads`: what each was read from.
+        The entries tell why a message did not change an estimate. Known messages are duplicates and late ones: they may
+        have been used before a restart. `payloads`: the raw content of each. `outcomes`: its verdict, and the reason.
         """
         entries, malformed, known = list[Entry](), 0, 0
         for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):

@@ -212,10 +212,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
-        """Return for all pairs (component, mode) that z corrects: moments of the sensor's signal, and prior weights.
-
-        The signal is that of the mode's sensor if x has the component's Gaussian.
-        """
+        """Return, of pairs (component, mode) that z corrects, moments of the mode's sensor's signal and prior weights."""
         component, mode = self.merging.list_update_pairs(len(self.initial))
         return self.signals_of_pairs(state.gaussian, (component, mode), k), state.weight[component, mode]
 

@@ -41,7 +41,7 @@ class OpenEnds(NamedTuple):
     """Coordinates by which an end of a domain is at infinity.
 
     A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
-    Shapes (p,). single: numbers whose end can be tried alone.
+    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
     """
 
     low: Bool[np.ndarray, " p"]
@@ -87,8 +87,7 @@ class _Lanes(NamedTuple):
 
     x: points (lanes, p). total: log-likelihood l there (lanes,), gradient (lanes, p), information I (lanes, p, p).
     model: B, a model of minus the Hessian of l (lanes, p, p). radius: of the trust region (lanes,). remaining: what a
-    full step would gain, g' I^-1 g / 2. done: lanes that go no further. joined: the lane that each one has joined,
-    itself if none.
+    full step would gain, g' I^-1 g / 2. done: lanes that go no further. joined: the lane that each joined, or itself.
     """
 
     x: np.ndarray

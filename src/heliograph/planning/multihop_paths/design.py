@@ -78,7 +78,7 @@ class PathProblem(NamedTuple):
     def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
         """Return a problem whose error is at most this one's, and equal at `powers`; then its value and gradient there.
 
-        Its error is linear in P: the criterion's tangent at the P of these powers. The gradient is (time, free).
+        Its error is linear in the covariance P: the tangent of this criterion at the P of these powers (time, free).
         """
         problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
@@ -262,8 +262,7 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
 def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least error within the limits of a task, and the certificate."""
     problem, starts = task.problem, task.starts
-    # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there. A criterion
-    # with a sharpness is an eigenvalue, not a trace.
+    # Water filling solves a convex problem of the trace (no sharpness) but for rounding; the descent goes on from there.
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole_paths()))
         starts = [water_filling(problem.limits, problem.sensitivity, path_of_hop, starts[0])]

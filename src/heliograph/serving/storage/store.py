@@ -44,8 +44,7 @@ class Store:
     """Plants and a journal of outputs in SQLite (a path) or PostgreSQL (a URL), for one process or several with names.
 
     If a plant was committed by another process since it was read, nothing is committed. Every row has a checksum;
-    `damaged` are the plants with rows that are not as written. A new name may belong to one of them if its name is
-    damaged.
+    `damaged` are plants with rows that are not as written; a new name may be one of them, if its name is damaged.
 
     Args:
         location: a path, or a URL of PostgreSQL.

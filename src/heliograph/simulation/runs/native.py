@@ -307,6 +307,8 @@ def simulate_natively(
 ) -> Result | None:
     """Simulate a network by native code, and return what the reducer makes of its runs.
 
+    The result is None where native code does not support the network or the reducer.
+
     Args:
         network: the network.
         inputs: of the plant (horizon, inputs).
@@ -317,10 +319,7 @@ def simulate_natively(
         chunk: number of runs between two reports of progress.
         progress: is called with how many runs are done, and of how many.
         smoothing: the part of the network that is smoothed; None if nothing is.
-        precision: type of numbers in which runs are computed.
-
-    Returns:
-        The reducer's result; None where native code does not support the network or the reducer.
+        precision: in which runs are computed.
     """
     # Many nodes that share nothing go in parts, where the reducer has a method of its own to join their results.
     can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)
