@@ -212,7 +212,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
-        """Return, of pairs (component, mode) that z corrects, moments of the mode's sensor's signal and prior weights."""
+        """Return for pairs (component, mode) that z corrects the moments of the mode's signal, and prior weights."""
         component, mode = self.merging.list_update_pairs(len(self.initial))
         return self.signals_of_pairs(state.gaussian, (component, mode), k), state.weight[component, mode]
 

@@ -262,7 +262,7 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
 def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least error within the limits of a task, and the certificate."""
     problem, starts = task.problem, task.starts
-    # Water filling solves a convex problem of the trace (no sharpness) but for rounding; the descent goes on from there.
+    # Water filling nearly solves a convex problem of a trace (one without a sharpness); the descent goes on from there.
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole_paths()))
         starts = [water_filling(problem.limits, problem.sensitivity, path_of_hop, starts[0])]
