@@ -152,8 +152,7 @@ class PowerTask(NamedTuple):
         """
         problem, limits = self.problem, self.problem.limits
         steps, count = problem.paths.second.shape  # (time, paths)
-        # Limits of a path: the sums of its hops'.
-        peak, mean = np.zeros((steps, count)), np.zeros(count)
+        peak, mean = np.zeros((steps, count)), np.zeros(count)  # limits of a path: the sums of its hops' limits
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
