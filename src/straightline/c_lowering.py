@@ -107,16 +107,21 @@ def lower_for_c(
 ) -> tuple[ZeroFoldingGraph, list[Buffer], list[np.ndarray]]:
     """Return a traced program's graph, a buffer for each argument and the nodes of each result.
 
+    C code is then written from this graph of single operations on numbers (nodes). A buffer is the memory of one
+    argument. What is known of the arguments saves operations: 0 times a finite number is 0.
+
     Args:
-        program: the traced function.
-        finite: numbers of the arguments that hold no NaN.
-        symmetric: numbers of the arguments that are symmetric matrices, of which the upper triangle alone is read.
+        program: the traced function, as JAX's list of operations (jaxpr).
+        finite: positions of the arguments that hold no NaN.
+        symmetric: positions of the arguments that are symmetric matrices; only their upper triangles are read.
         short: whether each loop stays a loop; else short ones are written out.
     """
-    lowering, buffers, values = CLowering(), list[Buffer](), list[Any]()  # of each argument its memory and its value
+    # The lowering translates JAX's operations to nodes; each argument has a memory (buffer) and a value.
+    lowering, buffers, values = CLowering(), list[Buffer](), list[Any]()
     graph = lowering.graph
     if short:
         lowering.written_out = 0  # loops of at most so many operations are written out: none
+    # One buffer for each argument, of its type and shape (`aval`).
     for number, variable in enumerate(program.jaxpr.invars):
         aval: Any = variable.aval
         buffer = Buffer("input", type_of(aval), tuple(aval.shape), graph.top)
@@ -128,6 +133,7 @@ def lower_for_c(
             nodes, n = value.nodes(graph), aval.shape[0]
             value = arrange_nodes([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)
         values.append(value)
+    # Translate all operations of the program, in double precision; each result becomes an array of nodes.
     with jax.enable_x64(True):
         outputs = [lowering.nodes(x) for x in lowering.inline_program(program, values)]
     return graph, buffers, outputs

@@ -286,19 +286,24 @@ def _choose_ring_row(
 ) -> RingTurn:
     """Choose the row of the ring that an iteration reads, or fills with numbers that it computes.
 
-    If a cycle is known, the next row of the cycle is read, provided that the tests had the same outcomes there. Else
-    the numbers are computed and fill the next row of the ring, or row 0 if a cycle was just left or the ring is full.
+    A loop, such as a Kalman filter over rows of data, often comes to compute the same covariances again and again in a
+    cycle. So its recurring numbers are stored in a ring of RING rows, with the outcomes of the tests on which they
+    depend (did a measurement arrive?). If a cycle is known, the next row of the cycle is read, provided that the tests
+    had the same outcomes there. Else the numbers are computed and fill the next row of the ring, or row 0 if a cycle
+    was just left or the ring is full.
 
     Args:
-        graph: the program.
-        outcomes: of the tests in this iteration.
+        graph: the program, to which operations (nodes) are added.
+        outcomes: outcomes of the tests in this iteration.
         test_ring: the ring of earlier outcomes.
         last_row: row of the last iteration.
-        period: how many rows the known cycle has, 0 if none is known.
+        period: number of rows of the known cycle, 0 if none is known.
     """
     node, zero, one = graph.node, graph.constant(0, "i64"), graph.constant(1, "i64")
+    # The next row, which after the last row of the cycle is row 0.
     next_row = node("add", "i64", last_row, one)
     next_in_cycle = select(graph, node("eq", "bool", next_row, period), zero, next_row)
+    # Compute if no cycle is known or some test differs. Then fill row 0 if a cycle is left or the ring is full.
     knows_no_cycle = node("eq", "bool", period, zero)
     differing_tests = [node("xor", "bool", *pair) for pair in zip(outcomes, test_ring.load(next_in_cycle), strict=True)]
     computes = reduce(partial(node, "or", "bool"), differing_tests, knows_no_cycle)

@@ -234,15 +234,15 @@ def accumulate(
 ) -> SummingProgram:
     """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
 
-    Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
-    The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+    A Monte Carlo simulation is such a function: the run's number makes its random key. Sums take no more memory for
+    more runs. The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
 
     Args:
         function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what
             is summed (real numbers, in a tree) and what is collected run by run (a tree, such as `()`).
         examples: the arguments without the number; shapes and types count alone, but for what is known.
-        batches: sums that are kept apart, run r in that of r mod `batches`, from which the mean has an error; 1 by
-            default.
+        batches: number of sums that are kept apart, run r in sum r mod `batches`; their scatter gives the standard
+            error of a mean; 1 by default.
         known: of examples by their number among the leaves, which entries (a mask) are the example's in every call,
             such as zeros; they are constants of the code. None by default.
         single: whether numbers are float32, and draws those of JAX by default; double unless so. Sums are double.
@@ -252,10 +252,12 @@ def accumulate(
         ValueError: a function that returns no pair.
     """
     find_processor_features()  # refuses a processor that LLVM does not know
+    # The arrays of all arguments, and of some the entries that are constants of the code.
     leaves = jax.tree.leaves(examples)
     known_numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
     # The last argument is the number of the run.
     program = lower_function(function, *examples, make_placeholder((), np.uint32), known=known_numbers, single=single)
+    # The results are a pair: its first part is summed, its second collected.
     summed_leaves = _count_summed_leaves(program.tree)
     summed = tuple(n < summed_leaves for n in range(len(program.outputs)))
     return SummingProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))

@@ -116,12 +116,16 @@ def _compute_state_scores(
 ) -> list[StateScore]:
     """Return RMSE, claimed deviation and NEES with standard errors, by step, node, filter and state of one setting.
 
+    A setting is a network with certain numbers, simulated in many runs. NEES: squared error over claimed variance.
+
     Args:
         setting: number of the setting.
         labels: names of nodes, filters and states.
-        claims: what each filter claims (node, filter), "" where a node has no such filter.
-        steps: of the sums, 0 for the mean over all.
-        sums: over the finite runs.
+        claims: what each filter says that its covariance is, such as "exact" (node, filter), "" where a node has no
+            such filter.
+        steps: numbers of the steps in the sums, 0 for the mean over all.
+        sums: number of finite runs (node, filter), and over these sums and sums of squares of squared error, claimed
+            variance and NEES (3, step, node, filter, state).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         # Mean over n runs and its standard error, sqrt((E[x^2] - E[x]^2) / (n - 1)).

@@ -98,7 +98,8 @@ class _WorkerProcess:
     def get_reply(self, job: Job) -> Reply:
         """Send a job to the process and return its reply; if it dies or is too late, a reply that says so.
 
-        Then the next job gets a new process.
+        A job is one chunk of the runs of one setting of a campaign. The process reads a job as a line of JSON, and
+        answers with a line. After it died or was killed the next job gets a new process.
         """
         process = self._ensure_running()
         is_late = Event()
@@ -116,7 +117,7 @@ class _WorkerProcess:
         assert process.stdout is not None
         line = process.stdout.readline()
         timer.cancel()
-        # A whole line is an answer if the timer had not ended the process; else it ended, or was killed.
+        # A whole line is an answer unless the timer killed the process; else the process ended by itself or was killed.
         if line.endswith("\n") and not is_late.is_set():
             return Reply(**json.loads(line))
         code = process.wait()

@@ -145,7 +145,10 @@ def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
 def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Record":
     """Return some of the rows of a record, and of its smoothed estimates, which are of its last rows.
 
-    `rows`: a mask, (rows,); None for all. What is said of all rows together, as of weighing and uplinks, is left out.
+    Args:
+        record: results of filters on a recording, a row for each time. What it says of all rows together is left out:
+            reports between nodes, quantizers (`uplinks`), and the weights that filters gave to innovations (`weighed`).
+        rows: a mask (rows,); None for all.
     """
     from dataclasses import replace
 
@@ -163,6 +166,7 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
             modes=None if estimate.modes is None else np.asarray(estimate.modes)[rows],
         )
 
+    # Smoothed estimates cover the last rows only: they take the end of the mask.
     smoothed = record.smoothed
     return replace(
         record,

@@ -222,7 +222,18 @@ def _fit_with_progress(
     advance: "Advance",
     stop: GentleStop,
 ) -> "Fit":
-    """Return the fit to the first rows, with progress by iterations of the search; after each it may be stopped."""
+    """Return the fit to the first rows, with progress by iterations of the search; after each it may be stopped.
+
+    Args:
+        build: returns the network, in which some numbers are free to be learned.
+        recording: measurements by node, inputs, times and, if known, true states, a row for each time.
+        rows: number of rows to learn from.
+        starts: number of starting points of the search.
+        seed: seed of the starting points.
+        truth: whether estimates are compared with true states, not predictions with measurements.
+        advance: shows a text and how many of how many iterations are done.
+        stop: holds signals such as Ctrl-C; the first ends the search with the best result so far.
+    """
     from heliograph.files.recording import Recording
     from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from

@@ -93,8 +93,8 @@ def read_measured_plants(
         location: a file or folder, or the address of a store.
         reference: the user's name of the network, for errors.
         network: the network.
-        module: its file's names, such as `sources`, by which messages are read.
-        options: as typed.
+        module: names defined in the network's file, such as `sources`, by which messages are read.
+        options: options of the command line: which plant, how late messages may be, and how they are read.
         advance: called with the progress.
         lag: how much later estimates are asked for, of messages; None for none.
 
@@ -104,6 +104,7 @@ def read_measured_plants(
     """
     from heliograph.numerics.check import fail
 
+    # Messages are events, put in rows of time for each plant; a table of rows (no events) has one plant only.
     path = open_path_or_store(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:

@@ -47,10 +47,13 @@ class WorthOptions:
 def compute_worth(network: "Network", module: Mapping[str, object], options: WorthOptions) -> "SensorWorth":
     """Return what sensors are worth.
 
+    A sensor's worth is how much larger the estimates' errors are without it, or while it is out, or how much smaller
+    with a new one.
+
     Args:
         network: the network.
-        module: the names of its file, among them those of nodes to try.
-        options: as they are typed.
+        module: names defined in the network's file, among them those of nodes to try.
+        options: options as they are typed: which nodes are left out, out for some steps, or added.
 
     Raises:
         ValueError: an option that cannot be read, a figure that cannot be written, what `worth_of_sensors` refuses.
@@ -58,6 +61,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
     import heliograph as hg
     from heliograph.numerics.check import fail
 
+    # Outages NODE:STEPS as {node: steps}.
     outages = {}
     for word in options.outage:
         name, _, count = word.rpartition(":")

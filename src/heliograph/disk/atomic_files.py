@@ -306,21 +306,23 @@ def _write_listing(folder: Path) -> None:
 def whole_folder(target: Path) -> Iterator[Path]:
     """Yield an empty folder that replaces `target` at the end; after an error or interrupt `target` is unchanged.
 
-    Remains of killed processes that wrote the same folder are cleared first, and earlier results that one had moved
-    aside are restored. A folder into which files of somebody else came meanwhile is kept beside it, and a warning names
-    it.
+    The new folder is filled under another name and renamed at the end, so that a reader never sees half of it. Remains
+    of killed processes that wrote the same folder are cleared first, and earlier results that such a process had moved
+    aside are restored. If somebody else's files came into the old folder meanwhile, it is kept beside the new one, and
+    a warning names it.
     """
     remove_leftover_folders(target)
     made = [folder for folder in target.parents if not folder.exists()]
     temporary: Path | None = None  # a folder in the same file system; a lock on it says that we run
     lock = ExitStack()
     try:
+        # Ctrl-C waits while the temporary folder is made, so that it is known and can be removed.
         with hold_signals():
             target.parent.mkdir(parents=True, exist_ok=True)
             temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
             (temporary / "new").mkdir()
             lock.enter_context(try_lock(temporary))
-        # The lock goes before the folder is renamed.
+        # The caller fills the folder. The lock is released before the folder is renamed.
         with lock, name_path_in_errors(target):
             yield temporary / "new"
             _write_listing(temporary / "new")
@@ -328,6 +330,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
         with hold_signals():
             _replace_folder(temporary, target)
     except BaseException:
+        # Undo everything: the temporary folder, the old results, and parents that were made above.
         with hold_signals():
             lock.close()
             if temporary is not None:

@@ -282,12 +282,15 @@ def _find_code(
 ) -> EngineChoice:
     """Return the native code that `compile` makes of trees of this structure, made once, or why there is none.
 
+    One code serves all calls that differ in the numbers of arrays alone, so that it is cached by everything else.
+
     Args:
-        compile: one of the functions below, which keep what they made.
+        compile: one of the functions of this module that compile, which cache the code by their arguments.
         trees: functions and their arguments, with arrays.
         has_axis: for each tree whether its arrays have a leading axis, of runs or of rows.
-        most: operations above which there is no code; the compiler's own limit if None.
+        most: number of operations above which there is no code; the compiler's own limit if None.
     """
+    # All arrays and other objects in a list, and for each whether it has a leading axis.
     leaves, structure = jax.tree.flatten(tuple(trees))
     leaf_has_axis = list[bool]()  # the same of each leaf
     for tree, tree_has_axis in zip(trees, has_axis, strict=True):

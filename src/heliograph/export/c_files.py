@@ -156,10 +156,12 @@ def make_c_text(
 ) -> CText:
     """Return the text of both files of a filter in C, its header and its source.
 
+    The filter's step is traced by JAX, lowered to single operations, and written as C functions.
+
     Args:
         filter: the filter.
         received: names of z's components.
-        prefix: of all names in C.
+        prefix: with which all names in C begin.
         real: type of numbers.
         apart: whether prediction and correction are functions of their own, too.
         size: whether the source is to be short: the shorter one of two forms, with loops and with loops written out.
@@ -168,6 +170,7 @@ def make_c_text(
     Raises:
         ValueError: single precision for a filter that cannot keep its covariance in it; a number that is beyond it.
     """
+    # In single precision only factors of a covariance, or fixed gains, stay accurate.
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_covariance_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
@@ -237,10 +240,10 @@ def _run_command(*command: str, folder: Path) -> str:
 def _generate_timer_program(name: str, received: int, inputs: int, real: Real) -> str:
     """Return a C program that prints the nanoseconds of a step, by the fastest of REPEATS rounds of STEPS steps.
 
-    Where a step is refused, as past the end of a schedule, it starts again.
+    Exported filters are timed by it. Where a step is refused, as past the end of a schedule, the filter starts again.
 
     Args:
-        name: of the filter's header, and the prefix of its functions.
+        name: name of the filter's header, and the prefix of its functions.
         received: count of z's components, which get numbers from 0.
         inputs: count of u's components, which are 0.1.
         real: type of numbers.

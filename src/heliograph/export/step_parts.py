@@ -40,8 +40,16 @@ class PartOfStep(NamedTuple):
 def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
     """Return the functions to export: one step or, if `apart`, prediction and correction, for numbers of type `real`.
 
-    Each has example arguments, of which only shapes count, and the names of its results `beside` state and estimate.
+    C code is later written from these JAX functions. Each has example arguments, whose shapes alone count, and the
+    names of its results `beside` state and estimate: "implausible" says that the estimate lost its digits and must not
+    be used, "spoilt" that an input has too few digits.
+
+    Args:
+        filter: the filter.
+        real: "double" or "float".
+        apart: whether prediction and correction are functions of their own.
     """
+    # Examples: the arrays of the state, a measurement, inputs and the number of a step.
     leaves, tree = jax.tree.flatten(filter.init())
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
     flags = ("implausible", "spoilt")
@@ -111,7 +119,12 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
     """Return the function of the correction by a measurement, with its innovation as further results.
 
-    `tree`: structure of the filter's state, which the function takes and returns as a list of arrays.
+    C code is written from this JAX function, so that it takes and returns only arrays.
+
+    Args:
+        filter: the filter.
+        tree: structure of the filter's state, which the function takes and returns as a list of arrays.
+        real: type of numbers in C, "double" or "float"; a measurement is judged by their rounding.
     """
 
     @jax.jit
@@ -123,6 +136,7 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         """
         prior = jax.tree.unflatten(tree, arrays)
         after, innovation = filter.correct(prior, z, k)
+        # Estimates before and after z; judged by them are e' S^-1 e of the innovation, and how many numbers arrived.
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
         judgement = Judgement.judge_correction(
             filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms, filter.angles_used()

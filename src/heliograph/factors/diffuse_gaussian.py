@@ -300,18 +300,23 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
 def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
     """Return the regression of x on the next state x+ = F x + b + w, where x may have unknown directions.
 
-    The covariance has two levels: unknown directions have infinite variances, all others finite ones. A direction of x
-    that stays unknown given x+ gets the variance NaN, and so do the estimates that use it.
+    A smoother goes back by it. The covariance of x has two levels: unknown directions have infinite variances, all
+    others finite ones. A direction of x that stays unknown given x+ gets the variance NaN, and so do the estimates that
+    use it.
 
     Args:
-        x: the state before the step.
+        x: the state before the step: mean m, factor L_x, and the finite and infinite variances of its columns.
         matrix: F.
         ahead: mean of x+, F m + b.
-        noise: columns of Cov w.
+        noise: N and weights d of Cov w = N diag(d) N'.
+
+    Returns:
+        x = m + K e + rest for x+ = ahead + L e with uncorrelated e: m with the factors of Cov(rest), K, ahead and L.
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
-    # In the same uncorrelated (xi, omega): x+ = ahead + [F L_x | N] (xi, omega), and x = m + [L_x | 0] (xi, omega).
+    # Let xi and omega be the uncorrelated sources of x and w: x = m + L_x xi, w = N omega. Then
+    # x+ = ahead + [F L_x | N] (xi, omega), and x = m + [L_x | 0] (xi, omega).
     n = len(x.mean)
     next_rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
     rows = jnp.concatenate([x.root, jnp.zeros((n, next_rows.shape[1] - n))], axis=1)

@@ -144,11 +144,11 @@ class NodeEvents:
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
     def drop_unset_stamps_in_place(self, name: str) -> UnsetStampNotes:
-        """Remove the events whose stamps were not set; return what is to be said of that. `name`: of the node.
+        """Remove the events whose stamps were not set; return what is to be said of that. `name`: name of the node.
 
-        A stamp that is more than a year before its arrival was not set. Where most are, stamps and arrivals are of two
-        clocks: then nothing is removed, and each event arrives when it was measured. Where no arrivals are known a
-        stamp was not set that is more than a year away from those before and after it, which are near each other.
+        A stamp (time of measuring) that is more than a year before its arrival was not set. Where most are, stamps and
+        arrivals are of two clocks: nothing is removed, and each event arrives when it was measured. Where no arrivals
+        are known, a stamp was not set if it is more than a year away from both neighbours, which are near each other.
         """
         time, arrival, _ = self.arrays()
         delays, year = arrival - time, YEAR / SECOND if self.numbers else YEAR  # numbers are seconds
@@ -158,8 +158,7 @@ class NodeEvents:
             self.arrival = array(self.time.typecode, self.time)
             two_clocks = "stamps and arrivals are of two clocks: each event arrives when it was measured"
             return UnsetStampNotes(note=f"{name}: {two_clocks}")
-        # Where arrivals are not known each is the event's own time.
-        are_arrivals_known = bool(delays.any())
+        are_arrivals_known = bool(delays.any())  # else each arrival is the event's own time
         unset = delays > year if are_arrivals_known else find_unset_stamps(time, year)
         count = int(np.count_nonzero(unset))
         if not count:

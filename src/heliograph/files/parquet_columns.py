@@ -20,24 +20,27 @@ def read_parquet_blocks(
 ) -> Iterator[TableRows]:
     """Yield the rows of a Parquet file, so many at a time: numbers, NaN where null, and dates in nanoseconds.
 
+    A long file need not fit in memory.
+
     Args:
         path: the file.
-        only: the columns that are read; None for all.
-        rows: at most so many at a time.
-        progress: called with how many rows are read, and of how many (default none).
+        only: names of the columns that are read; None for all.
+        rows: largest number of rows in one block.
+        progress: called with the number of rows read so far and of all rows (default none).
 
     Raises:
-        ValueError: no Parquet, a column twice, one that is neither of numbers nor of dates.
+        ValueError: no Parquet file, two columns of one name, a column that holds neither numbers nor dates.
         ModuleNotFoundError: pyarrow is not installed (extra "tables").
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        # Buffered ahead, what was read is kept until the file is closed: 24 bytes a row of three columns.
+        # Without `pre_buffer`: that would keep what was read until the file is closed, 24 bytes a row of three columns.
         with pq.ParquetFile(path, pre_buffer=False) as file:
             check_distinct(path, file.schema_arrow.names)
             count, total = 0, file.metadata.num_rows
+            # Batch by batch: `first` is the number of its first row, counted from 1.
             for batch in file.iter_batches(batch_size=rows):
                 first, count = count + 1, count + batch.num_rows
                 if progress is not None:

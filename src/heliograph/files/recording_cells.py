@@ -53,12 +53,18 @@ class RowRefusals:
 
 
 def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: RowRefusals) -> RecordingRows:
-    """Return what stands in the columns of a table; rows that cannot be read are refused by `refusals`."""
+    """Return what stands in the columns of a table; rows that cannot be read are refused by `refusals`.
+
+    Args:
+        columns: the table's cells by name of column, a row for each time.
+        network: says which columns there may be: time, inputs, each node's measurements, and true states.
+        refusals: notes rows that cannot be read, with the reason, or raises the first one; `source` names the file.
+    """
     inputs, source = network.inputs, refusals.source
-    # By node the columns that each component of its measurements may have: of several names one.
+    # By node, for each component of its measurements, the names that its column may have; one of them must be there.
     received = list_received_columns(network)
-    # A relay may have no columns at all: the data of other nodes do not need what it received itself, so that only a
-    # filter of its own has nothing to filter.
+    # A relay may have no columns at all: the filters of other nodes do not need what the relay received, so that only
+    # its own filter has no data.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
             del received[name]

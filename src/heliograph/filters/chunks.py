@@ -312,8 +312,9 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     """Filter all chunks side by side from guessed first states; return the last state and the outputs (chunks, ...).
 
     Then, in order, each chunk whose guess differs from the state in which the chunk before it ended is filtered again,
-    from that state. None where rows are few, where the filter forgets too late, and without native code. `start` is
-    the state before the first row, `rows` are arrays (rows, ...), and `programs` filter one chunk.
+    from that state. None where rows are few, where the filter forgets too late, and without native code. `recursion`:
+    one step of a linear filter. `start`: state before the first row. `rows`: z and u (rows, ...). `programs` filter one
+    chunk in full, or only its means where covariances have settled.
     """
     begun = find_chunk_starts(recursion, start, rows)
     if begun is None:

@@ -26,17 +26,20 @@ def evaluate_for_derivatives(likelihood: Likelihood) -> Likelihood:
 def take_derivatives_from(plain: Likelihood, differentiated: Likelihood, arguments: tuple[Any, ...]) -> jax.Array:
     """Return plain(*arguments), a log-likelihood, with the derivatives of another function that computes it too.
 
+    The fastest code, such as native code, often cannot be differentiated by JAX; a rule for derivatives is attached.
+
     Args:
         plain: the log-likelihood as it is computed best.
         differentiated: the same by a program that can be differentiated; it is traced only for a derivative.
-        arguments: filter, measurements and inputs, of which some numbers are traced.
+        arguments: filter, measurements and inputs; some numbers in them are traced by JAX.
     """
+    # The arguments as a list of numbers and arrays; only traced ones may have derivatives, known ones stay constants.
     leaves, form = jax.tree.flatten(arguments)
-    traced = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]  # what is known stays known
+    traced = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]
 
     @jax.custom_jvp
     def evaluate(values: list[jax.Array]) -> jax.Array:
-        """Return the log-likelihood at these values of what is traced."""
+        """Return the log-likelihood at these values of the traced arguments."""
         return plain(*jax.tree.unflatten(form, _replace_entries(leaves, traced, values)))
 
     def differentiate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:

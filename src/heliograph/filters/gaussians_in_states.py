@@ -32,12 +32,14 @@ def find_equal_states(
 ) -> Bool[np.ndarray, " n"]:
     """Return which of two stacks of states (n, ...) agree, a flag (n,) for each pair.
 
-    Means may differ by `tolerance` deviations and some roundings. A mean far from zero is rounded more, and its
-    rounding enters all means through the innovations, so the largest |mean| / deviation scales the allowed rounding.
-    A derivative of a Gaussian is compared in the Gaussian's deviations too, relative to the largest derivative by the
-    same parameter in the states `among` (n', ...), by default `others`.
+    A long recording is filtered in chunks from guessed states, and a guess is then compared with the state in which the
+    chunk before ended. Means may differ by `tolerance` deviations and some roundings. A mean far from zero is rounded
+    more, and its rounding enters all means through the innovations, so the largest |mean| / deviation scales the
+    allowed rounding. A derivative of a Gaussian is compared in the Gaussian's deviations too, relative to the largest
+    derivative by the same parameter in the states `among` (n', ...), by default `others`.
     """
     # Each comparison: (number, other number, allowed difference beside some roundings of the number itself).
+    # First the arrays that belong to no Gaussian; then means and covariances of the Gaussians, and of derivatives.
     comparisons = [(a, b, np.zeros(())) for a, b in zip(*map(_other_leaves, (states, others)), strict=True)]
     largest_slopes = _find_largest_slopes(others if among is None else among)
     for x, y in zip(*map(_moving_parts, (states, others)), strict=True):

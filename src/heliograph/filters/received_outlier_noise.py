@@ -180,18 +180,23 @@ def describe_outlier_noise(
 def _find_noisy_outputs(squares: Array, covariance: Array) -> np.ndarray:
     """Return the sensor's output whose noise each received component carries, (m,).
 
-    `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
-    TOLERANCE: 1e-12, the share of a gain that is zero but for rounding. Free numbers (traced) cannot be compared:
-    then component i carries the noise of output i.
+    A channel brings z = G (y + noise) of m components, y of p outputs. A robust filter needs one noise in each
+    component. Numbers that are traced by JAX cannot be compared: then component i carries the noise of output i.
+    Gains up to TOLERANCE, 1e-12, of the largest one are zero but for rounding.
+
+    Args:
+        squares: E[G_ia^2] of the gain of output a in component i (m, p).
+        covariance: of the sensor's noise (p, p).
 
     Raises:
-        ValueError: one that carries the noise of several.
+        ValueError: a component that carries the noise of several outputs.
     """
     m, p = squares.shape
     if is_traced(squares, covariance):
         if m != p:
             raise fail("channel with free numbers before a robust filter", f"{p} outputs", m)
         return np.arange(m)
+    # noise_variance[i, a] = E[G_ia^2] R_aa; count in each component i the outputs a whose share is more than rounding.
     noise_variance = np.asarray(squares) * np.diag(np.asarray(covariance))
     largest = np.max(noise_variance, axis=1, keepdims=True, initial=0.0)
     output_count = np.count_nonzero(noise_variance > TOLERANCE**2 * largest, axis=1)

@@ -309,22 +309,22 @@ def _score_number(
     """Return the score of forecasts from each row of the number `horizon` rows later.
 
     Args:
-        number: its node, filter, part and name.
+        number: node and name of the filter, part ("state" or "received"), and name of the number.
         horizon: rows ahead.
-        law: the forecast from each row.
+        law: the forecast from each row: mixtures of K Gaussians, weights, means and variances (rows, K).
         values: the number in each row (rows,), NaN where it did not come.
         first: first row from which a forecast counts.
         is_angle: whether it is an angle.
     """
-    # The forecasts that count, and what came `horizon` rows later.
+    # The forecasts that count, and the values that came `horizon` rows later.
     law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
-    # An angle is taken within half a turn of what was expected.
+    # An angle is taken within half a turn of its forecast.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
     # Nothing was forecast yet where the start is unknown (infinite variances).
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)
     error, probability_below = came - law.mean, compute_probability_below(law, came)
     nan_if_absent = np.where(np.isnan(error), np.nan, 0.0)  # added to 0 or 1, so that absent rows do not count
-    # Whoever knows a value holds all of it within any interval: it is no trial of the share.
+    # A value that the forecast knows for certain is within any interval: it does not test the share within.
     absent_or_known = np.where(is_known_and_came(law, came), np.nan, nan_if_absent)
     in_middle = {level: (np.abs(probability_below - 0.5) <= level / 2) + absent_or_known for level in LEVELS}
     return Score(
@@ -361,10 +361,11 @@ def _forecast_from_each_row(
 ) -> PyTree:
     """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 
-    They are (rows, places, K, ...), of mixtures of K parts, with variances in the place of covariances.
+    They are (rows, places, K, ...), of mixtures of K parts, with variances in place of covariances. A backtest scores
+    them by the later rows.
 
     Args:
-        predictor: predicts the filter's state step by step without data.
+        predictor: predicts the filter's state, and from it the states' and measurements' moments, without data.
         z: measurements (rows, received).
         u: inputs (rows, inputs).
         windows: inputs of the rows ahead of each row (rows, ahead, inputs).

@@ -105,8 +105,11 @@ def residuals(
 ) -> Residuals:
     """Standardise what a filter did not predict, and test it: correlation, normality, changing variance.
 
+    If the model is right, the innovations (z minus its prediction) over their deviations are uncorrelated and standard
+    normal.
+
     Args:
-        filter: a filter that claims a covariance.
+        filter: a filter that states a covariance.
         z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
         u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
         lags: number of autocorrelations; 10 by default.
@@ -118,6 +121,7 @@ def residuals(
         Series Analysis by State Space Methods, Section 2.12.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    # Predict each row from those before it, then standardise and test; angles are compared within a turn.
     rows, inputs = check_data(filter, z, u)
     predicted, count = predict_rows(filter, rows, inputs), check_count("lags", lags)
     angles = (filter.angles_used() or FilterAngles((), ())).received

@@ -213,12 +213,18 @@ def correct_with_reports(
 ) -> tuple[ReportsBelief, PredictedReports]:
     """Correct with the reports z = C s + c + n that arrived, by their age in steps; NaN for those that did not arrive.
 
-    s is the centre's state and n the noise of the reports. Quantizers add G mu to the reports, with the links' gains G
-    and |mu| <= `past.error`.
+    s is the centre's state, which holds the plant's state and every node's error, and n the noise of the reports.
+    Quantizers (rounding to codewords) add G mu to the reports, with the links' gains G and |mu| <= `past.error`.
+
+    Args:
+        state: the law of s, gains, offsets c and noises of the reports by age (`past`), and a bound of the covariance
+            of the error that quantizers cause.
+        reports: NaN where none arrived.
 
     Returns:
         The corrected state, and the mean and covariance of the reports before they arrived.
     """
+    # C, the expected reports C s + c, and the filter's gain K, in which rows that did not arrive count nothing.
     x, past, values = state.gaussian, state.past, jnp.ravel(reports)
     output = _make_output_matrix(past, len(x.mean))
     expected, is_present = output @ x.mean + jnp.ravel(past.offset), ~jnp.isnan(values)
@@ -227,7 +233,8 @@ def correct_with_reports(
     innovation = jnp.where(is_present, values - expected, 0.0)
     slopes = jnp.asarray(output @ x.root)
     corrected = correct_by_gain(x, slopes, noise, gain, innovation)
-    # Quantizers' part v of the error: v+ = (I - K C) v - K G mu. Both terms are bounded, and then their sum.
+    # Quantizers' part v of the error: v+ = (I - K C) v - K G mu. Outer products v v' are bounded: of the first term as
+    # a linear map does, of the second by Cauchy's inequality, and of the sum by Young's inequality.
     quantizer_bound = None
     if state.quantizer_bound is not None:
         remaining = propagate_by_mode(jnp.eye(len(x.mean)) - gain @ output, state.quantizer_bound, 0.0)

@@ -150,11 +150,14 @@ def make_initial_errors(
 def make_error_step(filters: LinearStep, motion: Motion, observation: JointObservation) -> ErrorStep:
     """Return the step of the errors e = x - m of linear filters, whose models may be wrong.
 
-    x+ = A x + b + w is the true `motion`, and z = M x+ + o + nu what a node receives (`observation`). Its filter
-    predicts by F m + f and corrects by K (z - C m - c); `filters` has a leading axis of nodes. With U = I - K C and
+    A fusion that weighs several nodes' estimates needs the covariances between their errors. x+ = A x + b + w is the
+    true `motion`, and z = M x+ + o + nu the number that a node receives (`observation`). Its filter predicts by F m + f
+    and corrects by K (z - C m - c), m the prediction; `filters` has a leading axis of nodes. With U = I - K C and
     L = K (M - C):
 
       e+ = U F e + [U (A - F) - L A] x + [U (b - f) - L b - K (o - c)] + (U - L) w - K nu.
+
+    A difference of two nearly equal matrices, such as A - F, is taken for 0 if it is rounding.
     """
     # K, U and L, where M - C is the error of the filter's model of the measurement.
     gain, u, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.shift)

@@ -79,15 +79,15 @@ def solve_factored_weights(
 ) -> Float[jax.Array, "n node n"]:
     """Return the best weights W = (E' P^-1 E)^-1 E' P^-1 of nodes' estimates whose errors have the joint covariance P.
 
-    P = L L' + blockdiag(B_i) with every B_i positive definite, and E = [I; ...; I]. By the matrix inversion lemma
-    P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E, at a cost linear in the number of nodes.
+    P = L L' + B, B = blockdiag(B_i) with every B_i positive definite, and E = [I; ...; I]. By the matrix inversion
+    lemma P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E, at a cost linear in the number of nodes.
 
     Args:
-        shared: blocks of L, one for each node: how each of the sources moves the node's error.
-        independent: B_i, the covariance of what else is in each node's error.
+        shared: blocks of L, one for each node: how each of the sources that the nodes' errors share moves its error.
+        independent: B_i, the covariance of the rest of each node's error.
 
     Returns:
-        W, of which W[:, i] multiplies the estimate of node i; these sum to I.
+        W: W[:, i] (n, n) multiplies the estimate of node i; all of them sum to I.
     """
     nodes, n, sources = shared.shape
     # With B = F F': F^-1 L and F^-1 E, where the independent parts of errors have the covariance I.
@@ -98,7 +98,7 @@ def solve_factored_weights(
     # F' P^-1 E by the lemma.
     inner = jnp.linalg.cholesky(jnp.eye(sources) + f_l.T @ f_l)
     f_p_e = f_e - f_l @ jax.scipy.linalg.cho_solve((inner, True), f_l.T @ f_e)
-    # E' P^-1 E, and P^-1 E (nodes, n, n), with the axes of the latter moved so that it is E' P^-1 (n, nodes n).
+    # E' P^-1 E, and P^-1 E (nodes, n, n), whose axes are then moved to give E' P^-1 (n, nodes n).
     information = f_e.T @ f_p_e
     p_e = jax.lax.linalg.triangular_solve(factors, f_p_e.reshape(nodes, n, n), left_side=True, lower=True,
                                           transpose_a=True)  # fmt: skip

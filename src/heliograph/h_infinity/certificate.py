@@ -262,13 +262,15 @@ def _add_growth(
 ) -> None:
     """Add to Phi the growth conditions of step k: sum_i lambda_i (a_i^2 |argument_i|^2 - |value_i|^2).
 
-    They are those of f(x), f~(e), h(x) and h~(e), with the constants a_i of the system.
+    An H-infinity level holds if the quadratic form Phi in eta (state x, error e, unknown functions, disturbances) is
+    negative definite. The functions f(x), h(x), and their differences f~(e), h~(e) between state and estimate, are
+    known by |value_i| <= a_i |argument_i| alone; with lambda_i >= 0 these conditions may be added to Phi.
 
     Args:
-        phi: Phi, which is changed.
+        phi: Phi (q, q), which is changed.
         at: where each part of eta begins, by its letter (g for f~, d for h~).
         y: number of outputs.
-        system: the system.
+        system: the system, with the constants a_i of each step.
         k: the step.
         multipliers: lambda of f, f~, h, h~.
     """
@@ -281,6 +283,7 @@ def _add_growth(
         ("d", y, "e", h.error[k]),
     ]
     for (value_name, size, argument_name, constant), multiplier in zip(conditions, multipliers, strict=True):
+        # - lambda I in the block of the value, + lambda a^2 I in the block of the argument.
         value = slice(at[value_name], at[value_name] + size)
         argument = slice(at[argument_name], at[argument_name] + n)
         phi[value, value] -= multiplier * np.eye(size)

@@ -125,9 +125,8 @@ def check_growth(
     Slopes are norms of Jacobians, by automatic differentiation, at 4,096 points of a Sobol sequence; from the steepest
     ones the search goes on by random moves of shrinking size. Pairs start close together along the steepest directions,
     and far apart, and move likewise. A box is convex, so in it the largest slope is the smallest true constant. Where f
-    is written in operations that interval arithmetic can follow, the constant is then proved by bounds of the Jacobian
-    over parts of the box. An f(0) that is not 0 refutes any constant, so that a proof over a box with 0 in it holds for
-    |f(x)| <= a |x| too.
+    is written in operations that interval arithmetic can follow, bounds of the Jacobian over parts of the box then
+    prove the constant. An f(0) other than 0 refutes any: a proof over a box with 0 holds for |f(x)| <= a |x| too.
 
     Args:
         function: f, from (n,) to (m,) or a number, written with jax.numpy.
@@ -136,8 +135,7 @@ def check_growth(
         high: upper corner of the box (n,).
         name: the function's name in sentences; "f" by default.
         seed: seed of the search; 0 by default.
-        differences: False for the weaker condition on f itself, |f(x)| <= a |x|: pairs with 0, which has to be in the
-            box (default True).
+        differences: False for the weaker condition |f(x)| <= a |x|: pairs with 0, which is in the box (default True).
 
     Raises:
         ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
@@ -265,14 +263,16 @@ def _make_finding(
 ) -> GrowthFinding:
     """Return the finding from the points and pairs that a search ended at, with a bound unless it is refuted.
 
+    It is whether |f(x) - f(y)| <= a |x - y| in a box: a steeper point refutes it, a bound of all slopes proves it.
+
     Args:
-        name: of the function.
+        name: name of the function.
         constant: a, the growth constant in question.
         low: lower corner of the box (n,).
         high: upper corner of the box (n,).
-        meter: slopes and ratios of the function.
-        points: (points, n), of which the steepest is reported.
-        pairs: (pairs, 2n), x and y of each, of which that of the largest ratio is reported.
+        meter: measures slopes (norms of the Jacobian) and ratios |f(x) - f(y)| / |x - y| of the function.
+        points: points (points, n); the steepest is reported.
+        pairs: x and y of each pair (pairs, 2n); the pair of the largest ratio is reported.
         differences: whether the constant bounds |f(x) - f(y)| / |x - y|; else |f(x)| / |x|.
     """
     slopes, ratios = meter.measure_slopes(points), meter.measure_ratios(pairs)

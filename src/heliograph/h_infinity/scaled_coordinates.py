@@ -154,17 +154,20 @@ def _compute_eta_covariance(
 ) -> np.ndarray:
     """Return a covariance of eta = (x, e, f, f~, h, h~, v, rho) by which its coordinates are scaled.
 
-    The functions f(x) and h(x), and their differences f~ = f(x) - f(xhat) and h~ between the state and its estimate,
-    are known by growth constants alone, |f(x)| <= a |x|: each gets the largest variance that its constant allows. The
-    disturbances v and rho get the variance 1. A function that is zero at all steps is not in eta.
+    An H-infinity bound is a matrix inequality in eta, which a solver solves more exactly if all coordinates are of one
+    size. x is the state, e the estimate's error, v and rho are disturbances of unknown course. The functions f(x) and
+    h(x), and their differences f~ = f(x) - f(xhat) and h~ between the state and its estimate, are known by growth
+    constants alone, |f(x)| <= a |x|: each gets the largest variance that its constant allows. v and rho get the
+    variance 1. A function that is zero at all steps is not in eta.
 
     Args:
-        system: its growth constants.
+        system: x+ = A x + f(x) + B v, y = C x + h(x) + D v, with the growth constants of f and h at each step.
         k: the step.
-        step: its matrices, of the size q of eta.
+        step: its matrices; their width is the size q of eta.
         x: covariance of the state before the step.
         e: covariance of the error before the step.
     """
+    # The blocks of x and e; `begin` is the place of the next block.
     n, y, q = system.states, system.output.shape[1], len(step.energy)
     covariance, begin = np.zeros((q, q)), 2 * n
     covariance[:n, :n], covariance[n:begin, n:begin] = x, e
@@ -176,7 +179,7 @@ def _compute_eta_covariance(
             indices = slice(begin, begin + width)
             covariance[indices, indices] = constant**2 * np.linalg.eigvalsh(argument_covariance)[-1] * np.eye(width)
             begin += width
-    covariance[begin:, begin:] = np.eye(q - begin)
+    covariance[begin:, begin:] = np.eye(q - begin)  # v and rho
     return covariance
 
 
@@ -240,13 +243,17 @@ def _rescale_step(
 ) -> StepMatrices:
     """Return the step in scaled coordinates, with errors about the nominal gain.
 
+    An H-infinity bound is a matrix inequality in the vector eta of state, error, unknown functions and disturbances;
+    its solver needs numbers of order one. A matrix M that maps eta to the error becomes S2^-1 M T, a quadratic form M
+    becomes T' M T.
+
     Args:
-        step: in the user's units.
+        step: matrices of the step in the user's units.
         eta_scales: T of eta = T times scaled eta.
-        state_scales: diag(S1, S2), that of (x, e) after the step.
-        received_scales: one number for each that is received.
-        form_scales: one number for each growth form.
-        nominal: the gain about which errors are.
+        state_scales: diag(S1, S2), the scales of (x, e) after the step: x = S1 times scaled x, e = S2 times scaled e.
+        received_scales: a scale for each received number.
+        form_scales: a scale for each growth form, a diagonal quadratic form that bounds an unknown function.
+        nominal: the gain K0: the error's matrix becomes E - K0 U, where U maps eta to the received numbers.
     """
     n = step.state.shape[0]
     s1, s2, per_received = state_scales[:n, :n], state_scales[n:, n:], received_scales[:, None]

@@ -308,8 +308,8 @@ def _maximise_forms(
     """Return the maximum of each form of the likelihood; the first is searched from all starts, the next from its best.
 
     Args:
-        surfaces: the likelihood in each form.
-        points: the starts (starts, p).
+        surfaces: the likelihood in each form: linear (of the best linear filter), conditional (sharper), or one alone.
+        points: the starts (starts, p), each p free numbers as coordinates without bounds.
         seed: of further starts.
         ridges: number of directions in which the likelihood does not change.
         progress: called with a line of text at each step.
@@ -334,7 +334,7 @@ def _maximise_forms(
         solutions.append(Solution(surface, top, ridges))
         if stopped:
             return solutions, ends, True
-        points = top.x[None]
+        points = top.x[None]  # where the next form begins
     return solutions, ends, False
 
 

@@ -315,9 +315,15 @@ KINDS = ("mean gain", "gain variance", "noise")
 def describe_identified_links(solution: "Solution") -> list[str]:
     """Return a sentence on each output of which the data identify mean gain, gain variance or noise.
 
-    Such as "The received y has mean gain 0.8 (0.7 .. 0.9), 95 %, the sensor's noise included." There is none where the
+    An example is "The received y has mean gain 0.8 (0.7 .. 0.9), 95 %, the sensor's noise included." Single parameters
+    may not be identified (a gain only as the product of two) while these moments are. There is no sentence where the
     sensor or channel varies over time, or depends on inputs or the past.
+
+    Args:
+        solution: the maximum of the likelihood, with the point x, the covariance of its active coordinates (not at an
+            end of their domain), and the network as a function of x.
     """
+    # The sensor and channel of all nodes together, at the starting point, to see of what kind they are.
     description = solution.surface.objective.description
     _, sensor, channel = join_all_nodes(description.start)
     if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):
@@ -335,7 +341,8 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     with jax.enable_x64(True):  # compiled: operation by operation the compiler is called two hundred times
         moments, slopes = map(np.asarray, quickly_compiled(differentiate_moments)(jnp.asarray(solution.x)))
     slopes = slopes[:, :, solution.active]
-    # Intervals of what is identified: a function with the derivatives g has the variance g' C g.
+    # An interval for each moment that is identified: its estimate has the variance g' C g, with its derivatives g by x
+    # and the covariance C of x.
     covariance, freedom = solution.covariance()
     names = sensor.outputs if len(sensor.outputs) == len(moments) else [f"z{i}" for i in range(len(moments))]
     lines = []

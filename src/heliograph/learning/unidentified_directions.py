@@ -65,14 +65,16 @@ def find_confounded(
 ) -> list[ConfoundedNumbers]:
     """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
 
-    Only points with the fewest flat directions (without information) count. Flat directions of the coordinates x become
+    The data may tell a product or a sum of two numbers, but neither of the two. Flat directions are those along which
+    the likelihood does not change; only points with the fewest of them count. Directions of the coordinates x become
     those of the numbers v by dv/dx, and of log |v| by d log |v| / dx. A sum of v is identified if it does not change
-    along the former, and a product if its logarithm does not change along the latter.
+    along the flat directions of v, and a product if its logarithm does not change along those of log |v|.
 
     Args:
         parameters: the free numbers.
         points: points in unbounded coordinates x (p,): logarithms or logits of numbers whose domain has ends.
-        ranks: the rank of the information at each of them.
+        ranks: flat directions at each point, `flat` (p, directions), in units of 1 / sqrt(information) of each
+            coordinate, `unit` (p,).
     """
     fewest = min(rank.flat.shape[1] for rank in ranks)
     if not fewest:
@@ -80,6 +82,7 @@ def find_confounded(
     of_logs, of_numbers = [], []  # flat directions at each point, in columns
     for x, rank in zip(points, ranks, strict=True):
         if rank.flat.shape[1] == fewest:
+            # dv/dx and d log |v| / dx (p,) scale the rows of the flat directions, which `unit` takes to coordinates x.
             slopes, log_slopes = _differentiate_coordinates(parameters, x)
             flat = rank.unit[:, None] * rank.flat
             of_logs.append(_orthonormalise(log_slopes[:, None] * flat))

@@ -112,9 +112,16 @@ class JumpSystem(NamedTuple):
     def adjoint(self, weights: Float[np.ndarray, "time n n"], forever: bool) -> Float[np.ndarray, "time M n n"]:
         """Return the derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
 
-        L_k,i = W_k + sum_l T_k+1,il F_k+1,l' L_k+1,l F_k+1,l, from the last step to the first. Behind the last step L
-        is zero; or, if the steps repeat `forever`, it is that of the next period.
+        X_k,j = E[zeta zeta' 1{mode j}] after step k is moved by X+ = F_j (sum_i T_ij X_i) F_j' + S_j, and W_k are the
+        weights of a cost, of which planners need the gradient. L_k,i = W_k + sum_l T_k+1,il F_k+1,l' L_k+1,l F_k+1,l,
+        from the last step to the first. Behind the last step L is zero; or, if the steps repeat `forever`, it is that
+        of the next period.
+
+        Args:
+            weights: W of each step.
+            forever: whether the steps are a period that repeats.
         """
+        # modes_before: 1 where X before a step is a sum over the modes, else M.
         modes_before, n, _n = self.shape
 
         def go_back(later: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -245,12 +245,14 @@ def _propagate_errors(
 ) -> tuple[Float[np.ndarray, " next"], Float[np.ndarray, "next next"]]:
     """Return mean and covariance of (y+, s+, x - xhat) after a step from those of (y, s) before it.
 
-    The system is y+ = A y + a + w, z = C y+ + c + v and x = W y+ (`projection`), and the schedule s+ = F s + K z + f
-    and xhat = L s + J z + d. Put together,
+    So the error of a filter of fixed gains is known before any data, also under another model than its own. The system
+    is y+ = A y + a + w, z = C y+ + c + v and x = W y+ (`projection`); the filter, of state s, is the schedule of gains
+    s+ = F s + K z + f and xhat = L s + J z + d. Put together,
 
         (y+, s+, x - xhat) = M y+ + N (c + v) + S s + (0, f, -d),
         M = [I; K C; W - J C],  N = [0; K; -J],  S = [0; F; -L].
     """
+    # The matrices M, N and S, and the constants (0, f, -d).
     A, C, K, J = step.transition, step.output, gains.gain, gains.direct
     size, m = len(A), len(step.noise)
     states = len(mean) - size

@@ -253,7 +253,8 @@ def gain_over_linear(
 def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     """Return the largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over all steps k.
 
-    a and b are two components of x_k, or two of z_k, and c is any component of either.
+    Filters of higher degree exploit it: it is 0 for Gaussian x and z. a and b are two components of x_k, or two of z_k,
+    and c is any component of either; the third moment follows from the covariance of the product a b with c.
 
     Args:
         square: the system of degree 2, whose state and measurement are the products of x_k and of z_k up to degree 2.

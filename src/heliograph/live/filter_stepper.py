@@ -277,7 +277,11 @@ class CompiledFilter:
     """
 
     def __init__(self, filter: AbstractFilter):
-        """Take a filter apart into arrays and structure; note what its step takes and returns; nothing is compiled."""
+        """Take a filter apart into arrays and structure; note what its step takes and returns; nothing is compiled.
+
+        Filters that differ in numbers alone then share compiled code, which takes the arrays as arguments.
+        """
+        # Sizes of z and u, and how many numbers of z are measured values.
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
         self.values = 0
@@ -292,7 +296,7 @@ class CompiledFilter:
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)  # z, u, k: shapes to compile for
         with jax.enable_x64(True):
             modes = jax.eval_shape(filter.estimate, self._start).modes
-        # The numbers of this estimate stand for any: only its structure counts.
+        # An estimate as a step returns it; only its structure counts, so that its numbers stand for any.
         example = JudgedEstimate(
             mean=np.zeros(()),
             covariance=np.zeros(()),
@@ -303,8 +307,8 @@ class CompiledFilter:
             received=0,
         )
         self.estimate: PyTree = jax.tree.structure(example)
-        # The nis of a filter whose claim holds is chi-square, with as many degrees of freedom as numbers arrived. Where
-        # none did, there is none: infinity is never exceeded.
+        # The NIS (e' S^-1 e of the innovation) of a filter whose covariance is true is chi-square, with as many degrees
+        # of freedom as numbers arrived. The values that it rarely exceeds, by that number; none if nothing arrived.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:

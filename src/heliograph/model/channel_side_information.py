@@ -98,6 +98,7 @@ def told(
     """
     if not callable(link):
         raise fail("link", "a function of the numbers that are told", show_value(link))
+    # The memory draws the numbers in a simulation; there must be as many names as numbers, all different.
     names = tuple(name_list("numbers told", about))
     memory = law if isinstance(law, AbstractMemory) else FreshNumbers(_check_law(law), len(names))
     if memory.announced != len(names) or len(set(names)) < len(names):

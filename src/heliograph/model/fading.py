@@ -169,9 +169,9 @@ def with_flag(
 def shared(link: Channel, name: str) -> Channel:
     """Return the link as one of those that share its fading: all links of one name are in one state at each step.
 
-    Without a name a link is independent of all others, even if one object stands at several nodes or hops. The name
-    comes from here, or from `name` of `gilbert_elliott`, `markov_fading` and so on. `Network.shared` and reports list
-    what the nodes of a network share.
+    Two sensors behind one obstacle, for example, lose messages at the same time. Without a name a link is independent
+    of all others, even if one object stands at several nodes or hops. The name comes from here, or from `name` of
+    `gilbert_elliott`, `markov_fading` and so on. `Network.shared` and reports list the links that nodes share.
 
     Args:
         link: a link with memory, or a channel that contains some.
@@ -182,6 +182,7 @@ def shared(link: Channel, name: str) -> Channel:
     """
     text("name of what is shared", name)
     check_maps("shared link", [first(link)])
+    # A memory is the hidden state of a link, such as a Markov chain of its modes: copies of it get the name.
     memories_of_link = memories(link)
     if not memories_of_link:
         got = "one drawn anew at each step, which nodes share by Network.sharing"

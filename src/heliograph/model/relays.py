@@ -206,6 +206,9 @@ class _SlotMoments(NamedTuple):
 def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMoments:
     """Return second moments of all that is received in one slot, given all that is sent in it.
 
+    A slot is a turn of the schedule, which says who sends to whom. Rows are the numbers that all filters receive, one
+    filter after another; columns are the m numbers of each sender, the sensor first and then the relays.
+
     Args:
         network: the network.
         slot: links of the slot, by listener and sender.
@@ -219,6 +222,7 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
     spread, transmits = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
     for listener, links in slot.items():
         for sender, link in links.items():
+            # Mean gain and offset of the link z = G s + n, and covariances of the entries of (G, n).
             moments = second_order(at(link, k))
             if moments.uncertain:
                 raise fail("link", "known probabilities", "uncertain ones")

@@ -80,8 +80,11 @@ def _compare_turned(
 ) -> None:
     """Raise ValueError where f differs, by more than full turns of its results, at states that are one and the same.
 
+    Angles of a state may be changed by full turns (2 pi) at any time, so that a plant's or sensor's function must not
+    depend on them.
+
     Args:
-        name: of what has the function, for the error.
+        name: name of what has the function, for the error.
         function: f.
         cases: a state x, the same state with full turns, and the other arguments of f for these.
         results: which components of f(x) are angles and attitudes.
@@ -91,6 +94,7 @@ def _compare_turned(
     counts = [1 + len(case.turned) for case in cases]
     rest_by_point = [case.rest for case, count in zip(cases, counts, strict=True) for _ in range(count)]
     rests = tuple(np.stack(values) for values in zip(*rest_by_point, strict=True))  # (points, ...) of each argument
+    # f at all points, in native code if there is any.
     try:
         values_at_points = np.asarray(compute_once(_evaluate_at_points, _values_by_xla, (function, points, rests)))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number

@@ -63,6 +63,7 @@ def discretize(
 
     Source: Van Loan, Computing integrals involving the matrix exponential (1978), its integrals.
     """
+    # Check the matrices and the length, then compute the series.
     model = _read_continuous_matrices(A, intensity, B)
     step = scalar("length of a step", dt, 0.0)
     return model.discretize_over(step)
@@ -78,8 +79,10 @@ class ContinuousSystem(Module):
     def discretize_over(self, dt: Any) -> Discretized:
         """Return the step of length dt, known or traced: F = exp(A dt), its integral times B, and Q.
 
-        By series over a short step h = dt / 2^count, which is then doubled `count` times.
+        The model is dx = (A x + B u) dt + dW, where W gains the covariance S in a unit of time; Q is the integral of
+        exp(A s) S exp(A s)' over the step. Series over a short step h = dt / 2^count are doubled `count` times.
         """
+        # The 1-norm of A dt says how short the short step has to be.
         xp = library(self.a, self.b, self.intensity, dt)
         a = xp.asarray(self.a)
         size = xp.max(xp.sum(xp.abs(a), axis=0)) * dt
@@ -96,7 +99,7 @@ class ContinuousSystem(Module):
             for _ in range(int(count)):
                 parts = _double_step(*parts)
         growth, squared, integral, noise = parts
-        # There are two answers for F. I + (F - I) loses what is small beside 1, while the squared F is off by 2^count
+        # There are two answers for F. I + (F - I) loses numbers small beside 1, while the squared F is off by 2^count
         # roundings of itself: it is the better one where F is small enough.
         decayed = xp.max(xp.abs(squared)) * 2**count < 1
         matrix = xp.where(decayed, squared, np.eye(len(a)) + growth)

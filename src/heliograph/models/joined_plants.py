@@ -72,7 +72,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     """Return plants side by side as one: states and inputs keep their names, units and angles.
 
     They start independently and are driven by independent noises. An input of one name, such as "dt", is one input of
-    all that have it. The result is linear where all are.
+    all that have it. The result is linear if all plants are.
 
     Args:
         plants: plants that do not vary over time, no state of one named as another's.
@@ -91,10 +91,11 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     doubled = sorted({str(name) for name in states if states.count(name) > 1})
     if doubled:
         raise fail("states of joined plants", "each name once (components and axes take another name)", doubled)
-    # All inputs, each once, and where among them those of each plant are.
+    # All inputs, each once, and the indices of each plant's own inputs among them.
     inputs = list(dict.fromkeys(name for plant in parts for name in plant.inputs))
     places = tuple(tuple(inputs.index(name) for name in plant.inputs) for plant in parts)
-    # Laws of the initial state, and of the noises: one law, or a function of the inputs where some noise is one.
+    # Laws of the initial state (a fixed center and a law of the deviation from it), and of the noises: one law, or, if
+    # some noise is a function of the inputs, a function of them.
     center, start = _join_starts(parts)
     noises = [plant.noise for plant in parts if isinstance(plant.noise, AbstractNoise)]
     noise = Independent(noises) if len(noises) == len(parts) else JointNoise(tuple(parts), places)

@@ -110,11 +110,12 @@ def _make_component_weights(part: Component, names: Sequence[str]) -> SumOfCompo
 def structural(components: "Sequence[Component]", noise: NoiseLike = 0.0, output: str | Names = "y") -> Structural:
     """Return the model of a series y = sum of components + v.
 
-    `hg.kalman_filter(model.plant, model.sensor)` filters it, `hg.models.components(result, model.components)` takes its
-    estimates apart.
+    Each component is a plant and the combination of its states that enters y. `hg.kalman_filter(model.plant,
+    model.sensor)` filters the model, `hg.models.components(result, model.components)` takes its estimates apart.
 
     Args:
-        components: of `level`, `trend`, `seasonal`, `cycle`, `arma`, `regression` or own ones, each of another name.
+        components: results of `level`, `trend`, `seasonal`, `cycle`, `arma`, `regression`, or own ones, each of another
+            name.
         noise: variance of v, or its law; 0 by default.
         output: name of y, or a mapping of it to its unit; "y" by default.
 
@@ -127,11 +128,13 @@ def structural(components: "Sequence[Component]", noise: NoiseLike = 0.0, output
         instance("component", part, Component, "one such as hg.models.level(1.0)")
         for part in items("components", components, "components")
     ]
+    # The components' plants side by side.
     plant = join([part.plant for part in parts])
     assert isinstance(plant, LinearPlant)  # as all of them are
     named = [part.name for part in parts]
     if len(set(named)) < len(named):
         raise fail("components", "each name once", named)
+    # y = weights @ states; in a regression a state's weight is multiplied by an input (`places` says which).
     outputs = [output] if isinstance(output, str) else output
     weights = library(*(part.loading for part in parts)).concatenate([part.loading for part in parts])
     inputs = list(dict.fromkeys(name for part in parts for name in part.inputs))

@@ -229,20 +229,20 @@ def arma(
 ) -> Component:
     """Return an ARMA process y = ar_1 y_1ago + ... + e + ma_1 e_1ago + ..., stationary from the start.
 
-    States: NAME and what of later values is known, "NAME_1_ahead", ...
+    The plant's states are the present value, NAME, and the parts of later ones that are known now, "NAME_1_ahead", ...
 
     Args:
         ar: coefficients of past values (p,); to estimate them take `stationary(x)` of free x.
         ma: coefficients of past noises (q,).
-        variance: of e.
-        name: of the component; "arma" by default.
+        variance: variance of the noise e.
+        name: name of the component; "arma" by default.
 
     Raises:
         ValueError: coefficients that are not stationary, a negative variance.
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 3.3 and 4.1.3.
     """
-    # Harvey's state: the present value, and what is known of later ones; the first column of F has the coefficients.
+    # Harvey's state: the present value, and the known parts of later ones; the first column of F has the coefficients.
     phi, theta = array("ar", ar, (None,)), array("ma", ma, (None,))
     q = scalar("variance of the noise", variance, 0.0)
     size = max(len(phi), len(theta) + 1)

@@ -104,10 +104,10 @@ def error_over_sites(
     """Return the least error at a design's total power where its network stands at each of several places.
 
     Args:
-        best: the design.
-        build: function that returns the network for a place (x, y).
-        x: places, shape (columns,).
-        y: places, shape (rows,).
+        best: the design: a division of a total power among transmitters, with the problem that it solves.
+        build: function that returns the network for a place (x, y), such as of a relay.
+        x: first coordinates of the places, shape (columns,).
+        y: second coordinates, shape (rows,); all pairs (x, y) are tried.
         advance: called with a word before each row (by default nothing is).
 
     Returns:
@@ -116,6 +116,7 @@ def error_over_sites(
     Raises:
         ValueError: a function that builds no network, what `hg.design` refuses.
     """
+    # Check the design, the function and the places.
     instance("design", best, PowerDesign, "a PowerDesign")
     function("network of a map", build, "x and y")
     columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))

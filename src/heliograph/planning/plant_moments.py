@@ -99,10 +99,12 @@ def moments_with_one_over(
 ) -> list[Float[Array, "n1 n1"]]:
     """Return E (x, 1)(x, 1)' at each step from the plant's initial law on, the first after x_0 has moved once.
 
+    Planners need it for the power of signals, and for the noise behind random gains, which grows with the signal.
+
     Args:
         plant: a linear plant, which may vary in time.
         horizon: number of steps.
-        inputs: (horizon, inputs); zero unless given.
+        inputs: inputs at each step (horizon, inputs); zero unless given.
 
     Raises:
         ValueError: a plant that is not linear.
@@ -118,6 +120,7 @@ def moments_with_one_over(
         noise_mean, noise = _compute_noise_moments(now, u[k])
         maps.append(_append_shift(now.matrix, now.input_matrix @ u[k] + noise_mean))
         added.append(library(noise).pad(noise, ((0, 1), (0, 1))))
+    # A jump system with a single mode, which moves second moments by X+ = F X F' + S; its axis of modes is dropped.
     xp = library(maps, added)
     system = JumpSystem(np.ones((horizon, 1, 1)), xp.stack(maps)[:, None], xp.stack(added)[:, None])
     return [one for (one,) in system.after(_make_second_moment(start.initial_mean, start.initial_covariance)[None])]

@@ -121,7 +121,8 @@ class ToldMap(AbstractToldMap):
     ):
         """Hold the memory that draws the numbers, and the function `make` from numbers (count,) to a map.
 
-        make(typical), the map of an example, is checked and gives the sizes. `names` are those of the numbers.
+        A map is a link z = G y + n with random G and n; the numbers, such as a variance, come with each message and say
+        its law. make(typical), the map of an example, is checked and gives the sizes. `names` are those of the numbers.
         `exogenous`: the numbers are independent of the plant's state. `fresh`: given the numbers, the map is drawn
         independently with each message. Delays and erasures belong outside: delay(told map), not told map of a delay.
         """

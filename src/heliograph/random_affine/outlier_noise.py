@@ -167,11 +167,17 @@ class Contaminated(AbstractNoise):
     def one_sided(cls, covariance: ArrayLike, share: ArrayLike, mean: ArrayLike, slices: int = 6) -> "Contaminated":
         """Return the Gaussian noise to which, with probability `share`, an exponential delay of this mean is added.
 
-        The exponential law as `slices` of equal probability, each with its mean and variance: the mean and the variance
-        of the whole are those of the law. `mean` is a number or one for each component, of either sign.
+        The exponential law is cut into `slices` parts of equal probability, and each becomes a Gaussian of its mean and
+        variance, so that filters see a mixture of Gaussians with the law's own mean and variance.
+
+        Args:
+            covariance: covariance of the Gaussian noise (m, m), or a variance.
+            share: probability of a delay.
+            mean: mean of the delay, a number or one for each component, of either sign.
+            slices: number of parts.
 
         Raises:
-            ValueError: as for the class; no slice.
+            ValueError: a matrix that is no covariance, a share outside [0, 1], a mean of the wrong shape, no slice.
         """
         count = check_count("slices of an exponential bias", slices)
         inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))

@@ -179,15 +179,15 @@ def _make_gains(
     """Return s+ = (A - K B) s + K z + a - K b of one filter as gains over time; its estimate is its state s.
 
     Args:
-        steps: of the network, with A, a and, over what all filters receive, B and b.
-        gain: K.
-        received: which of the received numbers are the filter's z.
-        covariance: of its error after each step.
-        predicted: of its error before each correction.
-        innovation: of its innovation.
+        steps: the network's, with A, a and B, b: all filters' received numbers are predicted from s as B s + b.
+        gain: K of the filter at each step.
+        received: which of the numbers that all filters receive are this filter's z.
+        covariance: covariance of its error after each step.
+        predicted: covariance of its error before each correction.
+        innovation: covariance of its innovation z - (B s + b).
     """
     rows, constants = steps.predict_maps()
-    b_matrix, b = rows[:, received], constants[:, received]
+    b_matrix, b = rows[:, received], constants[:, received]  # B and b of this filter's z
     used_gain = gain * np.asarray(steps.receives_in_slot)[:, None, received]  # zero on what nobody transmits
     transition = steps.transition - used_gain @ b_matrix
     offset = steps.drift - np.einsum("kir,kr->ki", used_gain, b)

@@ -111,8 +111,8 @@ def minimise_within_limit(
     way is strictly inside the limits. t falls little at a time, since long descents multiply what rounding leaves.
 
     Args:
-        problem: the cost and the limits.
-        local_gains: with which the first descent begins, scaled into the limits.
+        problem: the relays' steps, the cost by second moments of states and errors, and the limits on their powers.
+        local_gains: gains of all filters (Fn, R) at each step, from which, scaled into the limits, descents begin.
         iterations: steps of all descents together.
     """
     local_cost, _slack = _compute_cost_and_slack(problem, local_gains)

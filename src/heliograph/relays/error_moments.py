@@ -225,15 +225,19 @@ def gain_hessian(
     """Return half the Hessian of the later cost in the free gains, with damping on its diagonal, and that damping.
 
     The cost is tr(Lam P) with P = [I -(0; K)] Z [I -(0; K)]', the covariance of (x, e_1 .. e_F) after a correction by
-    the gains K. Z = `predicted` is that of (x, e_1 .. e_F before it, innovations), and Lam = `ahead` is the gradient of
-    the cost of later steps by P. An entry of K is free if it multiplies a number that the filter receives itself.
+    the gains K. Z = `predicted` is the covariance of (x, e_1 .. e_F before it, innovations), and Lam = `ahead` is the
+    gradient of the cost of later steps by P. An entry of K is free if it multiplies a number that the filter receives
+    itself.
+
+    Newton's method in the gains uses it; damping keeps it invertible.
 
     Args:
-        predicted: Z (d + R, d + R).
+        predicted: Z (d + R, d + R): d numbers (x, e_1 .. e_F), and the R received numbers' innovations.
         ahead: Lam (d, d).
-        step: the network's step.
+        step: the network's step: which filter receives which number, and what arrives in this slot.
         damping: relative to the mean of the diagonal.
     """
+    # Free entries of K: their rows (states of filters) and columns (received numbers), r of each.
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
     is_free = jnp.asarray(step.receives_in_slot)[columns]

@@ -34,13 +34,17 @@ def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:
 def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure:
     """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true path.
 
-    `names`: of the filters. The record's states have to be a position in a plane (`find_coordinates`).
+    Args:
+        record: estimates by node and filter; two of its states are a position in a plane by their names.
+        node: name of the node.
+        names: names of its filters that are drawn.
     """
     coordinates = find_coordinates(record.states)
     assert coordinates is not None  # only then is a map drawn
     i, j = coordinates
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     axes = figure.subplots()
+    # For each filter a line, and ellipses at ELLIPSES of its rows if it says what its covariance is.
     for number, name in enumerate(names):
         estimate, colour = record.estimates[node][name], COLOURS[number % len(COLOURS)]
         mean = np.asarray(estimate.mean)[:, [i, j]]
@@ -49,6 +53,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
             covariance = np.asarray(estimate.covariance)
             for k in np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).astype(int)):
                 _draw_ellipse(axes, mean[k], covariance[k][np.ix_([i, j], [i, j])], colour)
+    # The true path, unless it is missing in all rows.
     if record.truth is not None and not np.isnan(record.truth[:, [i, j]]).any(axis=1).all():
         axes.plot(record.truth[:, i], record.truth[:, j], color=INK, linestyle=":", label="truth")
     axes.set_aspect("equal", adjustable="datalim")

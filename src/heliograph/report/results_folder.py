@@ -64,8 +64,10 @@ def write_results(
         ValueError: a folder that cannot be written, or that holds something else.
         ModuleNotFoundError: an extra is not installed.
     """
+    # Before the long computation: are the packages there, and may the folder be replaced?
     check_installed([*NEEDS, *needs])
     check_replaceable(target)
+    # One stage more than the computation's: writing. The folder appears whole, or not at all.
     with progress(stages + 1) as advance, whole_folder(target) as folder:
         outcome = compute(advance)
         advance("drawing and writing")

@@ -87,13 +87,19 @@ class BatchIntake:
     def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[MessageOutcome]:
         """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
 
-        `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
-        had never arrived.
+        Messages may be refused as implausible (too far from the forecast to be true) only after their plant used them.
+        Afterwards the plants are as if those messages had never arrived.
+
+        Args:
+            messages: the messages, read; one that could not be read says why.
+            damaged: names of the plants whose stored state is damaged: their messages are left alone.
+            wall: the time by this machine's clock.
         """
+        # Of this batch: refused events, plants that began anew, and the former plants that these replaced.
         self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
         outcomes = [MessageOutcome()] * len(messages)
-        # One plant after another, so that its memory is near; the messages of a plant in their order. Those that could
-        # not be read have no plant, and stand under "".
+        # One plant after another, so that its memory is near; the messages of a plant in their order. Messages that
+        # could not be read have no plant, and stand under "".
         numbers_by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
             name = find_plant_name(message)
@@ -102,6 +108,7 @@ class BatchIntake:
         waiting = [i for numbers in numbers_by_plant.values() for i in numbers]
         # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
         while waiting:
+            # States of the plants before this round, by which it can be undone, and the messages that they took.
             self._before, self._taken = {}, []
             for i in waiting:
                 outcomes[i] = self._take_message(i, messages[i], wall)
@@ -162,7 +169,8 @@ class BatchIntake:
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> MessageOutcome:
         """Give a message to its plant; the outcome has no plant if one would begin with a refused message.
 
-        `number`: of the message in the batch. `wall`: the time by this machine's clock.
+        A message is one event (a node's values, or the plant's inputs), or both. The outcome says whether it is used,
+        or why not. `number`: number of the message in the batch. `wall`: the time by this machine's clock.
         """
         plant = self._find_plant(message, wall)
         timed = self._read_events(message, plant, wall)
@@ -180,7 +188,7 @@ class BatchIntake:
             nothing_is_plausible = why and (timed.inputs is None or why_inputs)
             if nothing_is_plausible:
                 return MessageOutcome(verdict="implausible", why=why)
-            # Its first moment counts as a leap in time, by one clock that may be wrong: that of arrivals where given.
+            # Its first moment counts as a leap in time, by one clock that may be wrong: of arrivals, or of the sender.
             has_arrival = message.arrival is not None
             leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
             plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
@@ -268,16 +276,19 @@ class BatchIntake:
     def _find_plant(self, message: AnyMessage, wall: datetime) -> PlantState | None:
         """Return the plant of a message; None if it has to begin, or to begin anew because its first time was wrong.
 
-        The first message of a plant sets its time, by one clock only (its first leap). That was wrong if this message
-        is dated long before it and the rule of `is_taken_back_by` holds; or if the time here (`wall`) agrees with this
-        message while the plant's time is far ahead of it.
+        The first message of a plant sets its time, by one clock only: a leap (a gap longer than `longest_gap` that a
+        single clock shows, so that the clock may be wrong). It was wrong if this message is dated long before it and
+        the rule of `is_taken_back_by` holds; or if this machine's time (`wall`) agrees with this message while the
+        plant's time is far ahead.
         """
+        # The plant as stored, and the longest gap that is believed of one clock.
         plant, longest_gap = self.plants.get(message.plant), self.fleet.options.leap
         has_other_kind_of_time = plant is not None and isinstance(message.time, datetime) != (plant.origin is not None)
         if plant is None or has_other_kind_of_time:  # such a message is refused later
             return plant
+        # Times as numbers since the plant's origin (a date, if its times are dates).
         at = self._time_as_number(message.time, plant.origin, plant.name)
-        # The clock that decides: that of arrivals, where one was given, else the sender's; and what it says.
+        # The clock that decides (of arrivals, where an arrival was given, else the sender's), and the time it shows.
         clock, clock_time = message.node, at
         if message.arrival is not None:
             clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)

@@ -52,16 +52,13 @@ class Service:
     """A network's filters for any number of plants, fed with messages in whatever order they arrive.
 
     The service knows no transport: `take` uses a batch and returns the outputs to publish, after the commit. It is
-    called by one thread at a time. `malformed` counts messages that could not be read, `known` duplicates and late
-    ones.
+    called by one thread at a time. `malformed` counts unreadable messages, `known` duplicates and late ones.
 
     Args:
         fleet: the plants of the network.
         store: where the state is committed.
-        say: called with a line of text when the first message is refused as implausible, when an angle is first
-            known less well than its filter can use, and each time that a gate gives in.
-        every: seconds after which the estimate of a plant whose senders are silent is published again although it has
-            hardly changed; None for never.
+        say: called with a line at the first implausible message, the first vague angle, and each gate that gives in.
+        every: seconds after which a hardly changed estimate is published again while senders are silent; None: never.
         forecast: how far ahead provisional estimates are accompanied by forecasts; None for not at all.
         thresholds: levels of which forecasts have the probability that they are passed; none by default.
     """
@@ -75,7 +72,10 @@ class Service:
         forecast: Spans | None = None,
         thresholds: Thresholds = (),
     ):
-        """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings."""
+        """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings.
+
+        `fleet`: all plants of a network. `every`: seconds until a silent plant is published again. `forecast`: spans.
+        """
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
@@ -85,7 +85,7 @@ class Service:
         self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
-        # What is said of plants: doubts by `_doubt`, the first implausible message by `_say`, which then becomes None.
+        # Watches for warnings on plants: `_doubt` says doubts, `_say` the first implausible message, then it is None.
         self._angles, self._remarks, self._held = AngleWatch(fleet), RemarkWatch(fleet), FleetRepeatWatch(fleet)
         self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage
@@ -315,7 +315,7 @@ class Service:
     def _commit(self, touched: dict[str, PlantState], entries: Sequence[Entry], malformed: int) -> list[Output]:
         """Commit the changed plants and entries; return the outputs to publish.
 
-        If that fails, the plants are forgotten in memory: what the store has is true.
+        If it fails, the plants are dropped from memory and later read again from the store, whose content is true.
 
         Args:
             touched: the changed plants, by name.

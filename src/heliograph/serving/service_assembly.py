@@ -230,7 +230,8 @@ async def _serve_watch_page(settings: ServiceSettings) -> AsyncIterator[WrapServ
 async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService) -> None:
     """Serve all plants in this process, until the messages end or a signal; `wrap` shows the service on the page."""
     stop = asyncio.Event()
-    # The reader of messages in others' form, where the network's file has sources; these then say how long a step is.
+    # The reader of messages that other programs make, where the network's file has sources, which describe them; these
+    # then say how long a step is. A fleet holds and steps the plants.
     reader = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
     step = settings.options.step if reader is None else reader.sources.step_seconds
     fleet = Fleet(program, settings.options._replace(step=step))
@@ -243,7 +244,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
         try:
             service.resume()
             transport = _open_transport(settings, reader)
-            # Of devices that say when they go offline the last such word is kept in the store too.
+            # Devices may say when they go offline: the last status of each is kept in the store too.
             shown = (
                 wrap(service)
                 if reader is None
@@ -252,7 +253,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
             await serve_until(stop, WaitingService(shown, stop), transport, _choose_patience(fleet))
         finally:
             store.close()
-    # What was not used, in words.
+    # Say which parts of other programs' messages were not used.
     for line in [] if reader is None else reader.left_out():
         _print_to_stderr(line)
     # A store may have used the same messages in an earlier run: say so, as nothing else shows it.
@@ -338,7 +339,8 @@ def _print_to_stderr(what: str) -> None:
 async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService, parts: int) -> None:
     """Serve the parts that this process leases, as one of several processes; `wrap` shows services on the page.
 
-    `parts`: into how many the plants are divided.
+    The plants are divided into `parts` parts. Each process takes its share of them for some time (a lease, noted in the
+    common store), so that the parts of a process that ends go to others.
     """
     from heliograph.serving.storage.database import open_database
     from heliograph.serving.storage.part_leases import Leases

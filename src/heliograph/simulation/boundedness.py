@@ -305,8 +305,9 @@ def _judge_unobserved_modes(
 ) -> tuple[Verdict, str]:
     """Return verdict and reason: "impossible" if an unobserved mode grows and noise excites it, else "undecided".
 
-    A mode of eigenvalue lambda grows without bound in mean square if |lambda|^2 times the spectral radius of the losses
-    that hide it, `unseen.growth`, is 1 or more.
+    The question is whether some filter keeps its mean squared error bounded. Every filter's error grows without bound
+    along a mode of eigenvalue lambda if noise excites it and `unseen.growth`, |lambda|^2 times the spectral radius of
+    the losses that hide it (the rate at which it becomes unlikely to stay hidden), is 1 or more.
 
     Args:
         network: the network.

@@ -200,19 +200,19 @@ class Network(Module):
     ) -> "Network":
         """Return the network of relays that run their schedules in the world, and a receiver with its filters.
 
-        At each step the relays send C s_r, with s_r their estimates at the step before, through hops with independent
-        draws; every filter then receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes are
-        the relays, each with a single filter "local", and "receiver". A recording may leave out what a relay received.
+        Relay r sends C s_r at each step, s_r its estimate of the step before, through hops (links to one listener) with
+        independent draws; each filter receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes
+        are the relays, each with one filter "local", and "receiver". A recording may leave out what a relay received.
 
         Args:
-            relays: the relays' slots and hops.
-            schedules: gains of each relay, by name.
+            relays: the relays' hops in each slot (turn of a schedule that says who transmits).
+            schedules: fixed gains of each relay's filter, by name.
             receivers: the receiver's filters, by name.
 
         Raises:
             ValueError: relays without a schedule, schedules of the wrong shape.
         """
-        # A schedule for each relay, of gains (n, received).
+        # A schedule for each relay, of gains (n, received): n states, `received` numbers that it receives.
         check_type("relays", relays, RelayNetwork)
         schedules = table("relay schedules", schedules, "schedules")
         if set(schedules) != set(relays.relays):

@@ -83,16 +83,18 @@ def check_encoder(
 ) -> None:
     """Raise ValueError unless an encoder fits the sensor, channel, trigger and filters of a node.
 
+    An encoder rounds each measured value to a word of some bits, which the channel carries.
+
     Args:
-        encoder: of the words that the sender sends.
-        sensor: of the node.
-        channel: of the node, which carries the words.
-        trigger: when the sender transmits; None where it always does.
-        filters: of the node, by name.
+        encoder: the encoder; dither is a noise that it adds before rounding, and that the receiver may subtract.
+        sensor: the node's sensor.
+        channel: the node's channel, which carries the words.
+        trigger: the rule by which the sender transmits; None where it always does.
+        filters: the node's filters, by name.
 
     Raises:
-        ValueError: a range for another count of components, angles, words that are amplified, a trigger whose ends do
-            not share what it compares with, a filter that is fed back.
+        ValueError: a range for another count of components, angles, words that are amplified, a trigger that compares
+            with a value that sender and receiver do not share, a filter that is fed back.
     """
     # Sensor, filters and channel.
     check_type("encoder", encoder, Words)

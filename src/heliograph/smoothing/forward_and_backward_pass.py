@@ -30,7 +30,8 @@ def smoother_steps(
 ) -> "tuple[PyTree, SmootherStep]":
     """Step a filter over rows of data; return its state after them, and its smoother steps stacked along time.
 
-    A smoother step is what a backward pass needs of a row.
+    A smoother step holds what a backward pass needs of a row: the filtered law, and the regression of the state before
+    the row on the state after it.
 
     Args:
         filter: a filter that can be smoothed.
@@ -42,6 +43,7 @@ def smoother_steps(
     Raises:
         ValueError: arrays of other sizes than the filter's, a wrong step number, a filter that cannot be smoothed.
     """
+    # Check the filter, the rows and the number of the first step.
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = check_data(filter, measurements, inputs)
     first = np.asarray(check_count("first step", first_step, least=0))
@@ -130,7 +132,11 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
     """Estimate each step's state given up to `lag` later steps.
 
     For each step k there is a short backward pass, from the filtered law after step k + lag to that after step k. All
-    these passes run in parallel, `lag` steps of each.
+    these passes run in parallel, `lag` steps of each. A law is a mean and a covariance.
+
+    Args:
+        steps: the filter's steps (leading axis: time): each has its filtered law, and passes a smoothed law one back.
+        lag: number of later steps whose data an estimate may use.
     """
     last = len(steps.mean) - 1
     k = jnp.arange(last + 1)

@@ -67,7 +67,13 @@ def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> 
 def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
     """Draw one path (steps, n) of the plant's states given all data, from the last step back.
 
-    The last state is drawn from its filtered law, each earlier one from its law given the state drawn after it.
+    Paths show what the states may have been together, where a smoother gives each step's law alone. The last state is
+    drawn from its filtered law, each earlier one from its law given the state drawn after it.
+
+    Args:
+        steps: of a filter, stacked along time: the regression of its state before a step on that after it (`before`),
+            the filtered law after it (`after`), and which states are angles or attitudes (`manifold`).
+        key: random key of the path.
     """
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -85,6 +91,7 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
         x = manifold.settle(filtered_mean, _draw_gaussian(regression.left._replace(mean=mean), key))
         return x, _take_plant_state(previous, x)
 
+    # The last state, then back over pairs of successive steps, each with a key of its own.
     last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
     end = last.manifold.settle(last.after.mean, _draw_gaussian(last.after, keys[-1]))
     pairs = take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None)), keys[:-1]

@@ -69,9 +69,16 @@ RULES |= {"platform_index": _select_platform}
 def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower JAX's `cond`, the choice of a branch by an index (`inputs[0]`), and return the branch's results.
 
-    A constant index takes one branch. Otherwise lanes, each with a run of its own, may take different branches: all
-    branches are computed, and each lane selects its results.
+    To lower is to add single operations (nodes) to a graph. A constant index takes one branch. Otherwise SIMD lanes may
+    take different branches, since each lane computes another run of the program: all branches are computed, and each
+    lane selects its results.
+
+    Args:
+        lowering: holds the graph, and adds nodes to it.
+        equation: the operation; its parameters hold the branches as traced programs.
+        inputs: the index, and the arguments of the branches.
     """
+    # An index known now, or a single branch, needs no choice; an index beyond the ends takes the first or last branch.
     branches = equation.params["branches"]
     which = lowering.get_only_node(inputs[0])
     if which.op == "constant":

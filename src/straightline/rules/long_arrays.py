@@ -151,10 +151,17 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b: StridedArray) -> list[Value]:
     """Lower a product of arrays in memory as a loop.
 
-    As JAX calls them, batch axes are those of both arguments and of the result, contracted ones are summed over, and
-    free ones are of one argument and of the result. The loop is over the first batch axis, else over the first free
-    axis of a, else over that of b: each turn computes a row of the result. Where there is no such axis, the loop is
-    over the first contracted one, and turns are summed.
+    The product (JAX's `dot_general`) becomes a loop in the graph of operations, since written out it would be too long.
+    As JAX calls them, batch axes are common to both arguments and the result, contracted axes are summed over, and free
+    axes belong to one argument and the result. The loop is over the first batch axis, else over the first free axis of
+    a, else of b: each turn computes a row of the result. Where there is no such axis, the loop is over the first
+    contracted one, and turns are summed.
+
+    Args:
+        lowering: translates JAX's operations to nodes of a graph.
+        equation: the operation, with its axes in `params`.
+        a: the first argument, in memory.
+        b: the second.
     """
     (a_contracted, b_contracted), (a_batch, b_batch) = equation.params["dimension_numbers"]
     # The axis of each argument that is looped over, None where an argument is used whole in every turn.
@@ -177,6 +184,7 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
         rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
         return load_as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
 
+    # As many turns as the axis of the loop is long; the turns' rows are stacked, or summed.
     count = next(x.shape[0] for x, axis in by_row if axis is not None)
     if is_summed:
         return _accumulate_turns(lowering, equation, count, multiply_row)

@@ -275,8 +275,15 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
 def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the solution X of A X = B with a triangular A (n, n), or of X A = B, or with A', by substitution.
 
-    params, of JAX's operation: "left_side" (A X, else X A), "lower" (else upper), "transpose_a", and "unit_diagonal",
-    where A's diagonal is taken for ones. A diagonal entry takes one reciprocal instead of a division for each column.
+    The substitution is written out as single operations, nodes of a graph from which code is made. A diagonal entry
+    takes one reciprocal instead of a division for each column.
+
+    Args:
+        graph: the graph, to which nodes are added.
+        params: of JAX's operation: "left_side" (A X, else X A), "lower" (else upper), "transpose_a", and
+            "unit_diagonal", where A's diagonal is taken for ones.
+        a: A, an array of nodes.
+        b: B, an array of nodes.
     """
     if params["conjugate_a"]:
         raise Unsupported("complex numbers")

@@ -126,7 +126,7 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
 def regularised_incomplete_gammas_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute P(a, x) and Q(a, x), the masses of the gamma law of a large shape a below and above x, by expansion.
 
-    A series in powers of x would take many terms.
+    A series in powers of x would take many terms for a large a; this expansion in 1 / a is about the normal law.
 
     With y^2 / 2 = m - log(1 + m), m = x / a - 1, y of the sign of m,
     Q = erfc(y root(a / 2)) / 2 + e^(-a y^2 / 2) / root(2 pi a) (c_0(y) + c_1(y) / a + c_2(y) / a^2), P = 1 - Q.

@@ -206,10 +206,11 @@ class BatchDecoder:
     def _read_by_node(self, batch: Sequence[RawMessage]) -> "tuple[dict[str, list[NodeReadings]], Counter[str]]":
         """Return the readings of each node, a block for the messages of one topic, size and layout.
 
-        And by topic how many messages say that something read of them has no value.
+        Messages with the same layout have each field at the same byte, so that NumPy reads a field from all of them at
+        once. Also return by topic how many messages mark a field that is read as having no value.
 
         Raises:
-            LayoutNotFixedError: messages that need a look at each.
+            LayoutNotFixedError: messages that have to be decoded one by one.
         """
         if not self._is_ros2:  # bags of ROS 1 are encoded otherwise
             raise LayoutNotFixedError
@@ -221,9 +222,11 @@ class BatchDecoder:
         if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
             raise LayoutNotFixedError
         for (topic, _), numbers in groups.items():
+            # The messages of one topic and size as bytes, (messages, size).
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
             connection = batch[numbers[0]].connection
             for rows, fields in self._yield_rows_by_layout(connection, table):
+                # Fields by path (messages,), NaN where a flag says that there is no value.
                 columns, marked = blank_columns(connection.msgtype, fields, self._list_judged_paths(topic))
                 counts[topic] += int(np.count_nonzero(marked))
                 for source, _, places in self._sources.of(topic):

@@ -75,11 +75,11 @@ def _yield_messages_of_chunk(
 
     Args:
         storage: the open file.
-        chunk: the chunk, as the file's index has it.
-        channels: connections by the numbers of their channels; messages of others are passed over.
+        chunk: a compressed group of records in the file, as the file's index has it.
+        channels: connections (topic and type) by the numbers of their channels; messages of others are passed over.
 
     Raises:
-        ValueError: a record that is longer than what is left of the chunk.
+        ValueError: a record that is longer than the rest of the chunk.
     """
     from rosbags.rosbag2.storage_mcap import decompress
 

@@ -18,6 +18,11 @@ RAW = "CAN_DataFrame"  # the signal that frames of a bus are recorded as
 def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """Open an MDF4 file; a message is a sample of a channel group, named as the group's acquisition or "group N".
 
+    Args:
+        path: the file, a vehicle's log of signals by channel group.
+        sources: say which signals are measurements of which node, and may have the date of the start.
+        wanted: whether the messages of a name are to be read.
+
     Raises:
         ValueError: no MDF4 file, or frames of a bus without a database.
         ModuleNotFoundError: asammdf is not installed (extra "mdf").
@@ -27,9 +32,11 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     try:
         with MDF(path) as file:
             names = _name_groups(file)
+            # Signals by group; raw frames of a bus cannot be read without the database that describes them.
             channels = {name: _list_channels(file, i) for i, name in enumerate(names)}
             if any(RAW in signals for signals in channels.values()):
                 raise fail(str(path), "dbc= of LogSources, for its frames of CAN", "none")
+            # Samples of the wanted groups, units of all signals, and the date from which the samples' times count.
             series = {name: _read_group(file, i, channels[name]) for i, name in enumerate(names) if wanted(name)}
             units = {
                 name: {signal: file.get_channel_unit(group=i, index=index) or "" for signal, index in signals.items()}

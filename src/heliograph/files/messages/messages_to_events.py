@@ -51,24 +51,27 @@ def read_messages(
 ) -> EventTable:
     """Read the events of a network from a bag, a vehicle's log, a file of messages or a folder of them, or a store.
 
-    A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files; each event has the
-    time of its source and the time when it was logged; MCAP may have messages of ROS or in JSON. A file of messages is
-    CSV or Parquet, of which each row is a message and its columns are the fields; Influx's annotated CSV; or lines of
-    JSON (.jsonl, .ndjson, .json, .log, .txt), also those that MQTT clients print; CSV and lines may be packed (.gz). A
-    message has the topic in its field `topic`, with JSON in `payload` if there is such a field, else that named as the
-    file. It arrives at the time in `arrival` or `tst`, beside a payload also in `timestamp`, `time` or `ts` (a date
-    with a zone, or seconds), else at its own. Messages in our own form, with node, sequence, time and values, need no
-    sources. Rows of a store, of a URL as `read_store` takes it, are messages as rows of CSV are; the topic is the
-    measurement's or the database's name.
+    An event is one measurement of a node, with its time and the time of its arrival. A source says which fields of
+    which messages it is read from; messages in our own form, with node, sequence, time and values, need no sources.
 
-    A folder of files of messages is one recording, merged by time; the topic of each file is its name, and files that
-    are no topic of the sources are left out. A clock that counts from its own start has it in its `Stamp`.
+    A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files. Each event has the
+    time of its source and the time when it was logged. MCAP may have messages of ROS or in JSON.
 
-    A vehicle's log is BLF (.blf) or ASC (.asc), whose frames a database describes, MDF4 (.mf4) or ULog (.ulg), read by
-    `LogSources`; each message arrives when it was logged.
+    A file of messages is CSV or Parquet, where each row is a message and its columns are the fields; Influx's annotated
+    CSV; or lines of JSON (.jsonl, .ndjson, .json, .log, .txt), also as MQTT clients print them. CSV and lines may be
+    packed (.gz). A message has its topic in the field `topic`, with JSON in `payload` if there is such a field; else
+    the topic is the file's name. It arrives at the time in `arrival` or `tst`, beside a payload also in `timestamp`,
+    `time` or `ts` (a date with a zone, or seconds), else at its own time.
+
+    A folder of files of messages is one recording, merged by time. The topic of each file is its name, and files whose
+    names are no topic of the sources are left out. A clock that counts from its own start has that in its `Stamp`.
+
+    Rows of a store, whose URL is as `read_store` takes it, are messages as rows of CSV are; the topic is the
+    measurement's or the database's name. A vehicle's log is BLF (.blf) or ASC (.asc), whose frames a database
+    describes, MDF4 (.mf4) or ULog (.ulg), read by `LogSources`; each message arrives when it was logged.
 
     A message that cannot be read is refused alone: `refused` of the result counts them, `reasons` has the first.
-    Where a bag is damaged what came before stays, and `broken` says where.
+    Where a bag is damaged, everything before the damage is read, and `broken` says where it is.
 
     Args:
         path: the bag, the file or the folder, or the URL of a store.
@@ -83,6 +86,7 @@ def read_messages(
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.
         ModuleNotFoundError: a bag without rosbags (extra "bags"), a log without what reads it ("can", "mdf", "ulog").
     """
+    # A store's rows are asked for by its URL; all else is a file or a folder.
     source = query_store(parse_store(str(path))) if is_store(path) else file_path("recording", path)
     return read_events(source, network, sources, progress, strict, ignore_unknown)
 

@@ -92,8 +92,10 @@ def the_things_stack(
 ) -> "dict[str, Source]":
     """Return the sources of uplinks of The Things Stack v3, a plant for each device: `sources = {**this, ...}`.
 
-    The time is that of the reception, the count that of the frames: absent at 0, and from 0 again after 65,535 frames
-    and after a device has joined again. An uplink without the field measured nothing.
+    A source says where time, count, device and values stand in other programs' messages, here in the JSON by which this
+    LoRaWAN server forwards a device's uplinks (radio messages). The time is when the uplink was received. The count is
+    the device's number of the frame: it is absent at 0, and begins from 0 again after 65,535 frames and after the
+    device has joined again. An uplink without the field measured nothing.
 
     Args:
         path: dotted path within the decoded payload, or several, as of `json_field`.

@@ -118,10 +118,7 @@ class EventFilter(AbstractSizedFilter):
         return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
 
     def _pad_sum(self, single: GaussianSum) -> GaussianSum:
-        """Return the one Gaussian of `single`, followed by copies of weight 0.
-
-        All steps then have as many: first those with a known reference r, then those whose r is a value that was lost.
-        """
+        """Return the one Gaussian of `single`, then copies of weight 0, so that all steps have as many Gaussians."""
         count = self._known_reference_count + self.reference_may_be_lost * self.lost
         copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
         return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))
@@ -173,14 +170,15 @@ class EventFilter(AbstractSizedFilter):
     def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
         """Correct with the values that came, and with the silence of the senders from which none came.
 
-        z: the values of all senders, NaN where none came, then what is reported of each one's losses, if anything.
+        A sender transmits only if its value y differs enough from its reference r, so that silence tells something too.
+        z: the values of all senders, NaN where none came; then the losses that each one reports, if it reports any.
         """
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
         mixture, has_sent, start = state.parts, state.begun, second_moments_at_start(self.plant)
         log_likelihood, innovations, covariances = jnp.zeros(()), [], []
-        # Senders one after the other, each given those before it.
+        # Senders one after the other, each given those before it; each sends the entries `components` of y.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
             reported_losses = losses[s] if len(losses) else jnp.asarray(jnp.nan)
@@ -188,7 +186,7 @@ class EventFilter(AbstractSizedFilter):
             posterior, mean_of_value, covariance_of_value = self._condition_on_sender(
                 xry, channel, received, reported_losses, s, has_sent[s]
             )
-            # The weights, normalised; their sum was p(what came from s | what came before).
+            # Normalise the weights; their sum was p(value or silence of sender s | data before).
             log_likelihood_of_sender = log_total_weight(posterior.log_weight)
             log_likelihood += log_likelihood_of_sender
             mixture = posterior.scale_weights(-log_likelihood_of_sender)

@@ -100,8 +100,15 @@ class StochasticEventFilter(AbstractSizedFilter):
     def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
         """Correct with the value that came, or with the silence if none did.
 
-        z: the value, NaN where none came; then, of a trigger whose losses are known, a flag: 1 if the link was down.
+        The sender transmits y or stays silent by a rule that depends on y and a reference, so that silence, too, tells
+        of the state x. A value is used by a Gaussian update, silence by the probability of being silent given x.
+
+        Args:
+            state: Gaussian of x, probabilities of the link's modes, and the reference with which the sender compares y.
+            z: the value, NaN where none came; then, if the trigger's losses are known, a flag: 1 if the link was down.
+            k: number of the step.
         """
+        # The parts at this step, and the moments of the sensor's signal y.
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
@@ -117,7 +124,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         log_silent, given_silence = self._condition_on_silence(prior, signal, state.reference, k)
         silent = _sum_of_one_gaussian(log_silent, given_silence, state.law)
         by_silence = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
-        # Of a value: that it was sent says something too, behind a trigger that sends by chance.
+        # That a value was sent says something too, behind a trigger that sends by chance.
         if isinstance(self.trigger, StochasticTrigger):
             link = self._average_link_moments(channel, state.law)
             innovation = self._condition_on_sending(innovation, link, signal, state.reference, log_silent)

@@ -291,11 +291,10 @@ def _scale_branches(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
     """Return the filter with the noise variances of its sensor learned on line.
 
-    At each step a share 1 - `memory` of the learned law is forgotten, and replaced by the variance of the filter's
-    model. A component that does not arrive forgets nothing. The process noise is taken as true: a Q that is too small
-    makes the learned R too large, so learn Q first, with `fit`.
-
-    Claim: "nominal".
+    Each variance has a law of its own (inverse gamma), which squared residuals update. At each step a share 1 -
+    `memory` of this law is forgotten, and replaced by the variance of the filter's model. A component that does not
+    arrive forgets nothing. The process noise is taken as true: a Q that is too small makes the learned R too large, so
+    learn Q first, with `fit`. Claim: "nominal", the covariance is neither exact nor a bound.
 
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
@@ -310,6 +309,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     if not isinstance(filter, GaussianFilter | RobustFilter):
         expected = "one of kalman_filter, extended_filter, cubature_filter or robust_filter"
         raise fail("filter to adapt", expected, type(filter).__name__)
+    # The noise as it arrives; a Gaussian filter's own is found from its sensor and channel.
     stored = scalar("memory of an adaptive filter", memory, low=TINY, high=1.0)
     noise = filter.noise if isinstance(filter, RobustFilter) else _find_sensor_noise(filter)
     adaptive = AdaptiveFilter(

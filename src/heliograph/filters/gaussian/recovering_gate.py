@@ -131,8 +131,16 @@ class GivingInFilter(AbstractSizedFilter):
     def correct(self, state: GateAndRival, z: ArrayLike, k: Step = 0) -> tuple[GateAndRival, Innovation]:
         """Correct the gate's estimate with z (m,), and the rival with all of z; then choose between them.
 
-        The gate gives in, which makes the rival's estimate its own, if a number has been refused for long and the
-        numbers that were not refused do not contradict the rival.
+        A gate is a filter that refuses numbers far from its prediction. If the state jumps, it would refuse all numbers
+        for ever; so a second estimate, the rival, also uses the refused ones. The gate gives in, which makes the
+        rival's estimate its own, if a number has been refused for long and the numbers that were not refused do not
+        contradict the rival.
+
+        Args:
+            state: both estimates, how often in a row each number was refused, and the evidence (log-likelihood of the
+                numbers that are not refused, under the rival minus that under the gate).
+            z: measurement (m,), NaN where missing.
+            k: number of the step.
         """
         # The gate's own update, and how often in a row it has refused each number.
         z = jnp.asarray(z)

@@ -73,18 +73,20 @@ def keep_where_unchanged(changes: jax.Array, after: T, before: T) -> T:
 def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalars: Array) -> Gaussian:
     """Return the state after z with an upper bound of its error covariance, by Young's inequality (`Polytope`).
 
-    The error after a gain K is e+ = e - K M (H e + v) - K D y - K u, where u, the deviation of z from its mean given y,
-    is uncorrelated with the rest. Young's inequality, a b' + b a' <= beta a a' + b b' / beta, bounds the products of D
-    y with e (beta_1) and with M (H e + v) (beta_2):
+    The sensor gives y = H x + v (v of covariance R), and the channel z = G y + n, where E[G] is uncertain: M + D, M
+    nominal. The error after a gain K is e+ = e - K M (H e + v) - K D y - K u, where e is the error before, of
+    covariance P, and u, the deviation of z from its mean given y, is uncorrelated with the rest. Young's inequality, a
+    b' + b a' <= beta a a' + b b' / beta, bounds the products of D y with e (beta_1) and with M (H e + v) (beta_2):
 
         E[e+ e+'] <= (1 + beta_1) P - K C - C' K' + K Omega K',  C = M H P,
         Omega = base + (1 / beta_1 + 1 / beta_2) shift + (1 + beta_2) M (H P H' + R) M',
 
-    with base = spread(Y), shift = shift(Y). The gain K = C' Omega^-1 of least bound leaves
-    (1 + beta_1) P - C' Omega^-1 C. A Kalman update gives the same, with a = 1 + beta_1 and b = 1 + beta_2: of the
-    prior a P by the innovation times a, with the noise a^2 Omega - a M H P H' M' (a sum of positive terms below).
+    with base = spread(Y) >= E u u' and shift = shift(Y) >= E D y y' D', Y the second moment of (y, 1). The gain
+    K = C' Omega^-1 of least bound leaves (1 + beta_1) P - C' Omega^-1 C. A Kalman update gives the same, with
+    a = 1 + beta_1 and b = 1 + beta_2: of the prior a P by the innovation times a, with the noise
+    a^2 Omega - a M H P H' M' (a sum of positive terms below).
 
-    `scalars` (2,) are beta_1 and beta_2, NaN for those of least trace.
+    `scalars` (2,) are beta_1 and beta_2, NaN to choose the values whose bound has the least trace.
     """
     prior, present = signal.prior, z.present
     # M H, M H P H' M' and M R M'.

@@ -80,12 +80,14 @@ class Unscented(AbstractTransform):
 
         The state is x = m + L xi with Var xi_j = v_j, and the points are m +- h_j L_j with h_j = sqrt(c v_j) and
         c = alpha^2 (n + kappa). Let f_j+ and f_j- be the values of f there, less f(m); a_j = (f_j+ - f_j-) / 2 is the
-        odd part in xi_j, b_j = (f_j+ + f_j-) / 2 the even one, and b the mean of all b_j. The class's formulas become
+        odd part in xi_j, b_j = (f_j+ + f_j-) / 2 the even one, and b the mean of all b_j. The unscented transform, with
+        weights 1 / (2 c) of the points, becomes
 
             mean = f(m) + s,  s = sum_j b_j / c = n b / c,
             covariance = sum_j a_j a_j' / c + sum_j (b_j - b)(b_j - b)' / c + (alpha^2 kappa / n + beta) s s',
 
-        a sum of squares, since sum_j b_j b_j' / c = sum_j (b_j - b)(b_j - b)' / c + (c / n) s s'.
+        a sum of squares, since sum_j b_j b_j' / c = sum_j (b_j - b)(b_j - b)' / c + (c / n) s s'. It is returned as
+        weighted columns W diag(w) W': in `explained` the a_j, which are correlated with x, in `curvature` the rest.
         """
         n = x.mean.shape[0]
         self.check(n)
@@ -93,6 +95,7 @@ class Unscented(AbstractTransform):
         c = alpha**2 * (n + kappa)
         weights = jnp.full(n, 1 / (4 * c))
         weights_with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
+        # The same moments in a form whose derivatives JAX can take where a variance v_j is 0.
         if writes_for_derivatives():
             parts = find_odd_and_even_parts(function, x, c)
             mean_even = jnp.sum(parts.even, axis=1) * (1 / n)

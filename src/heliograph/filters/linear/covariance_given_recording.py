@@ -66,8 +66,14 @@ class LinearFilterOfRecord(AbstractSizedFilter):
     def correct(self, state: RecordedBelief, z: ArrayLike, k: Step = 0) -> tuple[RecordedBelief, Innovation]:
         """Correct the filter's own state as it does, and P by its gain K: P - K H P - P H' K' + K S K'.
 
-        S is the covariance of the innovation that the filter would compute if the moments of x before any data were
-        those given this recording, E[x x'] = m m' + P. The innovation that is returned has this S.
+        A linear filter behind random gains states a covariance that is a mean over all recordings; P is that given this
+        recording. S is the covariance of the innovation that the filter would compute if the moments of x before any
+        data were those given this recording, E[x x'] = m m' + P. The innovation that is returned has this S.
+
+        Args:
+            state: the filter's own state, and P (n, n).
+            z: measurement, NaN where missing.
+            k: number of the step.
         """
 
         def correct_mean(mean: jax.Array, value: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -349,6 +349,7 @@ def memoryless_filter(
 
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
+    # The channel with its modes drawn anew at each step, and whether its memory correlates mean gains over time.
     check_linear("memoryless filter", plant, sensor)
     memoryless_channel, is_memory_relevant = without_memory(channel), memory_matters(channel)
 
@@ -362,7 +363,7 @@ def memoryless_filter(
         assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
         return _claim_nominal(filter) if is_memory_relevant else filter
 
-    # Delays: the same filter for the system enlarged by past signals.
+    # A channel that delivers late: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(memoryless_channel)])[0].past:
         return wrappers.build_behind_delays(plant, sensor, memoryless_channel, make)
     return make(plant, sensor, memoryless_channel)

@@ -185,9 +185,11 @@ def polynomial_filter(
 ) -> PolynomialFilter:
     """Return the best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
 
-    It takes linear plants and sensors behind any channel, and noises of any law with moments up to order 2 degree. It
-    estimates the whole state with a dynamical bias, and recomputes its covariance where z has gaps. For many complete
-    runs `scheduled_polynomial_filter` does the same with saved gains. Behind a known gain moments are about the mean.
+    It takes linear plants and sensors behind any channel, and noises of any law with moments up to order 2 degree. The
+    powers of state and measurement up to `degree` follow a linear system of their own (a lift), in which the best
+    linear filter is the best polynomial one. It estimates the whole state, a bias with dynamics of its own included,
+    and recomputes its covariance where z has gaps. For many complete runs `scheduled_polynomial_filter` does the same
+    with saved gains. Behind a known gain moments are about the mean.
 
     Args:
         plant: a linear plant without inputs, n states.
@@ -206,6 +208,7 @@ def polynomial_filter(
 
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
+    # The linear system of the powers, about the state's mean or about 0; its filter; and around that the states alone.
     centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
     claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)

@@ -147,8 +147,9 @@ def _predict_joint_moments(
 def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: ChannelByMode, step: LinearStep) -> np.ndarray:
     """Return E[r r' 1{mode}] (M, size, size) after a correction, for r = (x, 1, s) and each of M modes of the channel.
 
-    The filter's state s becomes s + K (z - C s - c). The true sensor sends y = C_x x + v, and z = G y + n arrives, with
-    a random G and n whose law depends on the mode. With (y, 1) = D (x, 1) + (v, 0), D = [C_x, E v; 0, 1],
+    This follows a filter of a wrong model under the true one: r joins the true state x and the filter's state s, which
+    becomes s + K (z - C s - c). The true sensor sends y = C_x x + v, and z = G y + n arrives, with a random G and n
+    whose law depends on the mode. With (y, 1) = D (x, 1) + (v - E v, 0), D = [C_x, E v; 0, 1],
 
         s+ = (I - K C) s - K c + K E[(G, n)] D (x, 1)                  mean given x, s and the mode
              + K [(G, n) - E(G, n)] (y, 1) + K E[G] (v - E v)          zero-mean terms, uncorrelated with x and s
@@ -159,13 +160,14 @@ def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: Channel
         channel: E[(G, n)] (M, m, p + 1) and the covariances of its rows, `spread` (M, m, m, p + 1, p + 1), by mode.
         step: the filter's K, C and c.
     """
+    # K, E[(G, n)] by mode, D, and the covariance of (v, 0).
     p, n = sensor.matrix.shape
     gain, mean = np.asarray(step.gain), np.asarray(channel.mean)
     probability = moments[:, n, n, None, None]  # E[1 1{mode}]
     D, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     D[:p, :n], D[:p, n], D[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
-    # r+ = A_j r + zero-mean terms in s, with x and 1 unchanged.
+    # r+ = A_j r + zero-mean terms in s, with x and 1 unchanged: rows of s get K E[(G, n)] D - (0, K c) and I - K C.
     A = np.zeros_like(moments) + np.eye(moments.shape[-1])
     A[:, n + 1 :, : n + 1] += gain @ mean @ D
     A[:, n + 1 :, n + 1 :] -= gain @ step.output
@@ -175,6 +177,7 @@ def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: Channel
     signal_moments = propagate_by_mode(D, moments[:, : n + 1, : n + 1], probability * noise)
     by_channel = np.einsum("jilab,jab->jil", np.asarray(channel.spread), signal_moments)
     by_sensor = probability * propagate_by_mode(mean, noise, 0.0)
+    # A_j E[r r' 1{mode j}] A_j', and K (...) K' in the block of s.
     after: np.ndarray = propagate_by_mode(A, moments, 0.0)
     after[:, n + 1 :, n + 1 :] += propagate_by_mode(gain, by_channel + by_sensor, 0.0)
     return after

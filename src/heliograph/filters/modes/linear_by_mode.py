@@ -84,7 +84,8 @@ def centred_motion(
 ) -> MotionByMode:
     """Return the transition from (x - c, 1) to (x+ - c+, 1) in each mode j, and the centre c+ = E[x+] before any data.
 
-    x+ - c+ = A_j (x - c) + d_j + w_j with d_j = A_j c + B_j u + E w_j - c+, where w_j has mean 0.
+    Filters of systems whose law of motion depends on a mode work about the mean c, since moments about 0 lose digits.
+    In mode j, x+ - c+ = A_j (x - c) + d_j + (w_j - E w_j) with d_j = A_j c + B_j u + E w_j - c+.
 
     Args:
         plants: the different plants.
@@ -93,6 +94,7 @@ def centred_motion(
         centre: c (n,).
         moments_before: E[(x - c, 1) 1{mode j}] (M, n + 1), with j the mode by which x moves.
     """
+    # For each mode [A_j, B_j u + E w_j; 0, 1] and Cov w_j, by those of its plant.
     by_plant = [transition_with_constant(plant, jnp.asarray(u)) for plant in plants]
     matrices, noises = (jnp.stack(of_modes) for of_modes in zip(*(by_plant[mode] for mode in modes), strict=True))
     moved_centres = matrices[:, :-1] @ jnp.append(centre, 1.0)  # A_j c + B_j u + E w_j

@@ -251,14 +251,17 @@ def mix_and_predict_by_mode(
 ) -> Gaussian:
     """Return the Gaussians after a step: mixtures of the components, each moved by the plant of a mode.
 
+    A filter of several modes replaces each mixture by a Gaussian of its mean and covariance, so that their number does
+    not grow, and then predicts it.
+
     Args:
-        plants: the different plants.
+        plants: the different plants; several modes may share one.
         plant_of: [j], number of the plant of mode j.
         transform: of moments, for a nonlinear plant.
-        components: Gaussians that are mixed.
-        weight: [c, g], weight of component c in mixture g.
-        moves: two arrays, of each Gaussian after the step the number of the mixture that it was before, and the mode
-            that moves it.
+        components: Gaussians that are mixed, leading axis c.
+        weight: [c, g], weight of component c in mixture g, not normalised.
+        moves: two arrays with an entry for each Gaussian after the step: the number of the mixture that it was before,
+            and the mode that moves it.
         u: input.
         initial_power: E[x_i^2] before any data (n,), on which rounding acts.
     """

@@ -273,7 +273,7 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
     """Check the parts; return the best linear filter that receives the states of the links' memories with z.
 
     A memory is a chain of modes, or a gain that drifts, in the channel. Its state arrives at the same step, or `late`:
-    one step later.
+    one step later. The filter's claim says what its covariance is: exact, or only nominal. All parts are linear.
     """
     check_linear("filter that observes the mode", plant, sensor)
     # Erasures are side information of another kind.

@@ -75,13 +75,13 @@ def correct_in_every_mode(
 ) -> tuple[Gaussian, jax.Array, Innovation]:
     """Return the posteriors of several Gaussians, each corrected in its mode, their weights, the mixture's innovation.
 
-    The weight becomes proportional to weight P(what arrives | mode) N(z; ...). The innovation's likelihood is that of z
-    given which components arrive.
+    The weight becomes proportional to weight P(which components arrive | mode) N(z; ...). The innovation's likelihood
+    is that of z given which components arrive.
 
     Args:
-        signal: moments of the sensor's signal under each Gaussian (K, ...).
-        channel: by mode and pattern of arrivals.
-        mode: in which each Gaussian is corrected (K,).
+        signal: moments of the sensor's signal y under each Gaussian of the state x (K, ...).
+        channel: moments of z = G y + n and probability of arrival, by mode and pattern (which components arrive).
+        mode: the mode in which each Gaussian is corrected (K,).
         weight: probability of each Gaussian and its mode (K,).
         z: measurement (m,), NaN for what did not arrive.
         angles: components of z that are angles.
@@ -90,7 +90,7 @@ def correct_in_every_mode(
     pattern = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
     moments = channel.mean, channel.gain_spread, channel.noise
     links = jax.tree.map(lambda by_mode: jnp.asarray(by_mode)[mode, pattern], moments)
-    # Prior weights given which components arrived.
+    # Prior weights given which components arrived, as they were if that is impossible in all modes.
     joint = weight * jnp.asarray(channel.chance)[mode, pattern]
     total = jnp.sum(joint)
     prior = jnp.where(total > 0, joint / jnp.where(total > 0, total, 1.0), weight)
@@ -211,17 +211,14 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
-        """Return for all pairs (component, mode) that z corrects: moments of the sensor's signal, and prior weights.
-
-        The signal is that of the mode's sensor if x has the component's Gaussian.
-        """
+        """Return for pairs (component, mode) that z corrects the moments of the mode's signal, and prior weights."""
         component, mode = self.merging.list_update_pairs(len(self.initial))
         return self.signals_of_pairs(state.gaussian, (component, mode), k), state.weight[component, mode]
 
     def signals_of_pairs(self, components: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
         """Return for each pair (component, mode) the moments of the signal y of the mode's sensor, for x ~ component.
 
-        `pairs`: numbers of the components and of the modes. `components`: Gaussians of x with a leading axis.
+        `pairs`: number of the component, and of the mode, in each pair. `components`: Gaussians of x, a leading axis.
         """
         plant, sensors = list_mode_models(at(self.plant, k))[0], list_mode_models(at(self.sensor, k))
         (component, mode), start = pairs, second_moments_at_start(self.plant)
@@ -272,10 +269,10 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> PairSmootherTerms:
-        """Return what a smoother by pairs (mode i before the step, mode j after it) needs of a step.
+        """Return the terms of a step for a smoother by pairs (mode i before the step, mode j after it).
 
-        It is the Gaussian and the probability of each pair, the smoother gain back to mode i, and the Gaussian of each
-        mode j without later data, to which a smoothed one is compared. `after`: the law by mode after the correction.
+        These are Gaussian and probability of each pair, the smoother gain back to mode i, and the Gaussian of each mode
+        j without later data. `step`: states around step k, u and z. `after`: law by mode after the correction.
         """
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = list_mode_models(at(self.plant, k)), second_moments_at_start(self.plant)

@@ -140,8 +140,9 @@ class SideInformationFilter(AbstractSizedFilter):
     ) -> tuple[SideInformationBelief, Innovation]:
         """Weight the modes by the flag and by which components arrived, then project zeta on (1, s, z).
 
-        zeta holds the products of (x - c, 1) and the modes' indicators, and s is its estimate before. z: what the
-        channel delivers (m,), NaN for what did not arrive, and then the number of the flag, if `flagged`.
+        A mode of the link decides its losses and noise; a flag, or which components arrived, tells of the mode (side
+        information). zeta holds the products of (x - c, 1) and the modes' indicators, and s is its linear estimate
+        before. z: what the channel delivers (m,), NaN for what did not arrive, and then the flag's number if `flagged`.
         """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
@@ -151,8 +152,8 @@ class SideInformationFilter(AbstractSizedFilter):
         flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
-        # Moments given the side information: those of mode j times weight_j = P(j | side information) / P(j). `excess`,
-        # the weights times weight_j - 1, is what this adds.
+        # Moments given the side information: moments of mode j times weight_j = P(j | side information) / P(j).
+        # `excess`, the weights times weight_j - 1, is what this adds.
         _, x, weights = split_columns(state)
         weight = weight / (weight @ mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
@@ -313,6 +314,9 @@ def side_information_filter(
 ) -> SideInformationFilter:
     """Return the linear filter with side information on the modes: which packets arrived, and a flag with each.
 
+    A channel's mode, such as good or bad, follows a Markov chain, and decides gain, noise and losses. The flag is a
+    number that comes with z and whose probabilities depend on the mode, such as a signal strength in classes.
+
     Args:
         plant: a linear plant, n states.
         sensor: a linear sensor, m outputs.
@@ -329,6 +333,7 @@ def side_information_filter(
 
     Source: the filter of Costa (1994) with moments conditional on the side information.
     """
+    # Initial law of the modes, the channel by mode and pattern of arrivals at each step, and if all laws are known.
     check_linear("side-information filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
     initial, steps, is_known = _describe_channel_by_mode(channel)

@@ -113,8 +113,10 @@ def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryD
 def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_EntryDegrees]) -> Any:
     """Return the degrees, entry by entry, of the result of an operation on operands x; OTHER if it is not listed here.
 
-    A degree is a number, KNOWN (a constant) < GIVEN (no function of the variables) < AFFINE in them < OTHER, so that a
-    sum has the larger one of its terms. `name`: of the operation (a JAX primitive); `params`: its parameters.
+    A traced function is walked through operation by operation to see whether it is affine in some of its arguments, the
+    variables. A degree is a number, KNOWN (a constant) < GIVEN (no function of the variables) < AFFINE in them < OTHER,
+    so that a sum has the larger one of its terms. `name`: name of the operation (a JAX primitive); `params`: its
+    parameters; `x`: degrees of each operand's entries, with their values if all are constants.
     """
     match name:
         case "add" | "add_any" | "sub":

@@ -253,21 +253,22 @@ def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
     """Return last state and outputs of rows of data, the first with number `begin`; None without native code.
 
-    `z`: (rows, received), NaN for what did not arrive; `u`: (rows, inputs). `state`: that after the row before; None at
-    the start, where particles are drawn.
+    `filter`: a particle filter. `z`: (rows, received), NaN for what did not arrive; `u`: inputs (rows, inputs).
+    `state`: the filter's state after the row before; None at the start, where particles are drawn.
     """
     # Random keys of all rows at once: they depend on the data, and on no particle.
     key = None if state is None else np.asarray(state.key)
     start_key, choice_starts, last_key, noise_keys, proposal_keys = compute_once(
         draw_keys_of_rows, draw_keys_of_rows_by_xla, (filter, z, key)
     )
+    # Number of each step, and whether particles move before it: in all rows but the very first.
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
     rows = DataRow(k=k, z=z, u=u, noise_key=noise_keys, proposal_key=proposal_keys, moved=moved)
     programs = _compile_programs(filter, z, u, (noise_keys, proposal_keys))
     if programs is None:
         return None
-    # The particles before the first row: drawn, or those of the state.
+    # The particles before the first row: drawn, or taken from the state.
     loop = _ParticleLoop(filter, programs)
     if state is None:
         numbers = programs.memory.numbers[: filter.particles]
@@ -277,7 +278,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
         loop.set_particles(draw(start_key, numbers), np.zeros(filter.particles))
     else:
         loop.set_particles(jax.tree.map(np.asarray, filter.get_particles(state)), np.asarray(state.log_weight))
-    # Row by row the sums over particles, then of these the outputs of all rows, a row in each lane.
+    # Row by row the sums over particles; then the outputs of all rows from these sums, computed side by side.
     steps = [
         loop.filter_row(DataRow(*row), choice_start)
         for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
@@ -316,30 +317,34 @@ class _ParticleLoop:
     def filter_row(self, row: DataRow, choice_start: float) -> ParticleSums:
         """Resample the particles if needed, move and weigh them, in place; return the sums over them.
 
-        `choice_start`: a uniform number, which is where systematic resampling starts.
+        Mean, covariance and likelihood follow from the sums. The work is done by compiled programs, which read and
+        write arrays of one memory. `row`: data of one step, z NaN where missing, inputs u, random keys and number of
+        the step. `choice_start`: a uniform number, at which systematic resampling starts.
         """
+        # Copy the row to where the programs read it, and resample.
         memory, programs = self.memory, self.programs
         for array, value in zip(memory.row, row, strict=True):
             array[...] = value
         self._choose_particles(choice_start)
         # Move and weigh; a row that no particle explains is not used: they are only moved.
         used = self.filter.uses_empty_rows or not np.isnan(row.z).all()
-        largest = self._advance(used)
+        largest = self._advance(used)  # the largest log weight
         excluded = used and not largest > -np.inf
         if excluded:
             largest = self._advance(False)
         # weight = exp(log weight - largest).
         np.subtract(self.log_weight, largest, out=memory.log_weight)
         np.exp(memory.log_weight, out=memory.weight)
-        # First sums of all groups, then second sums about the means (einsum: in half of the time of add.reduce).
+        # First sums of all groups of particles (the programs sum each group, NumPy all groups), then second sums about
+        # the means (einsum: in half of the time of add.reduce).
         self._find_reference()
         programs.first()
         states = np.einsum("ij->j", programs.first.outputs[0], out=memory.states)
         received = np.einsum("ij->j", programs.first.outputs[1])
         programs.second()
         second = np.einsum("ijk->jk", programs.second.outputs[0])
-        # The first sums begin with the sums of weights and of their squares. p(z) is the sum of weights after z over
-        # that before z.
+        # The first sums begin with the sums of weights and of their squares. p(z) is the sum of weights after z divided
+        # by the sum of weights before z: log p(z) = log(sum after) + largest - log(sum before).
         sum_before_z = self.sum_of_weights
         self.sum_of_weights, self.sum_of_squares = float(states[0]), float(states[1])
         density = -np.inf if excluded else math.log(self.sum_of_weights) + largest - math.log(sum_before_z)

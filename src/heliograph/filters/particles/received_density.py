@@ -158,6 +158,9 @@ def find_received_density(
 ) -> ReceivedDensity:
     """Return the density of z given h(x), as atoms by mode and by set of components that arrive.
 
+    An atom is a Gaussian law of z = G (h(x) + v) + n for one value of the gain G and one branch of the noise v, with
+    its probability. A particle filter weighs its particles by this density.
+
     Args:
         sensors: the sensor of each mode.
         channels: the channel of each mode, without memory.
@@ -166,7 +169,7 @@ def find_received_density(
         ValueError: gains not of finitely many values, noises not Gaussian; a received number, or a combination
             of several, without noise.
     """
-    # Of each mode its outcomes by set of components that arrive; all sets, those of few components first.
+    # For each mode its outcomes by set of components that arrive; then all sets, small ones first.
     by_mode = [{tuple(outcome.arrived): outcome for outcome in channel.list_outcomes()} for channel in channels]
     sets = sorted({arrived for outcomes in by_mode for arrived in outcomes}, key=lambda flags: (sum(flags), flags))
     # Atoms and chance by mode and set. A set that cannot arrive in a mode has a chance of 0, and atoms of another set.

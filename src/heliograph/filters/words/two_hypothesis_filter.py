@@ -85,8 +85,11 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     def correct(self, state: Hypotheses, z: ArrayLike, k: Step = 0) -> tuple[Hypotheses, Innovation]:
         """Correct with the codewords that arrived, one component of y after another.
 
-        Each one splits both hypotheses, by whether its leading bits are right, and merges the four Gaussians to two.
+        A codeword is a value rounded to a number of some bits; the link may have flipped some. The state is two
+        Gaussians: the leading bits of the last codewords were right, or not. Each codeword splits both hypotheses, by
+        whether its leading bits are right, and the four Gaussians are merged to two.
         """
+        # Which codewords arrived, and for each received bit its probabilities if 0 or 1 was sent.
         base, z, n = self.base, jnp.asarray(z), len(self.states)
         words = base.identify_received_words(z, at(base.links, k))
 
@@ -96,6 +99,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
             return append_rows(x, signal.mean, signal.slopes, noise)
 
+        # Both hypotheses over (x, y); then component after component, each with its probability given those before it.
         joint = Hypotheses(jax.vmap(append_measured)(state.parts), state.weights)
         some_word_was_used, log_likelihood = jnp.asarray(False), jnp.zeros(())
         for i in range(len(base.low)):

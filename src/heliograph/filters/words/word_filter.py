@@ -100,9 +100,11 @@ class WordFilter(AbstractGaussianStateFilter):
     def identify_received_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
         """Return which codeword of each component was received, and likelihoods of the bits that were sent.
 
-        z (one step) has a number for each output of the channel: a received codeword low + i spacing, or the mode of
-        the link, as `places` says. If dither is subtracted, the dither of each codeword follows. The same component may
-        come several times, as copies over several paths. A codeword is returned as its number i.
+        A sensor sends codewords (values rounded to low + i spacing, i written in bits), of which the link may flip some
+        bits. z (one step) has a number for each output of the channel: a received codeword, or the mode of the link, as
+        `places` says. If dither (noise that the sender adds before rounding) is subtracted, that of each codeword
+        follows. A component may come several times, as copies over several paths. A codeword is returned as its number
+        i. `link`: the channel's mixture of bit error rates at this step.
         """
         outputs = len(self.places)
         # Rows of z that are words, the component of y of each, and how many steps it lies above the lowest word.

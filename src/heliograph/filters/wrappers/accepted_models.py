@@ -54,8 +54,14 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
     """Let a function that makes a filter take sensors that depend on inputs, by a `FilterOfInputs` of what it makes.
 
+    Most filters know only sensors without inputs. For a sensor y = h(x, u) a filter is made for typical inputs, and a
+    wrapper gives it the sensor of the present inputs at each step.
+
     Args:
         make: a function of a plant, a sensor, mostly a channel, and more.
+
+    Returns:
+        A function with the same parameters.
     """
     parameters = inspect.signature(make)
 

@@ -143,15 +143,24 @@ def _correct_covariance(filter: ToldFilter, prior: LinearBelief, numbers: jax.Ar
 def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
     """Return the numbers that a message may report, with their probabilities, by mode of the chain that decides them.
 
-    A Markov chain reports its mode, a single number in each mode. Numbers that are drawn anew at each step have one
-    mode, with all combinations of the numbers of all links that report some.
+    With them the mean of the filter's covariance over all reports is bounded. A Markov chain reports its mode, a single
+    number in each mode. Numbers that are drawn anew at each step have one mode, with all combinations of the numbers of
+    all links that report some; a continuous law is replaced by quadrature nodes with weights.
+
+    Args:
+        filter: corrects with each message by the law of the link (a gain, a noise variance) that the message reports.
+
+    Raises:
+        ValueError: a chain beside other reports or with unknown or varying probabilities, or more than MOST nodes.
     """
+    # The memory of a link draws the reported numbers: a Markov chain, or a law from which they are drawn anew.
     memories = [affine.memory for affine in list_told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
     if chains:
         varies = np.ndim(chains[0].transition) > 2  # a transition matrix for each step
         if len(memories) > 1 or chains[0].is_uncertain or varies:
             raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
+        # In mode i the number i is reported with weight 1: shapes (modes, 1, 1) and (modes, 1).
         modes = chains[0].modes
         numbers = np.arange(float(modes))[:, None, None]
         return ToldNumbersByMode(
@@ -160,7 +169,7 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
             initial=np.asarray(chains[0].initial),
             transition=np.asarray(chains[0].transition),
         )
-    # All combinations so far with each number of the next map.
+    # All combinations so far with each number of the next map: rows of `values`; their weights are products.
     values, weights = np.zeros((1, 0)), np.ones(1)
     for memory in memories:
         more, chances = _find_quadrature(memory)

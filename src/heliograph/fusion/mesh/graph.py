@@ -131,6 +131,7 @@ def neighbours_within(
     Raises:
         ValueError: no positions, positions of several lengths, a radius that is not positive.
     """
+    # Positions (nodes, axes), all of one length.
     given = table("positions", positions, "positions of nodes")
     reach = float(scalar("radius", radius, np.finfo(float).tiny))
     if not given:

@@ -78,17 +78,23 @@ def propagate_joint_covariance(
 ) -> Float[Array, "N N"]:
     """Return J+ = M J M' + F Q F' + (W S) W', the joint covariance of all nodes' errors after a step, symmetric.
 
+    Nodes estimate the plant's state of n numbers, exchange estimates and measurements with neighbours, and mix them;
+    N is n times the number of nodes. Their errors are correlated by common noises and by the mixing.
+
     Args:
         joint: J before the step.
-        transition: M (N, N), of the blocks M_ij.
+        transition: M (N, N), with blocks M_ij by which the error of node j enters that of node i.
         correction_map: F_i = I - W_i S_i of each node, one below the other in F: what a correction leaves of an error.
-        process_noise: Q.
-        weighted_information: matrix W S (N, N) of the blocks W_i S_j of the measurements that node i has.
-        weights: matrix W (N, N) of the blocks W_i of these.
+        process_noise: Q, the covariance of the plant's noise.
+        weighted_information: matrix W S (N, N) of the blocks W_i S_j of the measurements that node i has, with the
+            information S_j of a measurement of node j.
+        weights: matrix W (N, N) of the gains W_i for these measurements.
     """
+    # Noise of the measurements: W S W'.
     measured = weighted_information @ weights.T
     # Sparse matrices, outside of a program, are made dense before they are added.
     measured = measured if is_traced(measured) else measured.toarray()
+    # F Q F' + W S W', then M J M' plus that; symmetric, as rounding leaves it only nearly.
     added = propagate_by_mode(correction_map.reshape(len(joint), -1), process_noise, measured)
     after = propagate_by_mode(transition, joint, added)
     symmetric: Float[Array, "N N"] = (after + after.T) / 2

@@ -32,10 +32,12 @@ class LikelihoodData(NamedTuple):
 def gather_data(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> LikelihoodData:
     """Return all runs of all recordings, checked against the network and filled up to one length.
 
+    All runs are then evaluated side by side by one compiled likelihood.
+
     Args:
-        network: whose nodes received the measurements.
-        recording: one recording, or a list of several; what `hg.fit` takes.
-        inputs: of the plant (steps, inputs), or a list of one array for each recording; None for those of the
+        network: the network whose nodes received the measurements.
+        recording: one recording, or a list of several, as `hg.fit` takes them.
+        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording; None for those of the
             recordings themselves.
         free: how many numbers are to be learned, for which there must be data enough.
         truth: the true states (steps, n), or a list of them; True for those in the recordings; False where not needed.
@@ -43,6 +45,7 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
     """
+    # One recording, or several: a list of numbers may also be the rows of a single recording.
     several: Sequence[object] = [recording]
     is_list = isinstance(recording, list | tuple) and not hasattr(recording, "measurements")  # a Recording is a tuple
     if is_list and not _are_rows(network, recording):

@@ -131,10 +131,11 @@ def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Likelihood
 def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
     """Return each row's log-likelihood and score in one recording, and the information of its two halves.
 
-    Row k has the log density log N(e_k; 0, S_k), with the filter's innovation e_k and its covariance S_k; with `truth`
-    the error of the filter's estimate and the covariance that the filter claims. The score is its derivative in the p
-    free numbers, the information that of Gauss and Newton. Information is summed over each half of the rows apart,
-    because what is known of the initial state adds to the first half alone: the second shows what data identify.
+    Row k has the log density log N(e_k; 0, S_k), with the filter's innovation e_k and its covariance S_k; with `truth`,
+    e_k is the error of the filter's estimate and S_k the covariance that the filter states. The score is the derivative
+    of the log density in the p free numbers, the information that of Gauss and Newton. Information is summed over each
+    half of the rows apart, because knowledge of the initial state adds to the first half alone: the second shows what
+    data identify.
 
     Args:
         objective: makes the filter from the free numbers.
@@ -152,6 +153,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
     if linear is not None:
         density, score, halves = linear.score_rows(objective.filter, x, half).scan(z, u)
         return Evaluation(density=density, score=score, halves=halves)
+    # e_k and S_k of all rows, and their derivatives in x.
     e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
 
     def add_row(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:

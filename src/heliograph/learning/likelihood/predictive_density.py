@@ -125,10 +125,11 @@ def predictive(
 ) -> Predictive:
     """Return the density of each measurement with the laws of the channel's gains as `nodes` values each.
 
-    p(z_k | past) = sum_j w_j N(z; G_j y + c_j, G_j P_y G_j' + N_j), where y and P_y are what the cubature filter that
-    knows the channel's moments expects of the sensor, and j runs over the combinations of gains. Parts of a stack are
-    used one after another: y and P_y are corrected by each, moments matched. Observed losses carry no information.
-    Nominal, as the filter is: its prior is taken for Gaussian.
+    p(z_k | past) = sum_j w_j N(z; G_j y + c_j, G_j P_y G_j' + N_j): y and P_y are mean and covariance of the sensor's
+    signal as the cubature filter that knows the channel's moments expects it, and j runs over the combinations of
+    gains. Parts of a stack (channels side by side) are used one after another: y and P_y are corrected by each, moments
+    matched. Observed losses carry no information. The density is nominal, as the filter is: its prior is taken for
+    Gaussian.
 
     Args:
         plant: the plant, which does not vary over time.
@@ -142,6 +143,7 @@ def predictive(
         ValueError: a channel that remembers or varies over time, too many combinations of gains in one part, data of
             the wrong shape.
     """
+    # Check the parts, the rows and the inputs.
     instance("plant", plant, AbstractPlant, "one plant, that does not vary over time")
     instance("sensor", sensor, AbstractSensor, "one sensor, that does not vary over time")
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
@@ -257,9 +259,10 @@ def _weigh_combinations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-weights of combinations of gains, and the errors L^-1 (z - E z), standard normal given those before.
 
-    Log-weights (t, a, m + 1) before each component and after the last, and errors (t, a, m), for step t and combination
-    a: log of its probability and of the density of the components so far. L L' = G P_y G' + N is the covariance of z;
-    components that did not arrive stand apart with variance 1.
+    z = G y + offset + n is a mixture over the gain's values a. Log-weights (t, a, m + 1) before each component and
+    after the last, and errors (t, a, m), for step t and combination a: log of its probability and of the density of the
+    components so far. L L' = G P_y G' + N is the covariance of z; components that did not arrive stand apart with
+    variance 1.
 
     Args:
         y: mean of the signal (t, p).
@@ -267,6 +270,7 @@ def _weigh_combinations(
         z: measured components of this part (t, m), NaN where none arrived.
         law: gain G, offset and noise N of each combination.
     """
+    # G P_y G' + N (t, a, m, m), and 1 on the diagonal for components that did not arrive; L is its Cholesky factor.
     present = ~np.isnan(z)[:, None]
     both = present[..., None] & present[..., None, :]
     total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
@@ -276,9 +280,11 @@ def _weigh_combinations(
     except np.linalg.LinAlgError as why:
         expected = "one behind which every measurement has a density, whatever the gain"
         raise fail("channel of a predictive density", expected, "one that delivers a number without noise") from why
+    # z - G y - offset, and L^-1 times it: component i less what those before it foretold, in deviations L_ii.
     value = np.where(present, z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     error = np.linalg.solve(root, value[..., None])[..., 0]
     scale = np.diagonal(root, axis1=-2, axis2=-1)
+    # Log-densities of the components, summed up from the first on: 0 before any, then after each.
     density = np.where(present, -(error**2 + np.log(2 * np.pi)) / 2 - np.log(scale), 0.0)
     gained = np.concatenate([np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2)
     return law.log_weight[:, None] + gained, error

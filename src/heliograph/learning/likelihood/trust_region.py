@@ -85,8 +85,7 @@ class _Lanes(NamedTuple):
 
     x: points (lanes, p). total: log-likelihood l there (lanes,), gradient (lanes, p), information I (lanes, p, p).
     model: B, a model of minus the Hessian of l (lanes, p, p). radius: of the trust region (lanes,). remaining: what a
-    full step would gain, g' I^-1 g / 2. done: lanes that go no further. joined: the lane that each one has joined,
-    itself if none.
+    full step would gain, g' I^-1 g / 2. done: lanes that go no further. joined: the lane that each joined, or itself.
     """
 
     x: np.ndarray
@@ -125,15 +124,15 @@ def maximise_from_starts(
     its error (SR1), whichever foretold the last gain better. A step is taken where l rises by a share of what was
     foretold; else the radius falls. So l never falls, and the units of the numbers do not matter.
 
-    A lane has converged when g' I^-1 g, twice the gain of the step without bounds, is nothing: less than rounding sees.
-    Coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all, do not count.
+    A lane has converged when g' I^-1 g, twice the gain of the step without bounds, is less than rounding sees. This
+    leaves out coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all.
 
     Args:
         evaluate: l (lanes,), its gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
         start: points at which to begin (lanes, p).
         active: coordinates that move, the others stay (lanes, p); all unless given.
         watch: called with the best so far before each step.
-        domains: coordinates whose domains end at infinity; plain real numbers unless given.
+        domains: coordinates whose domains end at infinity (logarithms, logits); plain real numbers unless given.
         close: g' I^-1 g at which a lane has arrived.
         joining: whether a lane ends where another, higher one climbs to the same top.
     Source: Moré and Sorensen (1983) for the step; Dennis, Gay and Welsch (1981) for the choice of the model; Conn,
@@ -157,8 +156,7 @@ def maximise_from_starts(
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
     """Return the state of all lanes before the first step, at the points `start` (lanes, p).
 
-    A lane is done from the beginning where the log-likelihood, or a derivative in a coordinate that moves (`moving`,
-    (lanes, p)), is not finite there. For `domains` and `close` see `maximise_from_starts`.
+    A lane is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite.
     """
     total, gradient, information = evaluate(start)
     state = _Lanes(
@@ -263,12 +261,13 @@ def _accept_or_reject_steps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which lanes accept their step, and the radius for the next one, (lanes,) each.
 
-    A step is accepted where the log-likelihood l rises by a share of the gain that the model foretold. Where that gain
-    is below the rounding of l, the gradient decides: the step is accepted if it fell, or if the step went to the edge
-    of the region, as across a plateau, and l did not fall by more than rounding.
+    Lanes are searches side by side. A step is accepted where the log-likelihood l rises by a share of the gain that the
+    model foretold. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
+    gradient fell, or if the step went to the edge of the region, as across a plateau; and l must not fall by more than
+    rounding.
 
     Args:
-        state: the lanes before the step.
+        state: the lanes before the step, with l (`total`), the radius, and `done` for lanes that go no further.
         total: l at the end of the step.
         length: of the step in the units of the radius.
         foretold: gain of l by the model.
@@ -290,17 +289,17 @@ def _accept_or_reject_steps(
 def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
     """Return the state in which each lane (climb) a is ended that goes to the same top as a higher lane b.
 
-    Both are within JOINED standard errors of a top and of each other, by the information I of either, and less than
-    NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b - x_a, the log-likelihood l is concave:
-    l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and (g_a - g_b)' d >= BENT d' I d. `moving`:
-    coordinates that move (lanes, p).
+    Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
+    information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
+    x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
+    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (lanes, p). `domains`: which are plain real numbers.
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)
-    # d' I d: the greater of those by the information of a and of b; `squared` is [c, a, b], by that of lane c.
+    # d' I d: the greater of the two values by the information of a and of b; `squared` [c, a, b] uses I of lane c.
     squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
     distance = np.maximum(squared[lanes, lanes, :], squared[lanes, :, lanes].T)
-    # [a, b]: l_b - l_a; what it is of a quadratic; and the fall of the slope, (g_a - g_b)' d.
+    # [a, b]: l_b - l_a; the same if l were quadratic; and the fall of the slope, (g_a - g_b)' d.
     gain = state.total[None] - state.total[:, None]
     gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
     slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
@@ -374,8 +373,9 @@ def _correct_by_secant(
 ) -> np.ndarray:
     """Return B + r r' / (r' p) with r = y - B p (the symmetric rank-one update, SR1), (lanes, p, p).
 
-    It maps the step p to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays
-    where the gradient after the step is not finite, or r' p is rounding.
+    Lanes are searches for a maximum side by side; B is each one's model of minus the Hessian. The new B maps the step p
+    to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays where the gradient
+    after the step is not finite, or r' p is rounding.
 
     Args:
         model: B (lanes, p, p).

@@ -76,9 +76,13 @@ class JudgementReader:
     def find_implausible(self, taken: Sequence[CandidateEvent]) -> dict[int, str]:
         """Return {index of an implausible candidate: the reason}, by the rows that were just stepped.
 
-        Of a plant with implausible inputs only the first of these is returned: what comes after it was judged with it.
-        Of several events of one node in one row only the largest is returned, since the row was judged as a whole; an
-        event without numbers never is.
+        The filters judged each row (time step) of a plant as a whole, so that one wrong event may spoil others. If
+        inputs of a plant are implausible, only the first such inputs are returned: later rows were judged with them. Of
+        several events of one node in one row only that with the largest number is returned; the caller refuses the
+        returned events, computes anew, and asks again. An event without numbers is never returned.
+
+        Args:
+            taken: the events that were used since the last question, each with its plant and row.
         """
         if not taken:
             return {}
@@ -93,14 +97,14 @@ class JudgementReader:
             largest[node_of_row] = max(
                 largest.get(node_of_row, i), i, key=lambda j: _find_largest_number(taken[j].event)
             )
-        # By plant, the index of its first implausible inputs. What came after them was judged with them: it may be all
-        # right without them.
+        # By plant, the index of its first implausible inputs. Later events were judged with them, and may be all right
+        # without them.
         first_inputs: dict[str, int] = {}
         for i in reasons:
             if taken[i].event.is_inputs:
                 first = first_inputs.setdefault(taken[i].plant.name, i)
                 first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)
-        # The largest of their node in their row, and, of a plant with implausible inputs, these alone.
+        # The largest event of its node in its row; but of a plant with implausible inputs only the first of these.
         to_refuse = [i for i in reasons if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i]
         return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 

@@ -115,8 +115,12 @@ class LinkCounts:
     def _follow_sequence(self, verdict: Verdict | None, sequence: int, time: float, period: int) -> None:
         """Update `first`, `newest`, `at` and `lost` from the running count that one message carries.
 
+        The sender numbers its messages. `first` and `newest` are the least and the greatest number since its last
+        start, `at` the time of the newest, and `lost` how many numbers between them no message has brought.
+
         Args:
-            verdict: what became of the message; None where only its count and time could be read.
+            verdict: what became of the message: "used", or why it was not ("duplicate", "conflict" of two with one
+                number, "late", "future", "implausible"); None where only its count and time could be read.
             sequence: the running count as sent.
             time: when the message was measured.
             period: after how many messages the sender counts from 0 again; 0 if it never does.
@@ -132,7 +136,7 @@ class LinkCounts:
         # A second copy of a message says nothing that the first did not.
         if verdict in ("duplicate", "conflict"):
             return
-        # A time that may be wrong says nothing of the order: take that of the newest, so that it means no restart.
+        # A time that may be wrong says nothing of the order: take the newest's time, so that it means no restart.
         if verdict in ("future", "implausible", None):
             time = self.at
         # The first message; or a smaller number at a later time, since the sender was restarted: count from here.

@@ -71,9 +71,15 @@ class PlantParts(NamedTuple):
 def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
     """Return a plant as bytes, which `unpack_plant` reads; it must have no changes that could still be undone.
 
-    The head has its times, counts and newest leap (jump of a clock). The arrays have its rows, one for each time or
-    event whose state is held, and the events in them.
+    A service writes these bytes to its store, so that the plant goes on after a restart. The head has its times, counts
+    of messages and newest leap (gap in time that one clock alone shows). The arrays have its rows, one for each time or
+    event whose state is held because late data may still change it, and the events in them.
+
+    Args:
+        plant: times, message counts and rows of one plant; a row says by `slot` where its state is.
+        fleet: holds the states of all plants' rows in one table, a slot (row of the table) for each.
     """
+    # The head, as JSON: times, counts by node, and a leap if a clock showed one.
     head = {
         "now": plant.now,
         "forced": plant.forced,
@@ -83,7 +89,7 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
         "leap": None if plant.leap is None else _pack_leap(plant.leap),
         BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
     }
-    # First the row from before a leap, where one is held in case that the leap is undone (`kept`); then all others.
+    # First the row from before a leap, where one is held in case the leap is undone (`kept`); then all others.
     rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
     # Whole numbers, one after another: (node, sequence) of each row, and (number of the row, node, sequence) of each
     # event. Their times are no whole numbers, and stand apart; the time of a row is in the table.

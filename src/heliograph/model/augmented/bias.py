@@ -85,15 +85,18 @@ def _make_gauss_markov(
 ) -> LinearPlant:
     """Return the plant of Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2.
 
+    Such a process models a sensor's bias that drifts slowly and stays bounded; the processes are independent.
+
     Args:
         plant: the plant that they drive or are measured with, for the names of its inputs.
-        names: of the processes.
-        deviation: standard deviation of each at all times, or one for all.
-        time: T of each, or one for all.
+        names: names of the processes.
+        deviation: standard deviation of each process at all times, or one for all.
+        time: T, after which a bias is forgotten, of each process or one for all.
         dt: length of a step, or the name of the input that says it.
     """
     count, what = len(names), "deviation of a bias"
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
+    # 1 / T of each.
     rates = [_invert_time_constant(x) for x in _broadcast_to_biases("time of a bias", time, count)]
     # Deviation and 1 / T of each bias, as arrays (biases,).
     sd, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
@@ -148,12 +151,13 @@ class DrivenTransition(Module):
 def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
     """Return the plant of [x; b]: x+ = f(x, u) + E b + w and b+ = F b + B u + xi, linear if f is.
 
-    x and b start independently of each other, and w and xi are independent.
+    b may be a slow disturbance that drives x, which a filter then estimates with x. x and b start independently of each
+    other, and w and xi are independent.
 
     Args:
         plant: the plant of x.
         bias: the plant of b, whose inputs are some of those of x.
-        coupling: E (n, biases).
+        coupling: E (n, biases), how b enters x.
 
     Raises:
         ValueError: a plant of b with another input, a coupling to attitudes.
@@ -181,7 +185,8 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
             raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
         move = DrivenTransition(plant, bias, coupling, places)
         return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
-    inputs_of_bias = np.eye(len(plant.inputs))[list(places)]  # takes those of b out of all inputs
+    # Both are linear: the matrices of [x; b]. `inputs_of_bias` @ u is the inputs of b.
+    inputs_of_bias = np.eye(len(plant.inputs))[list(places)]
     matrix, input_matrix = _make_driven_matrices(plant, bias, coupling, inputs_of_bias)
     return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 

@@ -28,12 +28,14 @@ def describe_non_finite_function(filter: PyTree, before: Estimate, u: Float[np.n
     given = f", u = {u.tolist()}" if len(u) else ""
     with jax.enable_x64(True):
         for x in _yield_trial_states(before):
+            # Each plant that takes such a state: is f(x, u) finite?
             states = [x]
             for plant in (at(part, step) for part in yield_plants(filter)):
                 if _plant_fits(plant, x, u):
                     states.append(np.asarray(plant.transition(jnp.asarray(x), jnp.asarray(u))))
                     if not np.isfinite(states[-1]).all():
                         return f"transition(x, u) returned {states[-1].tolist()} for x = {x.tolist()}{given}"
+            # Sensors at x and at the predicted states, as they measure after the step.
             for sensor in (at(part, step) for part in yield_models_of_class(filter, AbstractSensor)):
                 for state in states:
                     y = _measure(sensor, state)

@@ -272,14 +272,19 @@ def do_inputs_spoil(
 
     Args:
         model: a filter, or anything else that holds plants and sensors with these inputs.
-        names: names of the inputs.
+        names: names of the inputs; TIME_STEP is the name of the one that says the length of the step.
         u: inputs of the step (inputs,).
         k: number of the step.
         precision: type of numbers in which the step is computed, whose rounding is allowed (default: the matrix's).
+
+    Returns:
+        A traced boolean; compiled code cannot raise an error.
     """
+    # One of the inputs may be the length of the step, which has to be a valid duration.
     spoilt = jnp.asarray(False)
     if TIME_STEP in names:
         spoilt = ~jnp.asarray(_is_time_step(u[list(names).index(TIME_STEP)], precision or np.float64))
+    # Plants that depend on exactly these inputs, as they are at step k; then sensors with their own part of u.
     for varying in yield_plants(model):
         plant = at(varying, k)
         if not names or plant.inputs != tuple(names):

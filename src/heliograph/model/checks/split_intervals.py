@@ -45,8 +45,9 @@ def find_indivisible_part(
 def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     """Explain how a plant's prediction over an interval differs from that over its parts; "" if it does not.
 
-    f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
-    test these around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
+    Data at irregular times cut an interval anywhere, and the prediction must not depend on that. With the motion f, its
+    Jacobian A and the noise covariance Q: f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)'
+    + Q(t). These are tested around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
 
     Args:
         plant: the plant, whose time step is an input.
@@ -56,6 +57,7 @@ def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + spread):
+        # f, A and Q over s + t at once, and over s and then t, for every cut (s, t).
         whole = _predict_over_intervals(plant, dt, x, cuts.sum(axis=1, keepdims=True))
         parts = _predict_over_intervals(plant, dt, x, cuts)
         for i, (s, t) in enumerate(CUTS):
@@ -74,6 +76,8 @@ def _predict_over_intervals(
     plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
     """Return the mean, transition matrix and noise covariance after some intervals of time, passed one after another.
+
+    If a span of time gives the same whether it is cut or not, data may add steps in between.
 
     Args:
         plant: the plant.
@@ -94,9 +98,11 @@ def _predict_over_intervals(
         n = len(x)
         mean, matrix, covariance = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in intervals:
+            # The step over one interval: F = df/dx at the mean, with angles kept continuous.
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
             F, predicted = jax.jacfwd(plant.make_motion_about(u, mean))(mean), plant.transition(mean, u)
             mean = plant.manifold.settle(predicted, predicted + plant.noise_mean())
+            # F F_before, and F P F' + Q of the noise so far.
             matrix, covariance = F @ matrix, F @ covariance @ F.T + plant.noise_covariance(u)
         return mean, matrix, covariance
 

@@ -54,13 +54,13 @@ def find_long_silences(
     """Return the silences that are longer than a node's timeout, by node that has some.
 
     A node is silent from the first row, or from a row in which something of it came, to the next such row, or to the
-    last one. Time counts rows, or adds up the input dt.
+    last one. Time counts rows, or adds up the input dt. A report names such silences, since a device may have failed.
 
     Args:
-        timeouts: by node, None of one that may be silent for any time.
-        measurements: by node, (steps, received), NaN where nothing came.
-        inputs: of the plant (steps, inputs).
-        names: of the inputs.
+        timeouts: longest usual silence by node; None for a node that may be silent for any time.
+        measurements: measurements by node (steps, received), NaN where nothing came.
+        inputs: inputs of the plant (steps, inputs).
+        names: names of the inputs; TIME_STEP, "dt", is the length of a step.
     """
     found = dict[str, LongSilences]()
     # Time at each row: the sum of dt, or the row's number.

@@ -42,7 +42,13 @@ def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
 def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
     """Return `count` equal rows, of which only a piece is in memory, mapped again and again; None where that fails.
 
-    It fails where the system has no such mapping, and is not tried where little memory would be saved.
+    A long recording has many equal covariances. The file below lies in memory; the system shows it at every address of
+    the array, and copies a page of it only when the page is written to. It fails where the system has no such mapping,
+    and is not tried where little memory would be saved.
+
+    Args:
+        row: the row, of any shape.
+        count: number of rows.
     """
     map_memory, size = _find_system_call(), row.nbytes * count
     # A piece: whole rows in whole pages, at least PIECE bytes, and so long that at most PIECES of them are mapped.
@@ -57,7 +63,8 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
         return None
     try:
         _fill_file(file, piece, row)
-        # Addresses for all rows, which are given back when the last view of them is gone, and pieces in their place.
+        # Reserve addresses for all rows, given back when the last view of them is gone; then put the piece there again
+        # and again, the last time in part.
         addresses = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
         rows: np.ndarray = np.frombuffer(addresses, row.dtype).reshape(count, *row.shape)
         start, read_and_write = rows.ctypes.data, mmap.PROT_READ | mmap.PROT_WRITE
@@ -69,7 +76,7 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
         return None
     finally:
         os.close(file)
-    _held.add(addresses)
+    _held.add(addresses)  # counted, since a process may have only so many mapped pieces
     return rows
 
 

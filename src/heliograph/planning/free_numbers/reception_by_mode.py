@@ -195,12 +195,15 @@ def compute_node_reception(
 ) -> NodeReception:
     """Return what a node receives at each step: the chain of its channel's observed modes, H, N and sent powers.
 
+    In each mode the node receives z = H x + noise of covariance N, which depends on the state's second moments since
+    gains are random. Planners compute the error of the best linear filter from these.
+
     Args:
-        name: of the node, for messages.
+        name: name of the node, for messages.
         source: its sensor and channel.
         states: E (x, 1)(x, 1)' of the state at each step.
         forever: whether the steps repeat for ever, or begin with the first.
-        young: the scalar b of Young's inequality at each step (time,), or None.
+        young: the scalar b at each step (time,) of Young's inequality, by which uncertain gains are bounded, or None.
 
     Raises:
         ValueError: a channel with memory whose mode is not observed.
@@ -208,6 +211,7 @@ def compute_node_reception(
     # Spans of steps with one sensor and channel each: every step by itself if either varies, else all of them.
     steps, varies = len(states), isinstance(source.sensor, OverTime) or isinstance(source.channel, OverTime)
     spans = [range(k, k + 1) for k in range(steps)] if varies else [range(steps)]
+    # The channel over each span and its modes; then probabilities of the modes at each step, and their transitions.
     channels = [at(source.channel, span[0]) for span in spans]
     modes = [_find_observed_modes(name, channel) for channel in channels]
     law, chain = _find_laws_and_chain(modes, [len(span) for span in spans], forever)

@@ -152,8 +152,7 @@ class PowerTask(NamedTuple):
         """
         problem, limits = self.problem, self.problem.limits
         steps, count = problem.paths.second.shape  # (time, paths)
-        # Limits of a path: the sums of its hops'.
-        peak, mean = np.zeros((steps, count)), np.zeros(count)
+        peak, mean = np.zeros((steps, count)), np.zeros(count)  # limits of a path: the sums of its hops' limits
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
@@ -228,8 +227,7 @@ def make_power_task(
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
     """Return the total power of starts if no total is given: the sum over transmitters of what each may send.
 
-    That is what its limits of peak and mean allow. Without limits it is ten times the largest alpha, where alpha is the
-    power at which half of what arrives is noise, so that more power hardly helps.
+    Its limits are of peak and mean. Without any it is ten times the largest alpha, where half of what arrives is noise.
     """
     largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
     without_limit = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
@@ -239,9 +237,8 @@ def _choose_total(limits: PowerLimits, paths: Paths) -> float:
 def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
     """Return a mask (steps, free) for each start of a search: which free hops send power at which step.
 
-    In the first all hops send. In each other one some whole paths send at each step: every choice of paths and steps if
-    there are at most `starts`, else random choices. A convex problem has one minimum, and needs the first start only.
-    `path`: number of the path of each free hop.
+    In the first all hops send. In each other one some whole paths send at each step: every choice if there are at most
+    `starts`, else random ones. A convex problem needs the first only. `path`: number of the path of each free hop.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):
@@ -292,8 +289,11 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 
 
 def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
-    """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
-    _check_reachable(task, target)
+    """Return the powers (time, free) of the least total that reaches the target error, and the certificate.
+
+    The certificate has a bound of the power that any allocation needs. `task`: paths, limits, free hops, starts.
+    """
+    _check_reachable(task, target)  # the target is possible at all within each transmitter's own limit
     # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.
     limits = task.problem.limits
     unlimited = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))

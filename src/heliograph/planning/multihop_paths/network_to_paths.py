@@ -42,9 +42,12 @@ class HopChain(NamedTuple):
 def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "time hop"]]:
     """Return a network's independent paths, as the best linear filter of all that its nodes receive has them.
 
+    A path is the chain of hops (transmitters that amplify) from one sensor to the receiver. A planner of powers needs
+    the gain and noise of each path, and the second moment of the signal that it carries.
+
     Args:
         network: nodes with linear sensors behind chains of hops.
-        error: over which steps: steady unless it has a period or a horizon.
+        error: over which steps the planner counts the error: steady unless it has a period or a horizon.
 
     Returns:
         The paths, and the power that each transmitter sends at present, shape (time, hop).
@@ -53,6 +56,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         ValueError: a network that is not of independent paths, a plant that is not linear or, without a horizon, not
             stable.
     """
+    # Check that the plant is linear and every node a plain one, of a linear sensor behind hops.
     instance("network", network, Network, "a Network")
     plant, steps = network.plant, instance("error", error, Error, "an Error").steps
     start_plant = require_design_plant(plant)
@@ -225,8 +229,16 @@ class _PathsOfStep(NamedTuple):
 def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _PathsOfStep:
     """Return the paths of all nodes at step k: what each carries, its powers, and its hops.
 
-    `state`: E (x, 1)(x, 1)' of the plant's state at this step.
+    A path carries a number c x + v from a sensor over a chain of hops, each a radio that amplifies what it receives,
+    g sent + m. A planner of powers needs of each path c, s = E y^2 and t = s - Var v, and of each hop
+    kappa = E g^2 / (E g)^2, alpha = Var m / E g^2 and the power that is sent.
+
+    Args:
+        nodes: nodes by name, each a linear sensor and a channel.
+        k: the step.
+        state: E (x, 1)(x, 1)' of the plant's state at this step.
     """
+    # Lists, filled path by path and hop by hop.
     step = _PathsOfStep(rows=[], second=[], signal=[], kappa=[], alpha=[], powers=[], names=[], path=[])
     for name, node in nodes.items():
         if node.informed_by is not None:
@@ -240,7 +252,7 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
         chains = find_hop_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
-        # Each chain is a path that carries chain.row @ (y, 1). Its number is that of its row in the list.
+        # Each chain is a path that carries chain.row @ (y, 1). Paths are numbered by their rows in the list.
         for chain in chains:
             weights = chain.row[:-1]  # of y alone
             step.rows.append(weights @ np.asarray(sensor.matrix))

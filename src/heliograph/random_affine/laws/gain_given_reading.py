@@ -178,8 +178,10 @@ def gain_quadrature(
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
     """Return gains (nodes, 1) and weights (nodes,) by which a mean over a gain is a sum: those of Gauss and Legendre.
 
+    E f(g) is about sum_i weight_i f(gain_i), so that filters can sum over the values of a random gain.
+
     Args:
-        law: of the gain, with a density or of finitely many values.
+        law: law of the gain, with a density or of finitely many values.
 
     Raises:
         ValueError: another law; uncertain probabilities.
@@ -190,13 +192,14 @@ def gain_quadrature(
         weights, values = np.array(law.list_atoms(), dtype=float).T
         return values[:, None], weights
     # E f(g) = int f(g(t)) p(g(t)) g'(t) dt with g = e^t or t^4, which takes nodes to where p changes fast, near 0.
+    # The nodes x in (-1, 1) are moved to t between the ends of the interval that holds nearly all of the law.
     x, w = np.polynomial.legendre.leggauss(GAINS)
     low, high = (float(end) for end in law.bulk())
     with jax.enable_x64(True):
         ends = np.log([low, high]) if law.logarithmic else np.array([low, high]) ** 0.25
         t = ends.mean() + (ends[1] - ends[0]) / 2 * x
         g = np.exp(t) if law.logarithmic else t**4
-        # log(p g'), g' = e^t or 4 t^3, up to a constant that the sum of the weights takes off.
+        # log(p g'), g' = e^t or 4 t^3, up to a constant, which division by the sum of the weights removes.
         log_density = np.asarray(jax.vmap(law.log_density)(jnp.asarray(g))) + (t if law.logarithmic else 3 * np.log(t))
     weights = w * np.exp(log_density - log_density.max())
     return g[:, None], weights / weights.sum()

@@ -125,7 +125,8 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
     if len(values) < 2:
         raise fail("noise samples", "at least two", len(values))
     check_count("order of the noise moments", order)
-    # The moment that is known worst, relative to its largest possible size, and its order.
+    # Over all exponents a = (a_1, ...) with |a| = sum a_i up to `order`: the moment that is known worst, relative to
+    # its largest possible size, and its order.
     absolute = np.abs(values)
     worst, worst_order = 0.0, 1
     for powers in (a for k in range(1, order + 1) for a in list_exponents(values.shape[1], k)):

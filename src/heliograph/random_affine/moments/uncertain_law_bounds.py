@@ -59,11 +59,13 @@ def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
 def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
     """Return the second moment max_v s_v M y y' M' + N_max of z = G y + n, and whether it is above those of all laws v.
 
-    s_v is a number, M the nominal E[G], and N_max the noise covariance of the largest trace. It is above all if each
-    law v has s_v M y y' M' + N_v, to rounding, without a correlation of gain and noise, and if N_max - N_v >= 0.
+    A channel z = G y + n may have any of several laws v of gain and noise, and a filter that is right under each needs
+    one second moment above all. s_v is a number, M the nominal E[G], and N_max the noise covariance of the largest
+    trace. The moment returned is above all if each law v has s_v M y y' M' + N_v, to rounding, without a correlation of
+    gain and noise, and if N_max - N_v >= 0.
 
     Args:
-        tensors: (law, m, m, p + 1, p + 1), maps of (y, 1) (y, 1)' to a second moment of z.
+        tensors: a map of (y, 1) (y, 1)' to a second moment of z for each law (law, m, m, p + 1, p + 1).
         mean: (M, mean offset) (m, p + 1).
     """
     xp = library(tensors, mean)
@@ -75,11 +77,12 @@ def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.n
     gain_size = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
     noise_size = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
     cross_size = xp.sqrt(xp.einsum("iiaa->ia", gain_size))[:, None, :] * noise_size[:, None]
+    # The s_v with the errors of their fit, and N_max; then whether the three conditions hold.
     multiples, residual = _fit_multiples(gains, shape)
     largest, noise_is_largest = _find_largest_noise(noises)
     gains_are_multiples = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)
     is_uncorrelated = xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (cross_size + cross_size.swapaxes(0, 1)))
-    # max_v s_v M y y' M' + N_max, the latter as what multiplies the constant 1.
+    # max_v s_v M y y' M' + N_max as one tensor: N_max multiplies the constant 1 of (y, 1), its last row and column.
     constant = np.zeros((mean.shape[1], mean.shape[1]))
     constant[-1, -1] = 1.0
     widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
@@ -119,12 +122,13 @@ def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:
     """Return bounds of spread, shift and power of a channel, from the interval in which each of its moments lies.
 
-    Let H = (G, n), H0 its nominal mean, m = E[H] and `raw` E[H_ia H_jb] under any possible law. The spread, of H about
-    H0, is raw - H0 m' - m H0' + H0 H0', the shift (m - H0) (m - H0)', and the power `raw` of G alone. A bound has a
-    center, the value at the middle of all intervals, and a radius for each entry.
+    Channels z = G y + n are known up to intervals of their moments, and filters need bounds of second moments under
+    every possible law. Let H = (G, n), H0 its nominal mean, m = E[H] and `raw` E[H_ia H_jb] under any such law. The
+    spread, of H about H0, is raw - H0 m' - m H0' + H0 H0', the shift (m - H0) (m - H0)', and the power `raw` of G
+    alone. A bound has a center, the value at the middle of all intervals, and a radius for each entry.
 
     Args:
-        channel: the channel.
+        channel: the channel, whose `moment_interval(2)` gives both ends of each moment up to the second.
         nominal: its moments up to the second under the nominal law, for their shape.
         mean: H0 (m, p + 1).
     """
@@ -137,7 +141,7 @@ def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, m
     mean_radius = half.mean[:-1]
     spread, _, power = tensors_of_law(middle, mean)
     reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
-    # Radii add up by the triangle inequality.
+    # Radii add up by the triangle inequality: of raw, and of m in the two products with H0.
     spread_radius = (
         raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
     )

@@ -35,9 +35,12 @@ NO_LAW = NoiseLaw(np.ones(1), np.zeros(1), 0.0)  # of which the claimed variance
 def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
     """Return the noise law of each number that a node receives; NO_LAW where it does not arrive as it was measured.
 
+    A noise law (a mixture of Gaussian branches) says how often equal readings follow each other by chance. NO_LAW has
+    the variance 0.
+
     Args:
         network: the network.
-        node: name of the node; of a filter of the centre, the nodes' numbers one after the other.
+        node: name of the node; or Network.FUSED, the centre, for the numbers of all nodes one after the other.
     """
     if node == Network.FUSED:
         return [law for name in network.names for law in list_noise_laws(network, name)]
@@ -45,9 +48,11 @@ def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
     unknown = [NO_LAW] * receiver.received
     if not isinstance(receiver, Node):
         return unknown
+    # Each received number must be an output of the sensor, passed on unchanged; sensors that vary are read at step 0.
     sensor, outputs = first(receiver.sensor), tuple(range(receiver.received))
     if len(sensor.outputs) != receiver.received or not delivers_as_sent(first(receiver.channel), outputs):
         return unknown
+    # Probability, mean and variance of each Gaussian branch (outputs, branches).
     try:
         log_share, mean, variance = (np.asarray(part) for part in sensor.noise.branches())
     except ValueError:  # noise that depends on inputs

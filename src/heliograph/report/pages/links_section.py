@@ -39,9 +39,14 @@ def draw_deliveries(health: Health) -> Figure:
 def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
     """Return the table of links, their figure, what was refused, and what nodes share.
 
-    Of each link: when it is due, what arrived, its longest gap, and mean and deviation of its values. `drawings`: each
-    figure as SVG.
+    The table says of each link (a received number of a node): when it is due, how much arrived, its longest gap, and
+    mean and deviation of its values.
+
+    Args:
+        health: the record of a recording with the diagnosis of its links and filters.
+        drawings: figures as SVG, by name.
     """
+    # The unit of time, and the explanation of "due" if some link is not due in each row.
     unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
     explained = (
         f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "

@@ -98,12 +98,13 @@ def run_figures(health: Health) -> dict[str, Figure]:
     """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links.
 
     Args:
-        health: what `examine` returned.
+        health: what `examine` returned: the record of all filters, and a diagnosis of links and filters.
 
     Raises:
         ValueError: `health` is not what `examine` returns.
     """
     instance("health", health, Health, "what examine returns")
+    # A map for each kind of record (filtered, smoothed) if two states are a position in a plane.
     drawn: dict[str, Figure] = {}
     if find_coordinates(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
@@ -111,6 +112,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
             drawn[_name_position_map(kind)] = draw_position_map(
                 record, node, list(record.estimates[node])[: len(COLOURS)]
             )
+    # Estimates and mode probabilities of the nodes that are chosen; then innovations, predictions and deliveries.
     for kind, record in _collect_estimates(health):
         drawn |= {
             f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_choose_nodes_to_draw(record))

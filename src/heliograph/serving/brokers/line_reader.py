@@ -49,8 +49,9 @@ class LineReader:
 
         Args:
             network: the network.
-            translator: the sources of the network's file; None if it has none.
-            path: the file that is redirected, whose name may be a topic; None of any other pipe.
+            translator: reads messages that other programs make, by the sources (where which value stands) in the
+                network's file; None if it has none.
+            path: the file that standard input is redirected from, whose name may be a topic; None for any other pipe.
             ignore_unknown: whether columns that the network does not know are left out.
         """
         instance("network", network, Network, "a Network")
@@ -59,8 +60,8 @@ class LineReader:
         path = None if path is None else file_path("path", path)
         ignore_unknown = flag("ignore_unknown", ignore_unknown)
         self.source = "standard input" if path is None else str(path)
-        # Readers of what lines may be: messages that others make, and the topic of those that name none; messages in
-        # our own form; a table.
+        # Readers of the kinds of lines: messages that others make, and the topic of such messages that name none;
+        # messages in our own form; a table.
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
         self._own = HeliographMessageReader(network, self.source, ignore_unknown, table=False)
@@ -68,7 +69,7 @@ class LineReader:
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
         self._number = 0  # of the newest line, for errors
-        # Messages of a file are put in order of arrival; those of a pipe go on as they come.
+        # Messages of a file are put in order of arrival; messages of a pipe are passed on as they come.
         self._order = None if path is None else ArrivalOrder(self.source, TIME_STEP not in network.inputs)
 
     def read(self, lines: Sequence[bytes]) -> list[Payload]:

@@ -44,8 +44,7 @@ class Store:
     """Plants and a journal of outputs in SQLite (a path) or PostgreSQL (a URL), for one process or several with names.
 
     If a plant was committed by another process since it was read, nothing is committed. Every row has a checksum;
-    `damaged` are the plants with rows that are not as written. A new name may belong to one of them if its name is
-    damaged.
+    `damaged` are plants with rows that are not as written; a new name may be one of them, if its name is damaged.
 
     Args:
         location: a path, or a URL of PostgreSQL.
@@ -256,14 +255,15 @@ class Store:
         """Commit in one transaction: check the versions, then write plants, journal and counts; return the outputs.
 
         Args:
-            plants: the changed plants, by name, with the versions that they were read with.
-            entries: what goes into the journal.
+            plants: the changed plants as bytes, by name, with the versions that they were read with.
+            entries: outputs (estimates, reports) for the journal, which get numbers in order.
             malformed: how many more messages could not be read.
             published: number of the newest output that was published; None if none was since the last commit.
         """
         with self._engine.begin() as connection:
             # The count locks the store for the other processes, which then see the new versions.
             newest = self._add_to_count(connection, NEWEST, len(entries))
+            # If another process has committed one of the plants since it was read, nothing is committed.
             versions = dict(select_plants(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
             if any(versions.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError

@@ -37,8 +37,9 @@ def name_of_process() -> str:
 def own_store(location: str, process: str) -> Iterator[None]:
     """Own a store for a block, for services of one name; the operating system, or the server, ends it with the process.
 
-    A file has a lock of the operating system in a file beside it, which contains the owner's name; a database of
-    PostgreSQL an advisory lock of a connection, which nothing is written for.
+    A store (the database of all plants' states) has one service of each name; a second one is refused, and told whose
+    it is. A file is locked by the operating system through a file beside it, which contains the owner's name; a
+    database of PostgreSQL by an advisory lock of a connection, for which nothing is written.
 
     Args:
         location: a path, or a URL of PostgreSQL.
@@ -56,6 +57,7 @@ def own_store(location: str, process: str) -> Iterator[None]:
             with _lock_file(str(engine.url.database), process):
                 yield
     except SQLAlchemyError as error:
+        # A server that is away may come back, so that the caller can try again; any other error is final.
         where = engine.url.render_as_string(hide_password=True)
         refused = fail(f"store {where}", "a server that answers", str(getattr(error, "orig", error)))
         raise AwayError(str(refused)) if is_server_away(error) else refused from None

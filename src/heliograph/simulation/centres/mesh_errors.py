@@ -110,14 +110,13 @@ def mesh_errors(
 ) -> MeshErrors:
     """Compute the covariances of all nodes' errors for one pattern of arrivals, whatever the rule.
 
-    J+ = M J M' + F Q F' + sum_l K_l R_l K_l' with the gains of these arrivals, by sparse M: up to 2,000 nodes. All
-    measurements reach their own node.
+    Nodes exchange estimates with neighbours and mix them by M. J+ = M J M' + F Q F' + sum_l K_l R_l K_l' with the gains
+    of these arrivals, by sparse M: up to 2,000 nodes. All measurements reach their own node.
 
     Args:
         network: the network.
         fusion: name of its fusion between neighbours.
-        arrived: what arrives (horizon, node, rounds, degree), such as `mesh_arrivals` draws; or a number of steps at
-            which everything does.
+        arrived: flags (horizon, node, rounds, degree), as `mesh_arrivals` draws them; or a number of lossless steps.
         inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Raises:
@@ -133,6 +132,7 @@ def mesh_errors(
     flags = _read_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
     u = read_plant_inputs(network, inputs, len(flags))
+    # Step by step: J, the true covariances on its diagonal, and those that the nodes state.
     actual, claimed, last_joint = [], [], np.zeros(())
     for joint, covariances, claims in propagate_errors_over_time(mesh, flags, u):
         actual.append(covariances)

@@ -180,18 +180,19 @@ def propagate_joint(
     """Return the joint covariance J+ = M J M' + F Q F' + sum_l W_l S_l W_l' of all nodes' errors after a step.
 
     The errors e_i = x - xhat_i of all nodes, one below the other, become M e + F w - sum_l W_l H_l' R_l^-1 v_l. w is
-    the plant's noise, Cov w = Q; F_i = I - W_i S (`step.gains.correction_map`) is what the correction of node i leaves
-    of an error. v_l is the noise of node l's measurement, Cov v_l = R_l, weighted by W_l at the nodes that receive it;
-    S_l = H_l' R_l^-1 H_l. M mixes the estimates.
+    the plant's noise, Cov w = Q; the correction of node i multiplies an error by F_i = I - W_i S
+    (`step.gains.correction_map`). v_l is the noise of node l's measurement, Cov v_l = R_l, weighted by W_l at the nodes
+    that receive it; S_l = H_l' R_l^-1 H_l. M mixes the estimates.
 
     Args:
         joint: J before the step.
-        step: the plant over it, its gains and its measurements' information.
-        arrived: which messages arrive.
-        senders: of whom each node receives (node, degree).
-        present: where it has a neighbour (node, degree); the other places only pad.
+        step: the plant's motion F and Q, the nodes' gains (`gains.gain` is W), and S_l of the nodes' measurements.
+        arrived: which messages of a node's neighbours arrive.
+        senders: numbers of the neighbours from which each node receives (node, degree).
+        present: True for a neighbour (node, degree); all other places only pad the rows to one length.
     """
     gains, motion, size = step.gains, step.motion, joint.shape[0] * joint.shape[1]
+    # W of the measurements that arrived, else 0.
     weights = measurement_weights(gains.gain, jnp.asarray(arrived))
     # M, W S and W as matrices (N, N), N = nodes n, from their blocks (node, degree, n, n).
     blocks = error_transitions(gains, motion.matrix), weights @ step.data.information[senders], weights

@@ -37,12 +37,14 @@ def find_filter_by_name(network: Network, name: str, node: str | None = None) ->
 
     Args:
         network: the network.
-        name: of its filter or fusion.
-        node: that has it, "fused" for the centre; None by default, which will do unless several have one of that name.
+        name: name of a filter or fusion.
+        node: the node that has it, "fused" for the centre, which receives from all nodes; by default None, which is
+            enough unless several have a filter of that name.
 
     Raises:
         ValueError: no network, no such name or place, a fusion of finished estimates.
     """
+    # {place: {filter: claim}}, from which the places that have a filter of this name are read.
     claims = instance("network", network, Network, "a Network").claims()
     places = [place for place, of_place in claims.items() if text("filter", name) in of_place]
     if not places:
@@ -52,6 +54,7 @@ def find_filter_by_name(network: Network, name: str, node: str | None = None) ->
         raise fail("node", f"one of {places}, which all have a filter {name!r}", "none")
     if node is not None and node not in places:
         raise fail("node", f"one that has a filter {name!r} {places}", repr(node))
+    # One of the three sorts: at the centre, of a node that exchanges with neighbours (a mesh), or of a node by itself.
     place = places[0] if node is None else node
     if place == FUSED:
         return _find_at_centre(network, name)

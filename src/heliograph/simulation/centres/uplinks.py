@@ -195,13 +195,14 @@ class Uplinks(Module):
     ) -> tuple[ReportsInTransit, jax.Array, dict[str, jax.Array]]:
         """Send the reports of step k: return the next state, their values as they arrive, and what the quantizers did.
 
-        A report in which a component saturates its quantizer becomes infinite: no bound of its error is known, and an
-        estimate that is no number shows that.
+        Nodes report the means of their estimates to a centre over uplinks. A quantizer rounds a report to a symbol of
+        few bits; a component beyond its range saturates it. Such a report becomes infinite: no bound of its error is
+        known, and an estimate that is no number shows that.
 
         Args:
-            state: of reports in transit and of quantizers, before the step.
-            means: to be sent (node, n).
-            drawn: gains and offsets of the step.
+            state: reports in transit and states of quantizers, before the step.
+            means: means to be sent (node, n).
+            drawn: the links' random gains G (node, m, n) and offsets b (node, m) of the step.
             k: number of the step.
 
         Returns:

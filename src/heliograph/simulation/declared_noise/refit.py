@@ -198,11 +198,14 @@ def _is_noise(leaf: object) -> bool:
 def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
     """Return the filter with the link's noise scaled, and a bias of each of its outputs where two numbers describe one.
 
+    Messages declare the variance of their own noise, which may be wrong; how a recording fits scaled variances tells by
+    how much. Messages are classed by the variance that they declare, and each class has a scale.
+
     Args:
-        declared: the filter and the recording.
-        logs: logarithms of the scale of each class (classes,). With a bias (classes + 2,): then of its deviation over
-            the root of its memory, in units of the deviation declared, which data tell better than the deviation
-            itself; and of its memory, in the time of the plant.
+        declared: the filter, the link that is judged (`place`), the edges of the classes and the recording.
+        logs: logarithms of the scale of each class (classes,). With a bias (classes + 2,) two more logarithms: of its
+            deviation over the root of its memory, in units of the declared deviation, which data tell better than the
+            deviation itself; and of its memory (the time after which it is forgotten), in the time of the plant.
     """
     filter, numbers, place = declared.filter, jnp.exp(jnp.asarray(logs)), declared.place
 
@@ -216,6 +219,7 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
         scaled = LinkWithScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
         return eqx.tree_at(lambda affine: affine.make, leaf, scaled)
 
+    # The filter's channel may hold several links whose messages tell their law (ToldMap): only one is judged.
     link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, ToldMap))
     plant, sensor = filter.plant, filter.sensor
     # A bias of the outputs that the link carries: one more state of the plant for each.

@@ -185,11 +185,12 @@ def _make_forecast_origin(network: Network, record: Record, state: PyTree, u: np
 
     Args:
         network: the network.
-        record: of all rows.
-        state: of all filters after the last row.
+        record: estimates and times of all rows.
+        state: states of all filters after the last row.
         u: inputs of the plant (steps, inputs).
         spacing: usual time between rows; a plant with the input dt takes the median of that instead.
     """
+    # Estimates by node and filter, only the last of each; then the median step, without the first row, which has none.
     last_estimates = {
         node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in by_filter.items()}
         for node, by_filter in record.estimates.items()
@@ -262,17 +263,18 @@ def _filter_without_implausible_data(
 ) -> PyTree:
     """Return the results of filtering a recording without implausible data, and warn of these.
 
-    If there are any, the recording is filtered first with judgements: at each step a filter leaves out what it finds
-    implausible. The rows that all filters of a node refuse are then taken out, and the rest is filtered again as a
-    recording that never had them, until no new row is refused. Of a row that central filters refuse one node is to
-    blame, and the others' values are judged again without it.
+    Data are implausible if they are too far from a filter's prediction to be right. If there are any, the recording is
+    filtered first with judgements: at each step a filter leaves out the values that it finds implausible. The rows that
+    all filters of a node refuse are then taken out, and the rest is filtered again as a recording that never had them,
+    until no new row is refused. If central filters refuse a row, one node is to blame, and the other nodes' values are
+    judged again without it.
 
     Args:
         network: the network.
-        z: measurements by node (steps, received); what is refused is taken out.
-        left_out: numbers of the reasons why readings do not count, by node (steps, received); those of what is refused
-            are added.
-        task: filters and all else that the recording is filtered with.
+        z: measurements by node (steps, received); refused rows are taken out.
+        left_out: number of the reason why a reading does not count, by node (steps, received), 0 if it does; reasons of
+            refused readings are added.
+        task: all that the recording is filtered with but measurements: filters, a smoother if any, and inputs.
     """
 
     def group_measurements() -> tuple[np.ndarray, ...]:

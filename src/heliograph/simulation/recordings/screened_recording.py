@@ -110,10 +110,14 @@ def _describe_refused(
 def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
     """Return the rows with values that their sender's rule forbids: no further than delta from the last value sent.
 
-    A sender on delta sends if its measurement differs from what it sent last by more than delta, in its norm (region
-    "ball") or in some component, or if a heartbeat is due after so many steps. Rules that compare with a prediction, or
-    send each component by itself (region "each"), are not judged; nor are channels that lose or change what is sent.
-    Forbidden values are used all the same.
+    Such rows show that the network describes the sender wrongly. A sender on delta sends if its measurement differs
+    from the value that it sent last by more than delta, in its norm (region "ball") or in some component, or if a
+    heartbeat is due after so many steps. Rules that compare with a prediction, or send each component by itself (region
+    "each"), are not judged; nor are channels that lose or change what is sent. Forbidden values are used all the same.
+
+    Args:
+        node: a node of the network, with its sender's rule (`trigger`) if it has one.
+        z: the node's measurements, NaN where nothing came.
     """
     trigger = node.trigger if isinstance(node, Node) else None
     if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":

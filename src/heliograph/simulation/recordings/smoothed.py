@@ -54,9 +54,14 @@ class NetworkSmoother(Module):
         """Return a run's results "filtered" and "smoothed", each as a reducer reads a step, and sums of the "nis".
 
         NIS: e' S^-1 e of an innovation e of covariance S, which is about its number of components if a filter is
-        consistent. `outputs` (time, ...): all that the filters' steps put out, with the terms of the backward pass
-        ("smoother_steps", "central_steps").
+        consistent. A reducer turns steps into results, such as statistics. A kind is a stack of filters of one
+        structure, a group a stack of nodes.
+
+        Args:
+            outputs: all that the filters' steps put out (time, ...): measurements and true states, and the terms of
+                the backward pass, by kind ("smoother_steps") and of filters at the centre by name ("central_steps").
         """
+        # Terms of the backward pass, and apart from them the filters' own outputs.
         steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
         # Smoothed estimates of nodes and central filters, then their fusions. Steps of one kind are
@@ -66,7 +71,7 @@ class NetworkSmoother(Module):
         fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
         for fusion in self.fusions:
             fused |= _fuse_at_each_time(fusion, estimates)
-        # Measurements of the same steps: a smoothing may leave out the first steps of a run.
+        # Measurements of the same steps (a smoothing may leave out the first steps of a run); senders have no part.
         length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
             "measurements": tuple(outputs["measurements"][g][-length:] for g in self.groups),
@@ -75,6 +80,7 @@ class NetworkSmoother(Module):
             "uplinks": {},
             "reports": {},
         }
+        # True states of these steps, and smoothed angles turned by full turns to be next to the true ones.
         if "truth" in outputs:
             truth = self.smoothing.select_reference(outputs["truth"])
             smoothed |= {

@@ -109,11 +109,13 @@ def nis(
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
+    # e (steps, m) with angles between -pi and pi; S repeated for each step; e' S^-1 e over the components that arrived.
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
     wrapped = wrap_angles(e, angles_of_outputs(angles, e.shape[-1]))
     covariances = _broadcast_covariance_to_steps(covariance, e)
-    return _compute_normalised_square(wrapped, covariances, size=np.zeros_like(e))  # e is no difference of numbers here
+    # Size 0: e is given, not computed here as a difference of large numbers, so that it has no rounding of these.
+    return _compute_normalised_square(wrapped, covariances, size=np.zeros_like(e))
 
 
 def _broadcast_covariance_to_steps(

@@ -113,9 +113,13 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
         """Return the statistics from a dataset that `to_xarray` made, with all its states.
 
+        They are sums over runs by node and filter: error products, claimed covariances, NEES (e' P^-1 e of an error e
+        with the claimed covariance P) and failures.
+
         Raises:
-            ValueError: no such dataset, or one with a part of the states, of which the NEES is not known.
+            ValueError: another dataset, or one with some of the states only, whose NEES is not known.
         """
+        # The dataset may have been cut: it says in words of which states it was made.
         check_title(dataset, STATISTICS)
         states, count = read_labels(dataset, "state"), read_values(dataset, "runs", [TIME])
         made_of = str(dataset.attrs.get("states", ""))
@@ -123,7 +127,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
             expected = f"all states, {made_of}, since the NEES is of all"
             raise fail("dataset, dimension 'state'", expected, ", ".join(states))
         upper, uplinks = np.triu_indices(len(states)), read_uplinks(dataset, [TIME])
-        # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
+        # Back to nodes and filters by name; symmetric matrices are stored as the pairs i <= j.
         results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in read_labels(dataset, "node")}
         sums = ("errors", "claimed", "nees", "failed", "failed_runs")
         for node, name, claim, values in iterate_filters(dataset, sums, [TIME]):
@@ -176,14 +180,14 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
             ValueError: a node, filter or state that there is not, another number of axes.
             ModuleNotFoundError: without matplotlib (extra "report").
         """
-        # What is drawn, on which axes.
+        # The filters and states that are drawn, over steps 1, 2, ..., on one axes for each state.
         node, filters = choose_filters(self, node, filters)
         places = find_state_places(states, self.states)
         time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
         drawn = make_panels(axes, len(places), time, self.units)
         for panel, i in zip(drawn, places, strict=True):
             for number, name in enumerate(filters):
-                # Solid: actual; dashed: claimed.
+                # Solid: actual; dashed: claimed, the root of the variance that the filter states.
                 score, colour = self[node][name], choose_colour(number)
                 claimed = score.claimed()[:, i, i]
                 panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=quote_for_figure(name))

@@ -231,9 +231,14 @@ def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> Erro
 def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[_FilterSums]]:
     """Return the number of runs in each batch, and the sums of each kind and then of each fused estimate, as views.
 
-    A kind is a stack of filters of one structure. `kinds`: numbers of filters and of nodes of each kind. Along their
-    axis `part` the sums have filters times nodes estimates for each kind, kinds in the order `carry.order`, in which
-    fused estimates follow the kinds; those whose covariance differs between runs (`carry.by_run` of them) come first.
+    A kind is a stack of filters of one structure. All estimates lie along one axis `part` of the sums, which is cut
+    here: filters times nodes for each kind, one for a fused estimate, in the order `carry.order`.
+
+    Args:
+        carry: sums over the runs of error products, normalised errors, covariances and failures, axes (time, part, ...,
+            batch). `order` has the numbers of kinds (0, 1, ...) and of fused estimates, which follow the kinds; the
+            first `by_run` in this order have covariances that differ between runs.
+        kinds: numbers of filters and of nodes of each kind.
     """
     # Axes (batch, time, part, ...); failures have their two sorts in place of batches.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed

@@ -122,7 +122,7 @@ def draw_modes(
     """Draw the probabilities of the modes of a node's filters: a colour for each filter, a style for each mode.
 
     Args:
-        estimates: by node and filter.
+        estimates: by node and filter; if a filter weighs modes, they have probabilities `modes` (..., time, mode).
         node: name of the node; None: the first with a filter that weighs modes.
         filters: names of its filters; None: all that weigh modes.
         axes: to draw on; None: new ones.
@@ -138,6 +138,7 @@ def draw_modes(
         for name, by_filter in estimates.items()
     }
     node, chosen = choose_filters(weighing, node, filters)
+    # A panel over time, and in it a line for each mode of each filter.
     time, units = clock
     (panel,) = make_panels(None if axes is None else [axes], 1, time, units)
     line_styles = "-", "--", ":", "-."

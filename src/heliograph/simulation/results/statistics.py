@@ -203,11 +203,12 @@ def expand_pairs(pairs: np.ndarray) -> np.ndarray:
 def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     """Pool the statistics of several nodes, their steps joined: means run over nodes as over steps.
 
-    Runs stay the unit of independence, so errors that nodes share are counted as shared. `statistics` are those of the
-    nodes, of the same runs.
+    Means and rates then have standard errors over runs: runs stay the unit of independence, so that errors that nodes
+    share are not counted as independent ones.
 
     Args:
-        statistics: those of the nodes, of the same runs.
+        statistics: one for each node, of the same runs: sums by batch of runs and step (batch, steps, ...) of error
+            products, claimed covariances and NEES (e' P^-1 e of an error e with the claimed covariance P).
 
     Raises:
         ValueError: nothing to pool, or statistics of different runs.
@@ -215,7 +216,7 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     nodes = items("pooled statistics", statistics, "ErrorStatistics")
     for of_node in nodes:
         instance("pooled statistics", of_node, ErrorStatistics, "ErrorStatistics")
-    # Steps one after another; the weakest claim.
+    # Statistics of the same runs have equal counts of runs in each batch. Join the steps; the weakest claim holds.
     if not nodes or any(not np.array_equal(s.count, nodes[0].count) for s in nodes):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(nodes)} that differ")
     return ErrorStatistics(

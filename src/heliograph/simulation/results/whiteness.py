@@ -107,12 +107,14 @@ def memory_test(
 ) -> MemoryTest:
     """Return a test of data for memory of the links that a filter ignores.
 
-    The best linear filter's innovations w_k are uncorrelated in time, but they need not be independent, since bursts
-    come and go with the modes. Standard errors therefore allow for correlated products w_k w_(k+t) (Newey and West).
+    A link with memory loses data in bursts, or has a gain that depends on its last one. If a filter ignores that, its
+    innovations, scaled to unit variance (w_k), are correlated in time. The best linear filter's innovations are
+    uncorrelated, but need not be independent, so that standard errors allow for correlated products w_k w_(k+t) (Newey
+    and West).
 
     Args:
         data: measurements of the filter (steps, received), or innovations if there is no filter; NaN where missing.
-        filter: a filter that claims a covariance; None by default.
+        filter: a filter that states a covariance of its innovations; None by default.
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
         lags: number of lags; 10 by default.
 
@@ -122,6 +124,7 @@ def memory_test(
 
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
+    # Innovations by the factor of their stated covariance; data without a filter by their own mean power.
     check_count("lags", lags)
     whitened = _scale_to_unit_power(data) if filter is None else whitened_innovations(data, filter, inputs)
     return MemoryTest.of(whitened, lags, claimed=filter is not None)

@@ -47,11 +47,11 @@ def compile_runs(
     """Return the native code of a network's runs, each of them reduced step by step as the reducer says.
 
     Args:
-        world: the network to be simulated, as a step.
-        inputs: of the plant (horizon, inputs).
-        key: of all runs.
-        reducer: says what is collected of each run.
-        runs: how many will follow.
+        world: one step of plant, channels and filters of the network to be simulated.
+        inputs: inputs of the plant (horizon, inputs).
+        key: random key of all runs.
+        reducer: says what is collected of each run: sums over runs, or series.
+        runs: about how many runs will follow.
         later: smooths each run; then its results are those of `reduce_run`: of filtered estimates, of smoothed ones,
             and sums of the NIS. None: nothing is smoothed.
         precision: in which runs are computed.
@@ -314,10 +314,10 @@ def simulate_natively(
         network: the network.
         inputs: of the plant (horizon, inputs).
         key: of all runs.
-        reducer: says what is collected of the runs.
+        reducer: says which statistics or series are collected from the runs.
         first_run: number of the first run, which seeds its draws.
-        runs: how many.
-        chunk: how many between two reports of progress.
+        runs: number of runs.
+        chunk: number of runs between two reports of progress.
         progress: is called with how many runs are done, and of how many.
         smoothing: the part of the network that is smoothed; None if nothing is.
         precision: in which runs are computed.
@@ -347,9 +347,9 @@ def _simulate_in_parts(
 ) -> Result | None:
     """Simulate a network of many independent nodes, a few at a time, by one program with other numbers for each few.
 
-    The result is the same: draws depend on names, and these nodes share nothing but the plant, which is simulated
-    again. `span`: number of the first run, how many there are, and how many between two reports of progress. The result
-    is None if native code does not support the network or the reducer.
+    The result is as of all at once: draws depend on names, and the nodes share only the plant, which is simulated
+    again. `span`: number of the first run, number of runs, and of runs between two reports of progress. `reducer`: says
+    what is collected from runs, and joins the parts. None if native code does not support the network or the reducer.
     """
     first_run, runs, chunk = span
     parts, memory = count_parts(network), list[list[np.ndarray]]()

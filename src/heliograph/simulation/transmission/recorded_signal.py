@@ -26,13 +26,14 @@ SENDER = checksum("transmit")
 def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0) -> Float[np.ndarray, "steps outputs"]:
     """Transmit a recorded signal y through a channel, z_k = G_k y_k + n_k, with new draws of G_k and n_k at each step.
 
-    Draws are independent unless the channel has memory. NaN in the signal was not sent: outputs to which G_k carries it
-    are NaN. Outputs that the channel loses are NaN too.
+    Measured data can so be tried behind a radio link before it exists. Draws are independent unless the channel has
+    memory. NaN in the signal was not sent: outputs to which G_k carries it are NaN. Outputs that the channel loses are
+    NaN too.
 
     Args:
         signal: (steps, inputs), or (steps,) for a channel with one input; a table of pandas or polars too.
-        channel: the channel.
-        seed: of the draws; 0 by default.
+        channel: the law of G_k and n_k; it may vary over time, or have modes that follow a Markov chain.
+        seed: seed of the draws; 0 by default.
 
     Returns:
         The received signal (steps, outputs).
@@ -47,6 +48,7 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     y = array("signal", signal, shape, missing=True).reshape(-1, inputs)
     if not len(y):
         raise fail("signal", "at least one step", "none")
+    # A channel that varies over time may cover fewer steps than the signal. Then draw all steps, natively or by XLA.
     check_horizon(len(y), steps_covered(channel))
     arguments = channel, y, np.asarray(check_seed("seed", seed))
     return np.asarray(compute_once(_transmit_all, _by_xla, arguments))

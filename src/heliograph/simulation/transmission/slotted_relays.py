@@ -58,11 +58,14 @@ class SlottedRelays(AbstractMedium):
     ) -> tuple[RelayStates, Measurements]:
         """Send over the hops of this step's slot, and sum at each listener what arrives over its hops.
 
+        Relays estimate the plant's state and send their estimates on. A schedule of slots, used in turn, says who sends
+        to whom; a hop is a random link from one sender to one listener.
+
         Args:
             state: the relays' estimates of the step before, and the states of hops with memory.
             x: the plant's state after the step.
             u: inputs of the plant over the step.
-            key: of the run.
+            key: random key of the run.
             k: number of the step.
 
         Returns:
