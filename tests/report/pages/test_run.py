@@ -141,7 +141,7 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
     assert ("size" in summary["filters"]["n"]["f"]) == (rows == 120)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis").touch()
-    assert cli.main([*arguments[:-1], "mine"]) == 2 and "other files" in capsys.readouterr().err
+    assert cli.main([*arguments[:-1], "mine"]) == 2 and "got thesis, which would be lost" in capsys.readouterr().err
     assert cli.main(arguments[:-2]) == 2 and "(--out FILE) or a folder for a report" in capsys.readouterr().err
 
 

@@ -283,6 +283,6 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     folder = tmp_path / "cubature-fusion"
     folder.mkdir()
     (folder / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match="to replace, got other files"):
+    with pytest.raises(ValueError, match=r"as they were written, got thesis\.txt, which would be lost"):
         cubature_fusion.run(cubature_fusion.Setting(runs=64), tmp_path)
     assert (folder / "thesis.txt").read_text() == "mine"

@@ -253,7 +253,7 @@ def test_failure_leaves_nothing(outcome: Outcome, tmp_path: Path) -> None:
 def test_other_peoples_files_are_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match=r"demo: expected .*, got other files"):
+    with pytest.raises(ValueError, match=r"demo: expected .*, got thesis.txt, which would be lost"):
         demo.run(demo.Setting(), tmp_path)
     assert (tmp_path / "demo" / "thesis.txt").read_text() == "mine"
 

@@ -168,5 +168,5 @@ def test_a_folder_with_other_files_and_too_few_runs_are_refused(tmp_path):
         quadratic_bias.Setting(runs=99)
     (tmp_path / "quadratic-bias").mkdir()
     (tmp_path / "quadratic-bias" / "thesis.tex").write_text("")
-    with pytest.raises(ValueError, match="other files"):
+    with pytest.raises(ValueError, match=r"got thesis\.tex, which would be lost"):
         quadratic_bias.run(quadratic_bias.Setting(runs=100), tmp_path)

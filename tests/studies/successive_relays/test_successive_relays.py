@@ -148,7 +148,7 @@ def test_bad_calls_are_refused(tmp_path):
         successive_relays.Setting(runs=10)
     (tmp_path / "successive-relays").mkdir()
     (tmp_path / "successive-relays" / "mine.txt").write_text("keep")
-    with pytest.raises(ValueError, match="to replace"):
+    with pytest.raises(ValueError, match=r"got mine\.txt, which would be lost"):
         successive_relays.run(successive_relays.Setting(runs=100), tmp_path)
 
 

@@ -1,5 +1,6 @@
 """Filters with side information on the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -92,6 +93,15 @@ class SideInformationFilter(AbstractSizedFilter):
         moments = WeightedColumns(jnp.stack([jnp.concatenate([e, x]) for e in errors]), weights)
         factors, mean = jax.vmap(triangularise)(moments), jnp.kron(law, mean_x[:, 0])
         return make_belief(mean, factors, centre=jnp.asarray(start.initial_mean), moved=jnp.asarray(False))
+
+    def trace_log_likelihood(self, plain: Callable[..., jax.Array], z: Array, u: Array) -> jax.Array:
+        """Return the log-likelihood of rows inside a trace, plain(self, z, u), which JAX differentiates.
+
+        Of one mode, one state and one number, no combination of rows can be known to rounding: the filter's own steps
+        have right derivatives, also where variances are zero. Else those are NaN where they cannot be had.
+        """
+        is_scalar = len(self.initial) == len(self.states) == self.received == 1
+        return plain(self, z, u) if is_scalar else super().trace_log_likelihood(plain, z, u)
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
