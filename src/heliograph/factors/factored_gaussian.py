@@ -68,7 +68,7 @@ class Gaussian(NamedTuple):
         root, variances = (xp.asarray(factor) for factor in (self.root, self.variances))
         product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
         upper = np.triu(np.ones(product.shape[-2:], bool))
-        choose = np.where if xp is np else where
+        choose: Any = np.where if xp is np else where  # of known numbers, and of traced ones
         return choose(upper, product, xp.swapaxes(product, -1, -2))
 
 
