@@ -44,11 +44,11 @@ class Parts(NamedTuple):
 def find_odd_and_even_parts(function: Function, x: Gaussian, scale: Array | float) -> Parts:
     """Return f at the mean, and its odd and even parts at m +- sqrt(scale d_j) L_j."""
     mean, variances = x.mean, x.variances
-    steps = square_root(scale * variances)
+    steps, here = square_root(scale * variances), function(mean)
 
-    def of_column(column: jax.Array, step: jax.Array, variance: jax.Array) -> Parts:
-        """Return the parts in one column L_j, by values at two points, or by derivatives."""
-        here, slope_here = jax.jvp(function, (mean,), (column,))
+    def of_column(column: jax.Array, step: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return slopes, even part and `linear` in one column L_j, by values at two points, or by derivatives."""
+        _, slope_here = jax.jvp(function, (mean,), (column,))
         at = [differentiate_twice(function, mean + sign * NODE * step * column, column) for sign in (1, -1)]
         (slope_ahead, bend_ahead), (slope_behind, bend_behind) = at
         bend = jnp.maximum(jnp.abs(bend_ahead), jnp.abs(bend_behind))
@@ -60,11 +60,9 @@ def find_odd_and_even_parts(function: Function, x: Gaussian, scale: Array | floa
         slopes = jnp.where(linear, slope_ahead + slope_behind - slope_here, (ahead - behind) / (2 * safe_step))
         even_by_values = (ahead - here) + (behind - here)
         even = jnp.where(linear, scale * variance / 2 * (bend_ahead + bend_behind), even_by_values)
-        return Parts(here, slopes, even, linear)
+        return slopes, even, linear
 
-    axes: Any = Parts(here=None, slopes=1, even=1, linear=1)  # type: ignore[arg-type]
-    parts: Parts = jax.vmap(of_column, in_axes=(1, 0, 0), out_axes=axes)(jnp.asarray(x.root), steps, variances)
-    return parts
+    return Parts(here, *jax.vmap(of_column, in_axes=(1, 0, 0), out_axes=1)(jnp.asarray(x.root), steps, variances))
 
 
 def differentiate_twice(function: Function, at: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
