@@ -1,12 +1,25 @@
 """Memory of numbers that all runs share, between the function that computes them and the one that uses them."""
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from straightline.llvm.operations import LLVM, vector_type
-from straightline.nodes import Node
+from straightline.nodes import Block, Node
 
-if TYPE_CHECKING:  # it imports this file
-    from straightline.llvm.function_writer import FunctionWriter
+
+class InstructionWriter(Protocol):
+    """What appends LLVM instructions to the function that is being written."""
+
+    def add(self, text: str) -> str:
+        """Append an operation in LLVM's text; return the new name of its result."""
+
+    def line(self, text: str) -> None:
+        """Append a line without a result."""
+
+    def write_address_in_iteration(self, start: str, block: Block, size: int) -> str:
+        """Write the address of a number of `size` bytes in the current iteration of the loops around its block.
+
+        `start` is the name of the address in the first iteration.
+        """
 
 
 class SharedSlots:
@@ -28,14 +41,14 @@ class SharedSlots:
             self.size += 8 * node.block.count_turns()
         return self.places[node]
 
-    def load(self, writer: "FunctionWriter", node: Node) -> str:
+    def load(self, writer: InstructionWriter, node: Node) -> str:
         """Write the load of a shared number, and return the name of the scalar; a flag is stored as a byte."""
         address = self._write_address(writer, node)
         if node.type == "bool":
             return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
         return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
 
-    def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
+    def store(self, writer: InstructionWriter, node: Node, name: str) -> None:
         """Write the store of a shared number, whose LLVM name is `name`, to its slot; a boolean is stored as a byte.
 
         The block function, which computes what differs between runs, loads it from there.
@@ -46,7 +59,7 @@ class SharedSlots:
             name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
         writer.line(f"store {kind} {name}, ptr {address}, align 1")
 
-    def _write_address(self, writer: "FunctionWriter", node: Node) -> str:
+    def _write_address(self, writer: InstructionWriter, node: Node) -> str:
         """Write the address of a number's slot of 8 bytes in the current iteration of its loops; return its name."""
         start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
         return writer.write_address_in_iteration(start, node.block, size=8)
