@@ -56,6 +56,7 @@ BORDERS = [
     "filters/wrappers",
     "fusion/mesh",
     "simulation/centres",
+    "simulation/mesh",
     "planning/multihop_paths",
     "simulation/runs",
     "files/bags",

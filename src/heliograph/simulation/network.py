@@ -27,7 +27,6 @@ from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
 from heliograph.random_affine.memories_of_channels import memories
-from heliograph.simulation.centres.mesh_check import check_mesh
 from heliograph.simulation.covariance_claims import (
     MistakenBelief,
     find_claims,
@@ -41,6 +40,7 @@ from heliograph.simulation.covariance_claims import (
 )
 from heliograph.simulation.description.diagram import write_diagram, write_html_table, write_short_diagram
 from heliograph.simulation.filter_flag_check import check_filter_flags
+from heliograph.simulation.mesh.check import check_mesh
 from heliograph.simulation.network_index import (
     AlikeFilters,
     EstimatePlace,

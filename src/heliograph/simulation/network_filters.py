@@ -32,8 +32,8 @@ from heliograph.simulation.centres.fusions import (
     list_stacked_fusions,
 )
 from heliograph.simulation.centres.linearised_centre import LinearisedCentre, LinearisedFusionState
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_building import build_meshes
+from heliograph.simulation.mesh.building import build_meshes
+from heliograph.simulation.mesh.mesh import Mesh
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_index import find_measurement_order
 from heliograph.simulation.runs.stacked_filters import (

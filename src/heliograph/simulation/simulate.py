@@ -20,7 +20,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.memories_of_channels import number_unnamed_memories
 from heliograph.simulation.arguments import Precision, check_precision, make_run_key, read_plant_inputs
-from heliograph.simulation.centres.mesh_building import build_meshes
+from heliograph.simulation.mesh.building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node

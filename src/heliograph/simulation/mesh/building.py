@@ -7,10 +7,10 @@ import numpy as np
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_state_and_step import NodeBucket
-from heliograph.simulation.centres.neighbour_edges import build_edges
 from heliograph.simulation.centres.observation_model import ObservationModel, SeparateObservations, stack_nodes
+from heliograph.simulation.mesh.mesh import Mesh
+from heliograph.simulation.mesh.neighbour_edges import build_edges
+from heliograph.simulation.mesh.state_and_step import NodeBucket
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
