@@ -47,6 +47,7 @@ BORDERS = [
     "disk",
     "factors",
     "random_affine/moments",
+    "random_affine/noises",
     "learning/likelihood",
     "live/stored",
     "filters/event",

@@ -30,7 +30,7 @@ from heliograph.random_affine.moments.monomials import (
     position,
 )
 from heliograph.random_affine.moments.pushed_moments import products_of_monomials, push_moments, push_through_known_map
-from heliograph.random_affine.noise import Gaussian, noise_moment_vector
+from heliograph.random_affine.noises.noise import Gaussian, noise_moment_vector
 
 EPS = float(np.finfo(np.float64).eps)
 

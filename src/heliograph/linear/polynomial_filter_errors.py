@@ -35,7 +35,7 @@ from heliograph.random_affine.moments.pushed_moments import (
     push_moments,
     push_through_known_map,
 )
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.series_and_stack import Series, Stack
 
 

@@ -38,7 +38,7 @@ from heliograph.random_affine.laws.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.memories_of_channels import separate_memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
+from heliograph.random_affine.noises.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.series_and_stack import Stack
 from heliograph.random_affine.sum_of_maps import Superposed
 

@@ -20,7 +20,7 @@ from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
-from heliograph.random_affine.noise import (
+from heliograph.random_affine.noises.noise import (
     AbstractNoise,
     Matrix,
     NoiseLike,

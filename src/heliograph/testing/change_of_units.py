@@ -36,8 +36,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.monomials import list_exponents
 from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.shaped_noise import Shaped
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.shaped_noise import Shaped
 
 Modes = TypeVar("Modes", ChannelByPattern, ChannelByMode)  # a channel at one step, mode by mode
 

@@ -23,7 +23,7 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
 
 
 def event_filter(

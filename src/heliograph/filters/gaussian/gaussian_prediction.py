@@ -41,7 +41,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal
 from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 MEAN_STEPS = 4  # to the mean of attitudes: of a deviation of 0.3 rad some 1e-9 are left
 

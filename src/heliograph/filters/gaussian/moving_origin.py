@@ -22,7 +22,7 @@ from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.compensated_arithmetic import Compensated, compensate, split_sum
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 
 class PlantAboutCenter(AbstractPlant):

@@ -44,7 +44,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memories_of_channels import is_memory_dependent
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 from heliograph.random_affine.words.rounding_noise import find_rounded_noises
 
 if TYPE_CHECKING:  # what few calls need is loaded by them

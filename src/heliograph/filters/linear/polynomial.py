@@ -32,7 +32,7 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import check_forgets, check_maps
 from heliograph.random_affine.moments.monomials import count_monomials, evaluate_monomials, position
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 
 
 class CentredState(NamedTuple):

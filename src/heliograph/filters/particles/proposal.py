@@ -16,7 +16,7 @@ from heliograph.filters.particles.resampling import draw_uniforms
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angles.angle import Angles, wrap_near
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 PRIOR_SHARE = 0.1  # of the proposal: weights are then bounded, where h saturates too
 

@@ -29,8 +29,8 @@ from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.noise import AbstractNoise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 from heliograph.random_affine.series_and_stack import Series
 
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"

@@ -39,7 +39,6 @@ from .monomials import position as position
 from .monomials import product_table as product_table
 from .monomials import refuse_if_too_large as refuse_if_too_large
 from .monomials import symmetric_power as symmetric_power
-from .noise_from_moments import about_mean as about_mean
 from .pushed_moments import TabulatedNoise as TabulatedNoise
 from .pushed_moments import products_of_monomials as products_of_monomials
 from .pushed_moments import push_moments as push_moments

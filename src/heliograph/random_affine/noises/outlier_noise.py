@@ -16,7 +16,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers
 from heliograph.random_affine.moments.monomials import Exponents
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
 
 PRECISIONS = 10.0 ** (-5 + 5.7 * np.arange(25) / 24)
 """Precisions, in units of the scale's, at which Student's law is read as a mixture of Gaussian ones."""
