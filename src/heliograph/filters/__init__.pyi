@@ -71,7 +71,7 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
-from .run_over_data import (
+from .rows.run_over_data import (
     Filtered as Filtered,
 )
 from .linear.scheduled_gains import (

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.forecasting.forecast_result import Array, Forecast
 from heliograph.forecasting.one_step_predictions import predict_rows
 from heliograph.model.plant import LinearPlant
