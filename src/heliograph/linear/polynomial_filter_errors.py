@@ -6,15 +6,9 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from heliograph.linear.lifted_map import make_linear_rows, mean_and_spread, split_homogeneous
 from heliograph.linear.lmmse_recursion import lmmse
-from heliograph.linear.monomial_lifted_system import (
-    initial_monomial_moments,
-    lifted_system,
-    make_linear_rows,
-    mean_and_spread,
-    refuse_lift,
-    split_homogeneous,
-)
+from heliograph.linear.monomial_lifted_system import initial_monomial_moments, lifted_system, refuse_lift
 from heliograph.linear.plant_and_measurement_maps import check_model, make_plant_and_measurement_maps
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
 from heliograph.model.channel import Channel

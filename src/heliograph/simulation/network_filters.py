@@ -17,12 +17,9 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.centre_filter import CentreFilter
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
-from heliograph.simulation.centres.fusion_centre import (
-    CentreFilter,
-    CentreState,
-    FusionCentre,
-)
+from heliograph.simulation.centres.fusion_centre import CentreState, FusionCentre
 from heliograph.simulation.centres.fusions import (
     ReportFusion,
     StackedFusions,

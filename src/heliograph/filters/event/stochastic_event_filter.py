@@ -20,8 +20,8 @@ from heliograph.filters.gaussian.gaussian_prediction import (
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import Signal, factor_spread, find_signal_moments
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag
+from heliograph.filters.modes.correction_by_mode import correct_in_every_mode
 from heliograph.filters.modes.mixing import replicate
-from heliograph.filters.modes.multiple_model import correct_in_every_mode
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.estimate import Estimate, Innovation

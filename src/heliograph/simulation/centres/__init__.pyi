@@ -1,9 +1,9 @@
 """Names that other folders take; the package loads them when first used."""
 
+from .centre_filter import CentreFilter as CentreFilter
 from .fused_innovation import FusedInnovation as FusedInnovation
 from .fused_innovation import following_prior as following_prior
 from .fused_innovation import make_fused_innovations as make_fused_innovations
-from .fusion_centre import CentreFilter as CentreFilter
 from .fusion_centre import CentreState as CentreState
 from .fusion_centre import FusionCentre as FusionCentre
 from .fusion_centre import find_claim_of_informed_fusion as find_claim_of_informed_fusion

@@ -19,10 +19,9 @@ from heliograph.model.over_time import at, first, stack, structure_key
 from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
+from heliograph.simulation.centres.centre_filter import CentreFilter, NodeFiltersWithoutData
 from heliograph.simulation.centres.fusion_centre import (
-    CentreFilter,
     FusionCentre,
-    NodeFiltersWithoutData,
     find_claim_of_report_fusion,
     has_data_dependent_gains,
 )
