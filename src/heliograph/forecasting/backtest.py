@@ -200,7 +200,7 @@ def _call_refit(refit: Refit, rows: int, network: Network) -> Network:
         ValueError: no network, or one with other nodes and filters.
     """
     fitted = instance(f"refit from {rows} rows", refit(rows), Network, "a Network")
-    if (fitted.names, set(fitted.places)) != (network.names, set(network.places)):
+    if (fitted.names, set(fitted.estimate_indices)) != (network.names, set(network.estimate_indices)):
         raise fail(f"refit from {rows} rows", f"the nodes and filters of {list(network.names)}", list(fitted.names))
     return fitted
 
@@ -217,7 +217,7 @@ def _find_start_of_forecasts(network: Network, record: Record, *data: Any) -> Or
 def list_single_filters(network: Network) -> set[tuple[str, str]]:
     """Return (node, filter) of the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
-    return set(network.places) | central
+    return set(network.estimate_indices) | central
 
 
 def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:

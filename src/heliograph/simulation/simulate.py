@@ -124,7 +124,7 @@ def monte_carlo(
         if by_native_code is not None:
             return _return_with_warnings(by_native_code, network)
     # Otherwise XLA: the world, with gains computed beforehand where they depend on no data, and what is collected.
-    filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
+    filters = AllFilters(network, None if smoothing is None else smoothing.stacks)
     planned = precompute_filters(filters, u) if can_precompute(filters) else filters
     job = _SimulationJob(
         world=World(number_unnamed_memories(network.plant), make_reception(network), planned),

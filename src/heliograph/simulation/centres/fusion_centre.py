@@ -50,7 +50,7 @@ class FusionCentre(Module):
         observation_model: of the nodes' measurements.
         rules: by name of the fusion.
         order: brings what is gathered from the sources into the order of the nodes.
-        sources: (kind, number within the kind) of the stacked filters, one group of nodes after another.
+        sources: (stack, number within the stack) of the stacked filters, one group of nodes after another.
         size: length of the longest measurement, to which others are padded.
         claim: of the fused estimates.
     """
