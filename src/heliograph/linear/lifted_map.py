@@ -72,7 +72,7 @@ class LiftedMap:
         return covariance[:-1, :-1], rounding[:-1]
 
 
-def mean_and_spread(
+def mean_and_covariance(
     second: Float[Array, "N N"],
 ) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
     """Return the mean and covariance of y, given the second moments of (y, 1).

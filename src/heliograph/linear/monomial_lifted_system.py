@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.lifted_map import EPS, LiftedMap, make_linear_rows, mean_and_spread, split_homogeneous
+from heliograph.linear.lifted_map import EPS, LiftedMap, make_linear_rows, mean_and_covariance, split_homogeneous
 from heliograph.linear.plant_and_measurement_maps import (
     PlantAndMeasurementMaps,
     check_model,
@@ -156,8 +156,8 @@ def _average_noise(
 
     `law` holds the modes' probabilities p_j, `lifts` each mode's map to monomials Z of z, `moments` those of y.
     """
-    spreads, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
-    return np.tensordot(law, spreads, axes=1), np.abs(law) @ np.array(losses)
+    covariances, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
+    return np.tensordot(law, covariances, axes=1), np.abs(law) @ np.array(losses)
 
 
 def _keep_if_unchanged(
@@ -203,13 +203,13 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         return with_premise(_lift_chain(routes, degree, moments, (n, m)), premise)
     # Start of the lifted state: E Y_0 and Cov Y_0.
     second = products_of_monomials(moments, n + 1, degree)
-    mean, spread = mean_and_spread(second)
+    mean, covariance = mean_and_covariance(second)
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
     steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
     system = LinearSystem(
         steps,
         mean=mean,
-        covariance=spread,
+        covariance=covariance,
         projection=make_linear_rows(n, degree),
         rounding=process_rounding,
         received_rounding=received_rounding,

@@ -108,7 +108,7 @@ def make_receiver_view(
     """Return the linear system of zeta = (x, e_1 ... e_relays), x the state and e_r relay r's error, over one step.
 
     Args:
-        step: the network in this step: x+ = A x + w, the sensor's noise v, mean and spread of the links' random gains.
+        step: the network in this step: x+ = A x + w, the sensor's noise v, moments of the links' random gains.
         moments: covariance of (x, e_1 ... e_F) of all filters before the step, the receiver last; it decides how much
             noise random gains add.
         gain: K of all filters as one block matrix (filters n, R), over all R numbers that they receive.
@@ -129,7 +129,7 @@ def make_receiver_view(
     # White noise: of plant and sensor, and what random gains make of the signals sent.
     noise = jax.scipy.linalg.block_diag(step.process, step.sensor_noise)
     _, sent = step_moments(step, moments)
-    of_random_gains = propagate_by_mode(correct[:, zeta:], contract(step.spread, sent.second), 0.0)
+    of_random_gains = propagate_by_mode(correct[:, zeta:], contract(step.covariance, sent.second), 0.0)
     white = propagate_by_mode(corrected[:, d:], noise, of_random_gains)
     return ReceiverViewOfRelays(transition=corrected[:zeta, :zeta], output=corrected[zeta:, :zeta], noise=white)
 

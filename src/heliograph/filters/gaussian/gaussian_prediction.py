@@ -245,13 +245,13 @@ def open_loop_filter(
     Source: the prediction step of any of the filters, alone.
     """
     start = read_first_plant(plant)
-    mean, spread, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
+    mean, covariance, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
     claim = lower_claim_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),
         initial_mean=mean,
-        initial_covariance=spread,
+        initial_covariance=covariance,
         **make_sizes(claim, start, 0),
     )

@@ -127,8 +127,8 @@ class LinearFilter(AbstractSizedFilter):
     @property
     def has_known_gain(self) -> bool:
         """True if no gain is random: then no covariance needs E[x x'] before data. A traced gain counts as random."""
-        spread = stack_over_time(self.channel).gain_spread
-        return not (is_traced(spread) or np.any(np.asarray(spread)))
+        gain_covariance = stack_over_time(self.channel).gain_covariance
+        return not (is_traced(gain_covariance) or np.any(np.asarray(gain_covariance)))
 
     def score_rows(
         self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array

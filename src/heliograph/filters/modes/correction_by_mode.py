@@ -43,7 +43,7 @@ def correct_in_every_mode(
     """
     # Channel moments by mode, given which components arrived.
     pattern = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
-    moments = channel.mean, channel.gain_spread, channel.noise
+    moments = channel.mean, channel.gain_covariance, channel.noise
     links = jax.tree.map(lambda by_mode: jnp.asarray(by_mode)[mode, pattern], moments)
     # Prior weights given which components arrived, as they were if that is impossible in all modes.
     joint = weight * jnp.asarray(channel.chance)[mode, pattern]
@@ -60,14 +60,14 @@ def correct_in_every_mode(
 
 
 def _correct_in_mode(
-    signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
+    signal: Signal, mean: jax.Array, gain_covariance: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
 ) -> tuple[Gaussian, Innovation]:
     """Correct the prior of a signal y with z = G y + n in one mode of the channel.
 
-    In this mode `mean` is E[(G, n)], `gain_spread` is Cov G and `link` holds columns of Cov n; `angles` are those of z.
+    In this mode `mean` is E[(G, n)], `gain_covariance` is Cov G, `link` has columns of Cov n; `angles` are those of z.
     """
     gain = mean[:, :-1]
     expected = gain @ signal.mean + mean[:, -1]
     z = wrap_near(z, expected, angles)
-    slopes, noise = gain @ signal.slopes, noise_behind_gain(signal, gain, gain_spread, link)
+    slopes, noise = gain @ signal.slopes, noise_behind_gain(signal, gain, gain_covariance, link)
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)

@@ -48,7 +48,7 @@ from .second_moments import SecondOrder as SecondOrder
 from .second_moments import describe_second_moments as describe_second_moments
 from .second_moments import has_known_mean as has_known_mean
 from .second_moments import has_random_gain as has_random_gain
-from .second_moments import nominal_spread as nominal_spread
+from .second_moments import nominal_covariance as nominal_covariance
 from .second_moments import second_order as second_order
 from .signal_path import ChannelPosition as ChannelPosition
 from .signal_path import Second as Second

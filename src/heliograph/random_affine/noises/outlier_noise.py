@@ -149,13 +149,13 @@ class Contaminated(AbstractNoise):
         outliers = _read_matrices("covariance of the outliers", outlier_covariance, kinds, are_several)
         biases = _read_matrices("bias of the outliers", bias, kinds, are_several)
         xp = library(inlier, outlier_shares, outliers, biases)
-        spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
+        outlier_covariances = [check.covariance("covariance of the outliers", r, n) for r in outliers]
         centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
                    for b in biases]  # fmt: skip
         # The first branch is the noise without outliers; mean and covariance are those of the mixture.
         self.shares = xp.concatenate([xp.stack([1 - sum(outlier_shares)]), xp.stack(outlier_shares)])
         self.means = xp.stack([xp.zeros(n), *centers])
-        self.covariances = xp.stack([inlier, *spreads])
+        self.covariances = xp.stack([inlier, *outlier_covariances])
         self.mean = self.shares @ self.means
         deviations = self.means - self.mean
         between = deviations[:, :, None] * deviations[:, None]

@@ -113,8 +113,8 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
     """
     # At a state drawn around the initial mean, since a symmetric point may hide what every other one shows.
     plant = first(network.plant)
-    spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
-    state = np.asarray(plant.initial_mean) + spread * np.random.default_rng(SEED).normal(size=len(plant.states))
+    deviation = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
+    state = np.asarray(plant.initial_mean) + deviation * np.random.default_rng(SEED).normal(size=len(plant.states))
     matrix = make_observability_matrix(plant, list_sensors(network), state, len(plant.states))
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
