@@ -147,7 +147,7 @@ class RelaySteps(Module):
     """Matrices of a relay network that its second moments need, for each step (leading axis).
 
     The F filters together receive R numbers; T = (1 + relays) m numbers are sent: y, then the signal of each relay.
-    With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and, given what is sent, covariance_ij : W
+    With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and, given them, covariance_ij : W
     (noise included). Rows with `receives_in_slot` = 1 have some link, senders with `transmits_in_slot` = 1 too;
     `state_mean` is E x before the step.
 
