@@ -14,7 +14,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.engine.choice import SETTING
-from heliograph.filters.run_over_data import Filtered
+from heliograph.filters.rows.run_over_data import Filtered
 
 ROWS, ROUNDS = 100, 5
 PARTICLES = 1_000, 10_000, 100_000

@@ -32,12 +32,12 @@ ORDER = [
         "filters.remark",
         "filters.sizes",
         "filters.plausibility",
-        "filters.gaussians_in_states",
-        "filters.linear_recursion",
-        "filters.row_windows",
-        "filters.settled_covariance",
-        "filters.chunks",
-        "filters.run_over_data",
+        "filters.rows.gaussians_in_states",
+        "filters.rows.linear_recursion",
+        "filters.rows.row_windows",
+        "filters.rows.settled_covariance",
+        "filters.rows.chunks",
+        "filters.rows.run_over_data",
         "filters.event.truncated_normal",
         "filters.truncation",
         "filters.smoother_step",
@@ -105,7 +105,7 @@ def import_graph() -> dict[str, set[str]]:
 def test_imports_never_go_round():
     """The error names the circle."""
     graph = import_graph()
-    assert "heliograph.filters.run_over_data" in graph["heliograph.filters.base"]  # it sees what there is
+    assert "heliograph.filters.rows.run_over_data" in graph["heliograph.filters.base"]  # it sees what there is
     TopologicalSorter(graph).prepare()
 
 

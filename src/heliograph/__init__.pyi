@@ -30,10 +30,10 @@ from .random_affine.words.bit_flips import (
 from .random_affine.laws.law import (
     Discrete as Discrete,
 )
-from .random_affine.noise import (
+from .random_affine.noises.noise import (
     Gaussian as Gaussian,
 )
-from .random_affine.outlier_noise import (
+from .random_affine.noises.outlier_noise import (
     Contaminated as Contaminated,
     StudentT as StudentT,
 )

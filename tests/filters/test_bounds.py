@@ -259,7 +259,7 @@ def too_small(radius, shrink, seeds=range(20)):
 def test_the_enumeration_finds_bounds_that_are_too_small():
     """Half the spread, or no shift, is caught; the description as it is is not: the checks above can fail."""
     half = lambda d: eqx.tree_at(  # noqa: E731
-        lambda x: (x.gain_spread, x.noise.weights), d, (d.gain_spread / 2, d.noise.weights / 2)
+        lambda x: (x.gain_covariance, x.noise.weights), d, (d.gain_covariance / 2, d.noise.weights / 2)
     )
     still = lambda d: eqx.tree_at(lambda x: x.shift.center, d, 0 * d.shift.center)  # noqa: E731
     assert too_small(0.0, half)

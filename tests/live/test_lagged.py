@@ -83,7 +83,7 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
     fused = {"informed": hg.Fusion("linear", hg.fusion.MatrixWeights())}
     others = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
     smoothed = RowSmoother(others, None).sweep
-    assert smoothed.fusions == () and [others.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]
+    assert smoothed.fusions == () and [others.stacks[i].filters for i in smoothed.stacks] == [("linear",)]
 
 
 def test_a_moment_costs_the_rows_of_its_lag_and_not_of_the_window(monkeypatch):

@@ -10,7 +10,7 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.fading import LogNormal
 from heliograph.random_affine.laws.law import GivenMoments, bernoulli
-from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.noises.noise import Gaussian
 from tests.oracles import successive_relays as oracle
 
 RELAYS = ("relay_1", "relay_2")

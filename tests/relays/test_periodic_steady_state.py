@@ -12,7 +12,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.laws.fading import Rayleigh
 from heliograph.relays.bfgs import bfgs
-from heliograph.relays.design import given_design, local_error_design, receiver_behind_relays, relay_schedules
+from heliograph.relays.design import given_design, local_error_design, relay_schedules
 from heliograph.relays.periodic_steady_state import (
     periodic_behind_relays,
     periodic_given_design,
@@ -20,6 +20,7 @@ from heliograph.relays.periodic_steady_state import (
     periodic_receiver_error_design,
     periodic_relays_for_best_receiver,
 )
+from heliograph.relays.receiver import receiver_behind_relays
 from tests.relays.relay_problems import example, relative
 
 PAPER = 1.066244e-5  # steady sum of even and odd tr P, by the oracle's 4000 steps

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
-from heliograph.relays.design import local_error_design, receiver_behind_relays
+from heliograph.relays.design import local_error_design
+from heliograph.relays.receiver import receiver_behind_relays
 from tests.oracles import successive_relays as oracle
 from tests.relays.relay_problems import example, network_of, relative, unusual
 

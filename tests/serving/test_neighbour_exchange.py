@@ -23,7 +23,7 @@ from heliograph.serving.message import Message
 from heliograph.serving.service import Service
 from heliograph.serving.settings import ServiceSettings, settings_of_node
 from heliograph.serving.storage import InMemoryStore
-from heliograph.simulation.centres.node_filter import node_network
+from heliograph.simulation.mesh.node_filter import node_network
 from tests.serving.neighbours import PLANT, chain
 
 ROOT = Path(hg.__file__).parents[2]

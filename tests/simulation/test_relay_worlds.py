@@ -8,7 +8,8 @@ from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.relays.design import local_error_design, receiver_behind_relays, relay_schedules
+from heliograph.relays.design import local_error_design, relay_schedules
+from heliograph.relays.receiver import receiver_behind_relays
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recordings.filter_recording import run

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters import chunks
+from heliograph.filters.rows import chunks
 
 ROWS = 34_001  # a chunk that is not full at the end
 RNG = np.random.default_rng(11)

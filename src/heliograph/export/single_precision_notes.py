@@ -9,7 +9,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import first
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 SHARE = 0.01  # of a measurement's noise that its rounding may be
 HALF_UNIT = 2.0**-24  # by which single precision rounds, of the number

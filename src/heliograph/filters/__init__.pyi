@@ -17,9 +17,7 @@ from .gaussian.uncertain_channel_bounds import (
 from .wrappers.mean_covariance_bound import (
     mean_error_bound as mean_error_bound,
 )
-from .wrappers.delay import (
-    late_filter as late_filter,
-)
+from .wrappers.late_data import late_filter as late_filter
 from .wrappers.delay import (
     part_filter as part_filter,
 )
@@ -61,9 +59,9 @@ from .modes.particle import (
 )
 from .linear.polynomial import (
     PolynomialFilter as PolynomialFilter,
-    memory_filter as memory_filter,
     scheduled_polynomial_filter as scheduled_polynomial_filter,
 )
+from .linear.memory_filter import memory_filter as memory_filter
 from .wrappers.fed_back import (
     prediction_of as prediction_of,
 )
@@ -71,7 +69,7 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
-from .run_over_data import (
+from .rows.run_over_data import (
     Filtered as Filtered,
 )
 from .linear.scheduled_gains import (

@@ -12,11 +12,11 @@ from typing_extensions import TypeAliasType
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.filters.call_checks import call_with_inputs, call_with_state
-from heliograph.filters.chunks import ScanResult
 from heliograph.filters.derivatives_of_likelihood import evaluate_for_derivatives, take_derivatives_from
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
-from heliograph.filters.run_over_data import Filtered, run_over_data, scan_inside_jit
+from heliograph.filters.rows.chunks import ScanResult
+from heliograph.filters.rows.run_over_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector_check import check_vector

@@ -17,8 +17,8 @@ from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.moments.second_moments import SecondOrder
-from heliograph.random_affine.noise import AbstractNoise, Independent
-from heliograph.random_affine.outlier_noise import StudentT
+from heliograph.random_affine.noises.noise import AbstractNoise, Independent
+from heliograph.random_affine.noises.outlier_noise import StudentT
 
 Vector = Float[jax.Array | np.ndarray, " m"]
 Matrix = Float[jax.Array | np.ndarray, "m branches"]

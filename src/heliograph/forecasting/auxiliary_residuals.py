@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.forecasting.forecast_result import Array, Forecast
 from heliograph.forecasting.one_step_predictions import predict_rows
 from heliograph.model.plant import LinearPlant
@@ -16,7 +16,7 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.noises.noise import Gaussian
 
 FALSE = 0.01  # probability of any false shock, of all tests together
 EQUAL = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same

@@ -5,15 +5,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import compute_once
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.forecasting.forecast import ForecastTarget, list_targets
 from heliograph.forecasting.mixture_moments import Moments
-from heliograph.forecasting.multistep_prediction import MultistepPredictor
 from heliograph.forecasting.scores import (
     LEVELS,
     MixtureLaws,
@@ -29,9 +26,8 @@ from heliograph.forecasting.scores import (
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, items
-from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.recordings.filter_recording import run
@@ -39,7 +35,7 @@ from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:  # an extra
     import pandas as pd
-
+from heliograph.forecasting.rolled_forecasts import roll_forecasts
 
 ByNode = TypeAliasType("ByNode", Mapping[str, ArrayLike])
 Rows = TypeAliasType("Rows", Float[ArrayLike, "steps ..."] | None)
@@ -204,7 +200,7 @@ def _call_refit(refit: Refit, rows: int, network: Network) -> Network:
         ValueError: no network, or one with other nodes and filters.
     """
     fitted = instance(f"refit from {rows} rows", refit(rows), Network, "a Network")
-    if (fitted.names, set(fitted.places)) != (network.names, set(network.places)):
+    if (fitted.names, set(fitted.estimate_indices)) != (network.names, set(network.estimate_indices)):
         raise fail(f"refit from {rows} rows", f"the nodes and filters of {list(network.names)}", list(fitted.names))
     return fitted
 
@@ -221,7 +217,7 @@ def _find_start_of_forecasts(network: Network, record: Record, *data: Any) -> Or
 def list_single_filters(network: Network) -> set[tuple[str, str]]:
     """Return (node, filter) of the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
-    return set(network.places) | central
+    return set(network.estimate_indices) | central
 
 
 def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
@@ -337,64 +333,3 @@ def _score_number(
         log_score=average_overlapping(log_score(law, came), horizon),
         crps=average_overlapping(crps(law, came), horizon),
     )
-
-
-def roll_forecasts(
-    predictor: MultistepPredictor, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
-) -> tuple[Moments, Moments | None]:
-    """Return forecasts from each row at each horizon: of the states, and of what would arrive.
-
-    Their moments (rows, horizons, K, ...) have variances instead of covariances. Inputs ahead are those of the later
-    rows; after the last row its inputs stay.
-    """
-    longest = horizons[-1]
-    padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
-    # For each row, the inputs of the rows after it: (rows, longest, inputs).
-    windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
-    arguments = predictor, z, u, windows, np.asarray(horizons) - 1
-    rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
-    return rolled
-
-
-def _forecast_from_each_row(
-    predictor: MultistepPredictor, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
-) -> PyTree:
-    """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
-
-    They are (rows, places, K, ...), of mixtures of K parts, with variances in place of covariances. A backtest scores
-    them by the later rows.
-
-    Args:
-        predictor: predicts the filter's state, and from it the states' and measurements' moments, without data.
-        z: measurements (rows, received).
-        u: inputs (rows, inputs).
-        windows: inputs of the rows ahead of each row (rows, ahead, inputs).
-        places: which of the rows ahead are returned, from 0.
-    """
-    filter, length = predictor.filter, windows.shape[1]
-
-    def select(moments: Moments | None) -> PyTree:
-        """Return the moments at `places` (the horizons among all rows ahead), with variances instead of covariances."""
-        if moments is None:
-            return None
-        variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
-        return jax.tree.map(lambda leaf: leaf[places], moments._replace(covariances=variances))
-
-    def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Return the filter's state after row k, and the moments that it forecasts from there.
-
-        The row holds k, the measurements, the inputs, and `window`, the inputs of the `length` rows ahead.
-        """
-        k, z_k, u_k, window = row
-        after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
-        ahead = window, k + 1 + jnp.arange(length)
-        _, (states, _, received) = jax.lax.scan(lambda s, row: predictor.predict_step(s, *row), after, ahead)
-        moments_alone = states and states._replace(laws=None)  # states are scored by moments even if they have limits
-        return after, (select(moments_alone), select(received))
-
-    start = jax.tree.map(jnp.asarray, filter.init())
-    rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(windows)
-    return jax.lax.scan(filter_and_forecast, start, rows)[1]
-
-
-_by_xla = quickly_compiled(_forecast_from_each_row)

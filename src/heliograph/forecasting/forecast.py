@@ -144,18 +144,18 @@ def _find_filter(
     Args:
         network: the model of the origin.
         origin: where the data end. Its `state` holds the states of the nodes' filters, where filters that are computed
-            side by side (a kind) have one array, and the states of central filters by name.
+            side by side (a stack) have one array, and the states of central filters by name.
         node: node of the estimate.
         name: name of the filter or fusion.
         estimate: the estimate, where the prediction of a fusion begins.
     """
-    states_by_kind, states_of_central, *_ = origin.state
-    if (node, name) in network.places:
-        # A kind stacks filters of one structure: filter after filter, and for each the nodes of the kind's group.
-        kind, filter_of_kind, node_of_group = network.places[node, name]
-        nodes_in_group = len(network.groups[network.kinds[kind].group])
-        index = filter_of_kind * nodes_in_group + node_of_group
-        return network.nodes[node].filters[name], _take_stacked_state(states_by_kind[kind], index, origin.several)
+    states_by_stack, states_of_central, *_ = origin.state
+    if (node, name) in network.estimate_indices:
+        # In a stack, of filters of one structure: filter after filter, and for each the nodes of the stack's group.
+        stack, filter_of_stack, node_of_group = network.estimate_indices[node, name]
+        nodes_in_group = len(network.groups[network.stacks[stack].group])
+        index = filter_of_stack * nodes_in_group + node_of_group
+        return network.nodes[node].filters[name], _take_stacked_state(states_by_stack[stack], index, origin.several)
     if name in states_of_central:
         filter = network.fused[name]
         assert isinstance(filter, AbstractFilter)

@@ -39,8 +39,8 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
-from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.outlier_noise import StudentT
+from heliograph.random_affine.noises.noise import AbstractNoise
+from heliograph.random_affine.noises.outlier_noise import StudentT
 
 BLOCK = 128  # plants side by side under XLA
 

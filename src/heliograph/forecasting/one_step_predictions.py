@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.engine.choice import scan_rows
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.forecasting.backtest import list_single_filters, select_measurements
 from heliograph.forecasting.forecast import Forecasts, combine_predictions, list_targets
 from heliograph.forecasting.forecast_result import Forecast

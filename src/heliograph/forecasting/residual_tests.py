@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from heliograph.filters.base import AbstractFilter, FilterAngles
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.forecasting.backtest import select_measurements
 from heliograph.forecasting.forecast import list_targets
 from heliograph.forecasting.forecast_result import Array, Forecast

@@ -28,9 +28,7 @@ from .quantizer import (
     AbstractQuantizer as AbstractQuantizer,
     Quantized as Quantized,
 )
-from .quantizer import (
-    EscapeQuantizer as EscapeQuantizer,
-)
+from .escape_quantizer import EscapeQuantizer as EscapeQuantizer
 from .zoom_quantizer import (
     ZoomQuantizer as ZoomQuantizer,
 )

@@ -103,7 +103,7 @@ def make_lossless_links(nodes: int, n: int) -> ReportModel:
     return ReportModel(
         gain=np.tile(np.eye(n), (nodes, 1, 1)),
         offset=np.zeros((nodes, n)),
-        spread=np.zeros((nodes, n, n, n + 1, n + 1)),
+        covariance=np.zeros((nodes, n, n, n + 1, n + 1)),
         error=np.zeros((nodes, n)),
     )
 
@@ -283,7 +283,7 @@ def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: Rep
     """Put the model of the reports that are sent now before those of earlier steps, and drop the oldest.
 
     The noise of a report, Cov(z_i | m_i) of z_i = G_i m_i + n_i, is the covariance of the link's random gains
-    (`links.spread`) applied to E[(m_i, 1)(m_i, 1)'], the second moment of what node i sends, before any data.
+    (`links.covariance`) applied to E[(m_i, 1)(m_i, 1)'], the second moment of what node i sends, before any data.
     """
     mean = errors.state_mean - errors.bias  # E m_i of each node's estimate m_i = x - e_i
     # E m_i m_i' = Cov x - Cov(e_i, x) - Cov(x, e_i) + Cov e_i + E m_i E m_i'.
@@ -296,8 +296,8 @@ def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: Rep
     sent = jax.vmap(widen_by_quantization)(sent, jnp.pad(error, ((0, 0), (0, 1))))
     # A link whose gains are not random adds no noise, also where the moments of what is sent are unknown (NaN), as they
     # are along the estimates of one run.
-    has_random_gains = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
-    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(has_random_gains[:, None, None], sent, 0.0))
+    has_random_gains = jnp.any(jnp.asarray(links.covariance) != 0, axis=(1, 2, 3, 4))
+    noise = jnp.einsum("iabcd,icd->iab", links.covariance, jnp.where(has_random_gains[:, None, None], sent, 0.0))
     present = PastReports(gain=jnp.asarray(links.gain), offset=jnp.asarray(links.offset), noise=noise, error=error)
     return PastReports(*(jnp.concatenate([new[None], old[:-1]]) for new, old in zip(present, past, strict=True)))
 

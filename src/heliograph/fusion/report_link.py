@@ -181,11 +181,11 @@ def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], 
 class ReportModel(NamedTuple):
     """Reports of one step as the centre models them, z_i = G_i m_i + n_i, quantizers' errors on m_i within error_i.
 
-    Shapes: gain E[G] (node, m, n), offset E[n] (node, m), spread (node, m, m, n + 1, n + 1), which takes second moments
-    of (m_i, 1) to Cov(z_i | m_i); error (node, n).
+    Shapes: gain E[G] (node, m, n), offset E[n] (node, m), covariance (node, m, m, n + 1, n + 1), which takes second
+    moments of (m_i, 1) to Cov(z_i | m_i); error (node, n).
     """
 
     gain: jax.Array | np.ndarray
     offset: jax.Array | np.ndarray
-    spread: jax.Array | np.ndarray
+    covariance: jax.Array | np.ndarray
     error: jax.Array | np.ndarray

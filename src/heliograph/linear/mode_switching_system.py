@@ -12,10 +12,10 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.second_moments import nominal_spread
+from heliograph.random_affine.moments.second_moments import nominal_covariance
 from heliograph.random_affine.series_and_stack import Stack
 
-Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its spread, by mode
+Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its covariance, by mode
 
 
 def modal_system(
@@ -56,21 +56,21 @@ def modal_system(
     n = _find_state_size(move, measure)
     # Homogeneous coordinates y~ = (y, 1).
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
-    spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
+    initial = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
     wanted = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
     pairs = zip(list_checked_steps(move, horizon), list_checked_steps(measure, horizon), strict=True)
     modes_by_step = [joint_modes(Stack(pair)) for pair in pairs]
     # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start, where the chain of the modes has not moved yet.
     law, chain = np.asarray(modes_by_step[0].initial), np.eye(len(modes_by_step[0].initial))
-    moments = law[:, None, None] * (np.outer(mean, mean) + spread)
-    start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
+    moments = law[:, None, None] * (np.outer(mean, mean) + initial)
+    start = np.kron(np.diag(law), initial) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
     steps = list[Steps]()
     for modes in modes_by_step:
         # In each mode the map is a pair (move, measure); moments of each.
         moves, measures = zip(*(m.maps for m in modes.maps if isinstance(m, Stack)), strict=True)
         transition, process, moments = _propagate_modes(_take_moments_by_mode(list(moves)), chain, moments)
-        measure_mean, measure_spread = _take_moments_by_mode(list(measures))
-        noise = np.einsum("jabcd,jcd->ab", measure_spread, moments)  # Cov(v) = sum_j Spread_j(E_j)
+        measure_mean, measure_covariance = _take_moments_by_mode(list(measures))
+        noise = np.einsum("jabcd,jcd->ab", measure_covariance, moments)  # Cov(v) = sum_j Spread_j(E_j)
         output = np.concatenate(list(measure_mean), axis=1)
         no_drift, no_offset = np.zeros(len(transition)), np.zeros(len(output))
         steps.append(Steps(transition, no_drift, process, output, no_offset, noise))
@@ -103,8 +103,8 @@ def _find_state_size(move: Channel, measure: Channel) -> int:
 
 def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
     """Return, for the map y -> G y + n of each mode, E[(G, n)] and the covariances of the entries of (G, n)."""
-    means, spreads = zip(*((m.moments(1).mean[:-1], nominal_spread(m).center) for m in maps), strict=True)
-    return np.array(means), np.array(spreads)
+    means, covariances = zip(*((m.moments(1).mean[:-1], nominal_covariance(m).center) for m in maps), strict=True)
+    return np.array(means), np.array(covariances)
 
 
 def _propagate_modes(
@@ -126,12 +126,12 @@ def _propagate_modes(
         rows: Pi (modes, modes).
         moments: E_i (modes, n + 1, n + 1) before the step.
     """
-    mean, spread = move
+    mean, covariance_of_move = move
     modes, size = len(moments), moments.shape[-1]
     # E H_j (modes, n + 1, n + 1), with the last row (0, ..., 0, 1), which keeps the constant of y~.
     EH = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
     Y = mix_moments_of_modes(rows, moments)
-    S = np.pad(np.einsum("jabcd,jcd->jab", spread, Y), ((0, 0), (0, 1), (0, 1)))
+    S = np.pad(np.einsum("jabcd,jcd->jab", covariance_of_move, Y), ((0, 0), (0, 1), (0, 1)))
     # Pi_ij (delta_jl - Pi_il): covariance of the indicators of the next modes j and l, given mode i.
     indicator_covariance = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
     # Blocks [j, a, l, b] of Cov(w) and [j, a, i, b] of F: entry (a, b) of block (j, l) or (j, i).

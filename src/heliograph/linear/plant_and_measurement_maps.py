@@ -15,7 +15,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.pushed_moments import TabulatedNoise
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.random_affine.series_and_stack import Series
 from heliograph.random_affine.sum_of_maps import move_sensor_into_links
 

@@ -6,15 +6,9 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from heliograph.linear.lifted_map import make_linear_rows, mean_and_covariance, split_homogeneous
 from heliograph.linear.lmmse_recursion import lmmse
-from heliograph.linear.monomial_lifted_system import (
-    initial_monomial_moments,
-    lifted_system,
-    make_linear_rows,
-    mean_and_spread,
-    refuse_lift,
-    split_homogeneous,
-)
+from heliograph.linear.monomial_lifted_system import initial_monomial_moments, lifted_system, refuse_lift
 from heliograph.linear.plant_and_measurement_maps import check_model, make_plant_and_measurement_maps
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
 from heliograph.model.channel import Channel
@@ -35,7 +29,7 @@ from heliograph.random_affine.moments.pushed_moments import (
     push_moments,
     push_through_known_map,
 )
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.series_and_stack import Series, Stack
 
 
@@ -67,7 +61,7 @@ def quadratic_system_with_linear_estimate(
     start_map = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
     moments = push_through_known_map(start_map, 4, initial_monomial_moments(plant_0, 4))
     second = products_of_monomials(moments, total + 1, 2)
-    mean, spread = mean_and_spread(second)
+    mean, initial = mean_and_covariance(second)
     received, cache = _make_received_products(n, m), _MomentCache()
     steps, rounding = list[Steps](), list[np.ndarray]()
     for k, route in enumerate(make_plant_and_measurement_maps(plant, sensor, channel, 4, horizon)):
@@ -87,7 +81,7 @@ def quadratic_system_with_linear_estimate(
         rounding.append(np.finfo(float).eps * np.diag(next_second)[:-1])
         second = next_second
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))
-    system = LinearSystem(over_time, mean, spread, projection=make_linear_rows(total, 2, n), rounding=rounding)
+    system = LinearSystem(over_time, mean, initial, projection=make_linear_rows(total, 2, n), rounding=rounding)
     return with_premise(system, Premise(plant, sensor, channel, order=4))
 
 
@@ -266,12 +260,12 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     state = state_moments(square)
     largest = 0.0
     for k in range(square.horizon):
-        step, spread = square.step(k), state.covariance[k + 1]
-        cross = step.output @ spread
+        step, covariance = square.step(k), state.covariance[k + 1]
+        cross = step.output @ covariance
         # Joint covariance and mean of (products of x, products of z), and the indices of x and z themselves in it.
-        joint = np.block([[spread, cross.T], [cross, cross @ step.output.T + step.noise]])
+        joint = np.block([[covariance, cross.T], [cross, cross @ step.output.T + step.noise]])
         mean = np.concatenate([state.mean[k + 1], step.output @ state.mean[k + 1] + step.offset])
-        first_z = len(spread)
+        first_z = len(covariance)
         linear = [x_indices[(i,)] for i in range(states)] + [first_z + z_indices[(i,)] for i in range(outputs)]
         for indices, start in ((x_indices, 0), (z_indices, first_z)):
             # Indices of the product a b, of a and of b.

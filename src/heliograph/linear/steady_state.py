@@ -17,7 +17,7 @@ from heliograph.numerics.check import array, fail, standard_deviations
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 RESOLUTION = 1e-8  # of an arrival probability
 

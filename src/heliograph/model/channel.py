@@ -25,20 +25,15 @@ from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps
-from heliograph.random_affine.delay import (
-    Delay,
-    DelayedLink,
-    connect_in_series,
-    place_channel_of_part,
-    signal_size,
-)
+from heliograph.random_affine.delay import Delay, DelayedLink, place_channel_of_part, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.memories_of_channels import separate_memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
+from heliograph.random_affine.noises.noise import AbstractNoise, NoiseLike, as_noise, count_components
+from heliograph.random_affine.relayed_links import connect_in_series
 from heliograph.random_affine.series_and_stack import Stack
 from heliograph.random_affine.sum_of_maps import Superposed
 

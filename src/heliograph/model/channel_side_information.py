@@ -25,7 +25,7 @@ from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory
 from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 from heliograph.random_affine.series_and_stack import Stack
 

@@ -11,7 +11,7 @@ from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 from heliograph.random_affine.words.rounding_noise import find_rounded_noises
 
 Claim = Literal["exact", "upper", "nominal", "none"]

@@ -26,7 +26,7 @@ from heliograph.random_affine.modes import (
     mode_laws_over_time,
     redraw_modes_each_step,
 )
-from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, count_components
+from heliograph.random_affine.noises.noise import FiniteSupport, NoiseLike, as_noise, count_components
 from heliograph.random_affine.series_and_stack import Stack
 from heliograph.random_affine.sum_of_maps import split_terms_without_common_memory
 

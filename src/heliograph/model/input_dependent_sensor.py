@@ -14,7 +14,7 @@ from heliograph.numerics.check import array, error_text, fail, function, name_li
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Names
-from heliograph.random_affine.noise import as_noise, count_components
+from heliograph.random_affine.noises.noise import as_noise, count_components
 
 
 class MeasureUnderInputs(Module):

@@ -21,7 +21,7 @@ from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
 from heliograph.random_affine.memories_of_channels import AbstractWithMemory, memories, select_model_of_equal_structure
-from heliograph.random_affine.noise import AbstractNoise, Square, Vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Square, Vector
 
 Transition = MarkovChain | ArrayLike  # a chain, or its probabilities (modes, modes)
 SUM = 1e-9  # of the largest rate: what a row of rates may sum to

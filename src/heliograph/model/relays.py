@@ -136,7 +136,7 @@ class RelayNetwork(Module):
             state_mean=np.array(means),
             gain=moments.gain,
             offset=moments.offset,
-            spread=moments.spread,
+            covariance=moments.covariance,
             receives_in_slot=moments.receives,
             transmits_in_slot=moments.transmits,
             received=self.received,
@@ -147,12 +147,12 @@ class RelaySteps(Module):
     """Matrices of a relay network that its second moments need, for each step (leading axis).
 
     The F filters together receive R numbers; T = (1 + relays) m numbers are sent: y, then the signal of each relay.
-    With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and conditional covariance spread_ij :
-    W (noise included). Rows with `receives_in_slot` = 1 have some link, senders with `transmits_in_slot` = 1 too;
+    With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and, given them, covariance_ij : W
+    (noise included). Rows with `receives_in_slot` = 1 have some link, senders with `transmits_in_slot` = 1 too;
     `state_mean` is E x before the step.
 
     Shapes: transition, process (time, n, n), drift, state_mean (time, n), sensing (time, m, n), sensor_noise
-    (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, receives_in_slot (time, R), spread
+    (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, receives_in_slot (time, R), covariance
     (time, R, R, T + 1, T + 1), transmits_in_slot (time, 1 + relays).
     """
 
@@ -165,7 +165,7 @@ class RelaySteps(Module):
     state_mean: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
-    spread: np.ndarray
+    covariance: np.ndarray
     receives_in_slot: np.ndarray
     transmits_in_slot: np.ndarray
     received: tuple[int, ...] = eqx.field(static=True)
@@ -192,13 +192,13 @@ class RelaySteps(Module):
 class _SlotMoments(NamedTuple):
     """Moments of the R numbers that are received in a slot, given the T numbers that are sent in it.
 
-    gain, offset: their means. spread: covariances of the entries of gain and offset, the offset as entry T.
+    gain, offset: their means. covariance: covariances of the entries of gain and offset, the offset as entry T.
     receives, transmits: 1 for each number that is received, and for each sender that transmits, in the slot; else 0.
     """
 
     gain: Float[np.ndarray, "R T"]
     offset: Float[np.ndarray, " R"]
-    spread: Float[np.ndarray, "R R T+1 T+1"]
+    covariance: Float[np.ndarray, "R R T+1 T+1"]
     receives: Float[np.ndarray, " R"]
     transmits: Float[np.ndarray, " senders"]
 
@@ -219,23 +219,23 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
     # First row of each filter among all that is received.
     starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))
     gain, offset, receives = np.zeros((rows, columns)), np.zeros(rows), np.zeros(rows)
-    spread, transmits = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
+    covariance, transmits = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
     for listener, links in slot.items():
         for sender, link in links.items():
             # Mean gain and offset of the link z = G s + n, and covariances of the entries of (G, n).
             moments = second_order(at(link, k))
             if moments.uncertain:
                 raise fail("link", "known probabilities", "uncertain ones")
-            # A listener receives the sum of its links: gains, offsets and spreads of independent links add.
+            # A listener receives the sum of its links: gains, offsets and covariances of independent links add.
             received = starts[listener] + np.arange(len(moments.offset))
             sent = m * senders.index(sender) + np.arange(m)
             gain[np.ix_(received, sent)] = moments.mean_gain
             offset[received] += moments.offset
             sent_and_one = np.append(sent, columns)  # the offset stands behind the gains of all that is sent
             # Covariances of the link's gains and offset, (outputs, outputs, inputs + 1, inputs + 1).
-            spread[np.ix_(received, received, sent_and_one, sent_and_one)] += moments.nominal.center
+            covariance[np.ix_(received, received, sent_and_one, sent_and_one)] += moments.nominal.center
             receives[received], transmits[senders.index(sender)] = 1.0, 1.0
-    return _SlotMoments(gain=gain, offset=offset, spread=spread, receives=receives, transmits=transmits)
+    return _SlotMoments(gain=gain, offset=offset, covariance=covariance, receives=receives, transmits=transmits)
 
 
 def _list_arrays_by_step(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:

@@ -39,7 +39,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
 from heliograph.random_affine.memories_of_channels import AbstractWithMemory
-from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
+from heliograph.random_affine.noises.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.words.rounding_noise import round_without_dither
 
 T = TypeVar("T")

@@ -13,7 +13,7 @@ from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.numpy_or_jax import is_traced
-from heliograph.random_affine.noise import Vector
+from heliograph.random_affine.noises.noise import Vector
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
 SOME_TURN = (0.3, -0.2, 0.5)  # radians, about the three axes or of any states: no attitude is at rest there

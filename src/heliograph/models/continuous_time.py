@@ -15,7 +15,7 @@ from heliograph.numerics.check import array, covariance, fail, name_list, names,
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
-from heliograph.random_affine.noise import NoiseLike
+from heliograph.random_affine.noises.noise import NoiseLike
 
 TERMS = 18  # of the series: (2 |A| h)^18 / 19! is below 1e-17 where |A| h is at most 1/2
 HALVINGS = 40  # of a step whose length is an input: up to |A| dt = 5e11

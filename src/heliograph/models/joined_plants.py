@@ -21,7 +21,7 @@ from heliograph.model.plant import (
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import block_diagonal, library
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
 
 
 class TransitionSideBySide(Module):

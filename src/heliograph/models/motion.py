@@ -10,7 +10,7 @@ from heliograph.models.continuous_time import continuous_plant
 from heliograph.numerics.check import fail, name_list, scalar
 from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import ArrayLike, Float, Names, rename
-from heliograph.random_affine.noise import NoiseLike
+from heliograph.random_affine.noises.noise import NoiseLike
 
 WIDE = 1e8  # variance of what nobody knows before the first measurement, unless one says it
 LARGEST = 1e100  # deviation, of which the square is a number

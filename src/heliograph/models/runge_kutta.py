@@ -14,7 +14,7 @@ from heliograph.numerics.check import array, check_count, covariance, function, 
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import as_real
 from heliograph.numerics.types import Array, Names
-from heliograph.random_affine.noise import NoiseLike
+from heliograph.random_affine.noises.noise import NoiseLike
 
 
 class DriftAndStepLength(Module):

@@ -17,7 +17,7 @@ from heliograph.numerics.check import array, fail, instance, items
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
-from heliograph.random_affine.noise import NoiseLike
+from heliograph.random_affine.noises.noise import NoiseLike
 
 
 class SumOfComponents(Module):

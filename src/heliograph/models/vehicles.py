@@ -11,7 +11,7 @@ from heliograph.models.motion import read_two_axes
 from heliograph.numerics.check import TINY, covariance, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
-from heliograph.random_affine.noise import NoiseLike
+from heliograph.random_affine.noises.noise import NoiseLike
 
 NEAR = 1e-4  # radians: below this, series take the place of quotients, right to the last digit
 

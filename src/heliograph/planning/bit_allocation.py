@@ -17,7 +17,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.random_affine.words.bit_flips import Flips
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

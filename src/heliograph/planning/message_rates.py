@@ -15,7 +15,7 @@ from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.planning.send_on_delta_grid import ScalarSystem, compute_rate_on_grid
-from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.noises.noise import Gaussian
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo

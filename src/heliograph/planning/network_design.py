@@ -19,13 +19,14 @@ from heliograph.planning.plant_moments import measured_moment_with_one, steady_m
 from heliograph.planning.power_budget import make_budget, make_power_limits, make_unlimited
 from heliograph.planning.sum_of_links_design import design_sum_of_links, is_sum_of_links
 from heliograph.planning.transmitters import find_free_transmitters
-from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
+from heliograph.relays.design import given_design, relay_schedules
 from heliograph.relays.periodic_steady_state import (
     periodic_behind_relays,
     periodic_given_design,
     periodic_local_error_design,
     periodic_relays_for_best_receiver,
 )
+from heliograph.relays.receiver import receiver_behind_relays
 from heliograph.simulation.network import Network
 
 

@@ -15,7 +15,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 DOUBLINGS = 60
 EPS = float(np.finfo(np.float64).eps)

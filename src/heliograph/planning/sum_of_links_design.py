@@ -34,7 +34,7 @@ from heliograph.planning.transmitters import (
 )
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

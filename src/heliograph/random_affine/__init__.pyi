@@ -38,16 +38,16 @@ from .modes import (
     Modes as Modes,
     joint_modes as joint_modes,
 )
-from .moments.noise_from_moments import (
+from .noises.noise_from_moments import (
     NoiseMoments as NoiseMoments,
     recorded_noise as recorded_noise,
 )
-from .noise import (
+from .noises.noise import (
     AbstractNoise as AbstractNoise,
     FiniteSupport as FiniteSupport,
     Independent as Independent,
 )
-from .shaped_noise import (
+from .noises.shaped_noise import (
     Shaped as Shaped,
 )
 from .moments.second_moments import (

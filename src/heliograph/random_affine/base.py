@@ -29,7 +29,7 @@ from heliograph.random_affine.moments.signal_path import (
     carry_by_moments,
     refuse_gain_on_angles,
 )
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 T = TypeVar("T")
 KnownGains = Bool[np.ndarray, " m"]

@@ -19,7 +19,6 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
-from heliograph.random_affine.factor_of_covariance import FACTOR_TOLERANCE
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.laws.gain_given_reading import gain_given_reading
 from heliograph.random_affine.laws.law import CertainDiscrete, Constant, Discrete
@@ -28,7 +27,8 @@ from heliograph.random_affine.markov_chain_and_autoregression import (
     CertainChain,
     MarkovChain,
 )
-from heliograph.random_affine.noise import AbstractNoise, Matrix
+from heliograph.random_affine.noises.factor_of_covariance import FACTOR_TOLERANCE
+from heliograph.random_affine.noises.noise import AbstractNoise, Matrix
 from heliograph.random_affine.reported_numbers import FreshReading
 
 T = TypeVar("T")

@@ -24,7 +24,7 @@ from heliograph.random_affine.moments.monomials import (
     symmetric_power,
 )
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_moment_vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_moment_vector
 
 NOTHING_SENT = "nothing sent"  # in words
 ROUNDING = 1e-12  # of a gain of 1 that was computed

@@ -18,7 +18,7 @@ from heliograph.random_affine.moments.gain_and_disturbance_moments import Distur
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, product_table
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
-from heliograph.random_affine.noise import Gaussian, Matrix
+from heliograph.random_affine.noises.noise import Gaussian, Matrix
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners
 
 

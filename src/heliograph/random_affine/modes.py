@@ -31,7 +31,7 @@ from heliograph.random_affine.memories_of_channels import condition_on_states, m
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
-from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
+from heliograph.random_affine.noises.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 

@@ -10,7 +10,7 @@ from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.laws.gain_given_reading import require_density
 from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, MemoryStates, identify_memory
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 
 class AbstractFreshDraw(AbstractMemory):

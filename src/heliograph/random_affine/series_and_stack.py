@@ -40,7 +40,7 @@ from heliograph.random_affine.moments.monomials import (
     refuse_if_too_large,
 )
 from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
 
 OUTCOME_LIMIT = 1024  # sets of losses that are listed
 Corners = Float[jax.Array | np.ndarray, "corner rows columns"]

@@ -28,7 +28,7 @@ from heliograph.random_affine.moments.moments_of_sum import (
 )
 from heliograph.random_affine.moments.monomials import JointMoments, count_monomials, refuse_if_too_large
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_moment_vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_moment_vector
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners, Series, Stack
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y

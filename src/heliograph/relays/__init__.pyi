@@ -15,7 +15,7 @@ from .periodic_steady_state import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
 )
-from .design import (
+from .receiver import (
     receiver_behind_relays as receiver_behind_relays,
     receiver_system as receiver_system,
 )

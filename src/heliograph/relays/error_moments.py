@@ -88,11 +88,11 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
     sources = jax.scipy.linalg.block_diag(moments, step.process, step.sensor_noise)
     # E (sent, 1)(sent, 1)' = mean mean' + Cov sent.
     second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate_by_mode(maps.sent, sources, 0.0))
-    # Random gains G add (G - E G) sent + n - E n to the innovations: its covariance is that of (G, n), `step.spread`,
+    # Random gains G add (G - E G) sent + n - E n to the innovations: the covariance is that of (G, n), in `step`,
     # contracted with the second moments of (sent, 1).
     linear = jnp.concatenate([maps.moved, maps.innovation])
     d = maps.moved.shape[0]
-    z = propagate_by_mode(linear, sources, 0.0).at[d:, d:].add(contract(step.spread, second))
+    z = propagate_by_mode(linear, sources, 0.0).at[d:, d:].add(contract(step.covariance, second))
     # E |signal|^2 of each sender, which sends m numbers.
     m = step.sensing.shape[0]
     power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * step.transmits_in_slot
@@ -142,7 +142,7 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
     # An innovation is E G sent less its prediction: its rounding is at most eps |E G| |sent|. Its variance has a term
     # sum_ab Cov(G_ia, G_ib) E[sent_a sent_b], which is computed up to eps |Cov| |sent| |sent|.
     rounding_of_innovation = ROUNDING * jnp.abs(step.gain) @ sent_sizes[:-1]
-    rounding_of_variance = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.spread), sent_sizes, sent_sizes)
+    rounding_of_variance = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.covariance), sent_sizes, sent_sizes)
     smallest_variance = rounding_of_innovation**2 + rounding_of_variance
     return jnp.where(jnp.diagonal(predicted)[d:] > smallest_variance, 1.0, 0.0)
 

@@ -16,17 +16,16 @@ from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.design import (
     GainsByFilter,
-    ReceiverViewOfRelays,
     RelayDesign,
     initial_error_covariance,
     join_gains,
     make_design,
-    make_receiver_view,
     relay_gains,
     split_gains,
 )
 from heliograph.relays.error_moments import PropagatedMoments, correct_moments, propagate_error_moments, regression_gain
 from heliograph.relays.power_limited_descent import Cost, make_penalised_cost, minimise_over_gains
+from heliograph.relays.receiver import ReceiverViewOfRelays, make_receiver_view
 
 CONVERGED = 1e-13  # relative change of the moments over a period
 PERIODS = 100_000

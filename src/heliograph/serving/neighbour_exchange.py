@@ -9,7 +9,7 @@ from heliograph.live.fleet import Fleet
 from heliograph.live.plant_state import PlantState
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.serving.output import Output
-from heliograph.simulation.centres.node_filter import NodeFilter
+from heliograph.simulation.mesh.node_filter import NodeFilter
 
 Moment = Callable[[PlantState, float], float | str]
 

@@ -13,7 +13,7 @@ from heliograph.serving.brokers.broker_address import Address
 from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.published_forecasts import Spans
 from heliograph.serving.thresholds import Thresholds
-from heliograph.simulation.centres.node_filter import node_network
+from heliograph.simulation.mesh.node_filter import node_network
 from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:

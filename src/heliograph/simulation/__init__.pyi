@@ -8,14 +8,14 @@ from .centres.cross_covariances import (
     cross_covariances as cross_covariances,
     fused_covariances as fused_covariances,
 )
-from .centres.mesh_errors import (
+from .mesh.errors import (
     MeshErrors as MeshErrors,
     best_possible as best_possible,
     freeze as freeze,
     mesh_arrivals as mesh_arrivals,
     mesh_errors as mesh_errors,
 )
-from .centres.mesh_mean_errors import (
+from .mesh.mean_errors import (
     mean_mesh_errors as mean_mesh_errors,
 )
 from .boundedness import (
@@ -70,7 +70,7 @@ from .centres.named_filter import (
     NamedFilter as NamedFilter,
     find_filter_by_name as find_filter_by_name,
 )
-from .centres.node_filter import (
+from .mesh.node_filter import (
     NodeFilter as NodeFilter,
     node_network as node_network,
 )

@@ -22,7 +22,7 @@ from heliograph.simulation.centres.fusion_centre import (
     find_claim_of_report_fusion,
     has_data_dependent_gains,
 )
-from heliograph.simulation.centres.mesh_check import find_claim_of_mesh
+from heliograph.simulation.mesh.check import find_claim_of_mesh
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
 UNSAID = "something that it does not say"

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.chunks import sum_filtered_in_chunks
-from heliograph.filters.run_over_data import check_data, step_over_known_rows
+from heliograph.filters.rows.chunks import sum_filtered_in_chunks
+from heliograph.filters.rows.run_over_data import check_data, step_over_known_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
 from heliograph.numerics.numpy_or_jax import is_traced

@@ -27,7 +27,6 @@ from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
 from heliograph.random_affine.memories_of_channels import memories
-from heliograph.simulation.centres.mesh_check import check_mesh
 from heliograph.simulation.covariance_claims import (
     MistakenBelief,
     find_claims,
@@ -41,14 +40,15 @@ from heliograph.simulation.covariance_claims import (
 )
 from heliograph.simulation.description.diagram import write_diagram, write_html_table, write_short_diagram
 from heliograph.simulation.filter_flag_check import check_filter_flags
+from heliograph.simulation.mesh.check import check_mesh
 from heliograph.simulation.network_index import (
-    AlikeFilters,
-    EstimatePlace,
-    find_estimate_places,
+    EstimateIndex,
+    StackIndex,
+    find_estimate_indices,
     find_rows_of_nodes,
     group_by_structure,
-    list_alike_filters,
-    list_alike_meshes,
+    list_mesh_stacks,
+    list_stacks,
 )
 from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
@@ -74,7 +74,7 @@ class Network(Module):
     """A plant observed by named nodes: the description that simulation, filters and reports are made from.
 
     `Network.of_relays` makes the network of relays that filter and forward, `Network.sharing` that of nodes which share
-    a sensor's noise, a hop or fading. Nodes of one structure form a group, filters of one structure in it a kind: each
+    a sensor's noise, a hop or fading. Nodes of one structure form a group, filters of one structure in it a stack: each
     is one array axis from here to the results, which have names again.
 
     Args:
@@ -104,9 +104,9 @@ class Network(Module):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
-    kinds: tuple[AlikeFilters, ...] = eqx.field(static=True)
-    mesh_kinds: tuple[AlikeFilters, ...] = eqx.field(static=True)  # of meshes, sorted as in compiled code
-    places: FrozenMapping[tuple[str, str], EstimatePlace] = eqx.field(static=True)  # by node and filter
+    stacks: tuple[StackIndex, ...] = eqx.field(static=True)
+    mesh_stacks: tuple[StackIndex, ...] = eqx.field(static=True)  # of meshes, sorted as in compiled code
+    estimate_indices: FrozenMapping[tuple[str, str], EstimateIndex] = eqx.field(static=True)  # by node and filter
     rows: FrozenMapping[str, range] = eqx.field(static=True)  # among all measurements, joined in the order of the nodes
     claimed: FrozenMapping[tuple[str, str], Claim] = eqx.field(static=True)  # by node and filter, fused ones last
 
@@ -138,15 +138,15 @@ class Network(Module):
         self.rows = FrozenMapping(find_rows_of_nodes({name: node.received for name, node in self.nodes.items()}))
         # A filter made for other models than its node's claims less. Arrays get one length, so that they stack.
         self.nodes = pad_filters_alike(lower_claims_of_nodes(self))
-        # Groups of nodes and kinds of filters, by structure.
+        # Groups of nodes and stacks of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
             (name, without_output_names((get_parts_of_reception(n), n.filters, meshes[name])))
             for name, n in self.nodes.items()
         )
-        self.kinds = list_alike_filters(self.groups, {name: node.filters for name, node in self.nodes.items()})
-        self.mesh_kinds = list_alike_meshes(self.groups, meshes)
-        self.places = FrozenMapping(find_estimate_places(self.groups, self.kinds))
+        self.stacks = list_stacks(self.groups, {name: node.filters for name, node in self.nodes.items()})
+        self.mesh_stacks = list_mesh_stacks(self.groups, meshes)
+        self.estimate_indices = FrozenMapping(find_estimate_indices(self.groups, self.stacks))
         # Links and fusions, which are checked by group.
         self._check_links()
         self._check_fused()

@@ -17,12 +17,9 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.centre_filter import CentreFilter
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
-from heliograph.simulation.centres.fusion_centre import (
-    CentreFilter,
-    CentreState,
-    FusionCentre,
-)
+from heliograph.simulation.centres.fusion_centre import CentreState, FusionCentre
 from heliograph.simulation.centres.fusions import (
     ReportFusion,
     StackedFusions,
@@ -32,8 +29,8 @@ from heliograph.simulation.centres.fusions import (
     list_stacked_fusions,
 )
 from heliograph.simulation.centres.linearised_centre import LinearisedCentre, LinearisedFusionState
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_building import build_meshes
+from heliograph.simulation.mesh.building import build_meshes
+from heliograph.simulation.mesh.mesh import Mesh
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_index import find_measurement_order
 from heliograph.simulation.runs.stacked_filters import (
@@ -41,17 +38,17 @@ from heliograph.simulation.runs.stacked_filters import (
     StepOutput,
     filter_step,
     initial_state,
-    stack_by_kind,
+    stack_filters,
 )
 
 
 class AllFilters(Module):
-    """Every filter of a network: those of the nodes by kind, fusion rules, informed centres, central filters.
+    """Every filter of a network: those of the nodes by stack, fusion rules, informed centres, central filters.
 
-    A group holds the nodes that differ in numbers alone; a kind holds, of one group, the filters that differ so.
+    A group holds the nodes that differ in numbers alone; a stack holds, of one group, the filters that differ so.
 
     Fields:
-        alike: the nodes' filters, those of a kind stacked.
+        stacks: the nodes' filters, those of one structure stacked.
         fusions: of the nodes' estimates by rules that know nothing of the nodes.
         centres: of the informed fusions, which know how the nodes' errors are correlated; one for each filter fused so.
         reporting: fusions by reports over uplinks, by name.
@@ -61,11 +58,11 @@ class AllFilters(Module):
         order: brings the groups' measurements, joined, into the order of the nodes; None where they are in it.
         complete: of each group, whether nothing of its measurements is ever missing.
         n: number of the plant's states.
-        smooths: central filters return smoother steps, as do those of the kinds that do.
+        smooths: central filters return smoother steps, as do those of the stacks that do.
         judges: filters judge their data.
     """
 
-    alike: tuple[StackedFilters, ...]
+    stacks: tuple[StackedFilters, ...]
     fusions: tuple[StackedFusions, ...]
     centres: tuple[FusionCentre | LinearisedCentre, ...]
     reporting: dict[str, ReportFusion]
@@ -81,27 +78,27 @@ class AllFilters(Module):
     def __init__(
         self,
         network: Network,
-        smoothed_kinds: Collection[int] | None = None,
+        smoothed_stacks: Collection[int] | None = None,
         judges: bool = False,
         tests: bool = False,
     ):
-        """Stack the filters of a network that differ in numbers alone (a kind), and build its fusions.
+        """Stack the filters of a network that differ in numbers alone, and build its fusions.
 
         Args:
             network: the network.
-            smoothed_kinds: numbers of the kinds of filters to be smoothed, with all central filters; None if nothing
+            smoothed_stacks: numbers of the stacks of filters to be smoothed, with all central filters; None if nothing
                 is.
             judges: whether filters test if their measurements are plausible, and leave out others on request.
             tests: whether fused estimates are tested: if what arrives at the next step is as they predict.
         """
-        self.smooths, self.judges = smoothed_kinds is not None, judges
-        self.alike = stack_by_kind(network, smoothed_kinds or (), judges)
+        self.smooths, self.judges = smoothed_stacks is not None, judges
+        self.stacks = stack_filters(network, smoothed_stacks or (), judges)
         # At the centre: filters of all measurements; fusions by rules that need nothing but the estimates; fusions that
         # need the joint covariance of the nodes' errors; fusions of reports over uplinks; fusions between neighbours.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
         self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
-        self.tests = make_fused_innovations(network, self.alike) if tests else {}
+        self.tests = make_fused_innovations(network, self.stacks) if tests else {}
         # `order` brings the groups' measurements into the nodes' order; `complete`: nothing of a group is ever missing.
         self.order = find_measurement_order(network.groups, network.rows)
         self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
@@ -110,12 +107,12 @@ class AllFilters(Module):
     def init(self) -> PyTree:
         """Return the states before the first step, as a tuple of six entries.
 
-        They are the states of: the nodes' filters, by kind (a stack of filters of one structure); central filters, by
+        They are the states of: the nodes' filters, by stack; central filters, by
         name; quantizers of the nodes' estimates, by stack of fusions; centres that propagate the joint covariance of
         the nodes' errors; fusions of reports and between neighbours, by name; and fused estimates that are tested.
         """
         central = {name: initial_state(filter) for name, filter in self.central.items()}
-        states = tuple(stacked.init() for stacked in self.alike)
+        states = tuple(stacked.init() for stacked in self.stacks)
         quantizers = tuple(fusion.init(self.n) for fusion in self.fusions)
         exchanges: dict[str, PyTree] = {name: fusion.init() for name, fusion in self.reporting.items()}
         exchanges |= {name: mesh.init() for name, mesh in self.meshes.items()}
@@ -128,20 +125,20 @@ class AllFilters(Module):
     ) -> CentreState | dict[str, LinearisedFusionState]:
         """Return a centre's state before the first step, from the initial means of the filters that it fuses.
 
-        `states`: states of the nodes' filters by kind, a stack of filters of one structure. `centre.sources`: (kind,
-        number within the kind) of each filter that it fuses.
+        `states`: states of the nodes' filters by stack. `centre.sources`: (stack,
+        number within the stack) of each filter that it fuses.
         """
         means = []
-        for kind, number in centre.sources:
+        for stack, number in centre.sources:
             # The rows of a stack are (filter and node), filter after filter.
-            means_by_filter = gaussian_of(states[kind]).mean.reshape(self.alike[kind].count, -1, self.n)
+            means_by_filter = gaussian_of(states[stack]).mean.reshape(self.stacks[stack].count, -1, self.n)
             means.append(means_by_filter[number])
         return centre.init(means)
 
     @property
     def are_linear_and_unfused(self) -> bool:
         """Whether all filters are linear with gains that depend on no data, and none of their estimates is fused."""
-        filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
+        filters = [*(stacked.filters for stacked in self.stacks), *self.central.values()]
         are_fused = self.fusions or self.centres or self.reporting or self.meshes
         return not are_fused and all(filter.is_linear for filter in filters)
 
@@ -153,23 +150,23 @@ class AllFilters(Module):
     def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
         """Return the matrices of step k of the filters that a centre fuses, one entry for each of its sources.
 
-        `states`: states of the nodes' filters by kind, before the step. The matrices depend on covariances alone, so
+        `states`: states of the nodes' filters by stack, before the step. The matrices depend on covariances alone, so
         the measurements are set to zero.
         """
         matrices = []
-        for kind, filter in centre.sources:
-            stacked, zeros = self.alike[kind], self._make_zeros(kind)
-            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[kind], filter, zeros, u, k))
+        for stack, filter in centre.sources:
+            stacked, zeros = self.stacks[stack], self._make_zeros(stack)
+            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[stack], filter, zeros, u, k))
         return matrices
 
     def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Return the states of the nodes' filters by kind after step k with measurements of zero, for their gains."""
-        stacks = enumerate(zip(self.alike, states, strict=True))
-        return tuple(stack.step(state, self._make_zeros(kind), u, k)[0] for kind, (stack, state) in stacks)
+        """Return the states of the nodes' filters by stack after step k with measurements of zero, for their gains."""
+        numbered = enumerate(zip(self.stacks, states, strict=True))
+        return tuple(stacked.step(state, self._make_zeros(stack), u, k)[0] for stack, (stacked, state) in numbered)
 
-    def _make_zeros(self, kind: int) -> jax.Array:
-        """Return measurements (node, received) of zero for the nodes of a kind."""
-        return jnp.zeros((self.alike[kind].nodes, self.alike[kind].filters.received))
+    def _make_zeros(self, stack: int) -> jax.Array:
+        """Return measurements (node, received) of zero for the nodes of a stack."""
+        return jnp.zeros((self.stacks[stack].nodes, self.stacks[stack].filters.received))
 
     def step(
         self,
@@ -188,13 +185,13 @@ class AllFilters(Module):
             u: inputs of the plant over the step.
             k: number of the step.
             drawn: what the uplinks and the links between neighbours do, by fusion; without, nothing is lost.
-            skip: reasons not to use data, codes of `Reason`: (filter, node) by kind, and by name of central filters.
+            skip: reasons not to use data, codes of `Reason`: (filter, node) by stack, and by name of central filters.
 
         Returns:
-            The states after the step, and its outputs: "estimates" by kind, (filter, node, ...), then those between
+            The states after the step, and its outputs: "estimates" by stack, (filter, node, ...), then those between
             neighbours; "fused" by name; "uplinks" of fusions with quantizers, and "reports" with their delays by
-            fusion, as the nodes send them; where filters smooth, their "smoother_steps" by kind and "central_steps" by
-            name; where they judge, "judged" and "weighed" by kind, "judged_centrally" and "weighed_centrally" by name,
+            fusion, as the nodes send them; where filters smooth, their "smoother_steps" by stack and "central_steps" by
+            name; where they judge, "judged" and "weighed" by stack, "judged_centrally" and "weighed_centrally" by name,
             and "tested", the squared innovations of fused estimates by name.
         """
         filter_states, central, quantizer_states, centre_states, exchange_states, tested = states
@@ -205,7 +202,7 @@ class AllFilters(Module):
         # The nodes' filters, and central ones on all measurements in the order of the nodes.
         stepped = [
             stacked.step(state, z[stacked.group], u, k, reason)
-            for stacked, state, reason in zip(self.alike, filter_states, reasons, strict=True)
+            for stacked, state, reason in zip(self.stacks, filter_states, reasons, strict=True)
         ]
         stepped_centrally = self._step_central_filters(central, z, u, k, central_reasons)
         # Fusions of the nodes' estimates.
@@ -223,7 +220,7 @@ class AllFilters(Module):
         }
         # What arrived now tests the fused estimates of the last step; those of this step are tested at the next.
         distances = {
-            name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
+            name: test.step(tested[name], self.stacks, filter_states, z, u, k, reasons)
             for name, test in self.tests.items()
         }
         tested_next = {name: following_prior(fused[name]) for name in self.tests}
@@ -279,7 +276,7 @@ class AllFilters(Module):
         Args:
             states: before the step, of the nodes' filters, quantizers, informed centres and exchanges of messages.
             z: measurements (node, received) by group of nodes.
-            estimates: of the nodes' filters by kind, (filter, node, ...).
+            estimates: of the nodes' filters by stack, (filter, node, ...).
             u: inputs of the plant over the step.
             k: number of the step.
             drawn: what the uplinks and the links between neighbours do, by fusion; without, nothing is lost.
@@ -335,18 +332,20 @@ class AllFilters(Module):
         """Step a centre: return its next state, and the nodes' estimates fused by the joint covariance of their errors.
 
         Args:
-            centre: knows the joint covariance; `sources`: (kind, number in it) of its filters, a kind being a stack.
+            centre: knows the joint covariance; `sources`: (stack, number in it) of its filters.
             state: state of the centre before the step.
-            states: states of the nodes' filters by kind before the step, from which their steps' matrices follow.
+            states: states of the nodes' filters by stack before the step, from which their steps' matrices follow.
             z: measurements (node, received) by group of nodes.
-            estimates: estimates of the nodes' filters by kind after the step, (filter, node, ...).
+            estimates: estimates of the nodes' filters by stack after the step, (filter, node, ...).
             u, k: inputs of the plant over the step, and its number.
         """
         matrices = []
-        for kind, number in centre.sources:
-            stack = self.alike[kind]
-            matrices.append(stack.compute_by_node(centre.compute_matrices, states[kind], number, z[stack.group], u, k))
-        means = [jnp.asarray(estimates[kind].mean)[number] for kind, number in centre.sources]
+        for stack, number in centre.sources:
+            stacked = self.stacks[stack]
+            matrices.append(
+                stacked.compute_by_node(centre.compute_matrices, states[stack], number, z[stacked.group], u, k)
+            )
+        means = [jnp.asarray(estimates[stack].mean)[number] for stack, number in centre.sources]
         return centre.step(state, matrices, means, u, k)
 
 

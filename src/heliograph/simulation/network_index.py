@@ -9,33 +9,33 @@ import numpy as np
 from heliograph.model.over_time import structure_key
 
 
-class AlikeFilters(NamedTuple):
-    """Filters that differ in numbers alone, one kind: those of the names `filters` at the nodes of one group."""
+class StackIndex(NamedTuple):
+    """Filters that differ in numbers alone, and so are stacked: those named `filters` at the nodes of one group."""
 
     group: int
     filters: tuple[str, ...]
 
 
-class EstimatePlace(NamedTuple):
-    """Where an estimate stands: number of its kind, of its filter within the kind, and of its node within the group."""
+class EstimateIndex(NamedTuple):
+    """Where an estimate stands: number of its stack, of its filter in the stack, and of its node in the group."""
 
-    kind: int
+    stack: int
     filter: int
     node: int
 
 
-def find_estimate_places(
-    groups: Sequence[Sequence[str]], kinds: Sequence[AlikeFilters]
-) -> dict[tuple[str, str], EstimatePlace]:
-    """Return the place of each estimate in the stacks of filters, by (node, name of the filter).
+def find_estimate_indices(
+    groups: Sequence[Sequence[str]], stacks: Sequence[StackIndex]
+) -> dict[tuple[str, str], EstimateIndex]:
+    """Return the index of each estimate in the stacks of filters, by (node, name of the filter).
 
-    `groups`: names of the nodes of each structure. `kinds`: filters of one structure at the nodes of a group.
+    `groups`: names of the nodes of each structure. `stacks`: filters of one structure at the nodes of a group.
     """
     return {
-        (node, name): EstimatePlace(kind=k, filter=f, node=i)
-        for k, kind in enumerate(kinds)
-        for f, name in enumerate(kind.filters)
-        for i, node in enumerate(groups[kind.group])
+        (node, name): EstimateIndex(stack=k, filter=f, node=i)
+        for k, stack in enumerate(stacks)
+        for f, name in enumerate(stack.filters)
+        for i, node in enumerate(groups[stack.group])
     }
 
 
@@ -47,29 +47,27 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
     return tuple(tuple(names) for names in names_by_structure.values())
 
 
-def list_alike_filters(
-    groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]
-) -> tuple[AlikeFilters, ...]:
-    """Return the kinds of filters, group after group; a kind is filters of one structure at the nodes of one group.
+def list_stacks(groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]) -> tuple[StackIndex, ...]:
+    """Return the stacks of filters, group after group; a stack is filters of one structure at the nodes of one group.
 
-    `filters`: the filters of each node, by node and name. Nodes of a group have alike filters, so the first node of a
-    group tells for all.
+    `filters`: the filters of each node, by node and name. Nodes of a group have filters of one structure, so the
+    first node of a group tells for all.
     """
     return tuple(
-        AlikeFilters(g, alike)
+        StackIndex(g, names_of_stack)
         for g, names in enumerate(groups)
-        for alike in group_by_structure(filters[names[0]].items())
+        for names_of_stack in group_by_structure(filters[names[0]].items())
     )
 
 
-def list_alike_meshes(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[AlikeFilters, ...]:
-    """Return a kind of one filter for each fusion between neighbours and each group of nodes that takes part in it.
+def list_mesh_stacks(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[StackIndex, ...]:
+    """Return a stack of one filter for each fusion between neighbours and each group of nodes that takes part in it.
 
     The fusions are sorted by name, as in compiled code. `meshes`: names of the fusions of each node.
     """
     all_meshes = sorted({mesh for of_node in meshes.values() for mesh in of_node})
     return tuple(
-        AlikeFilters(g, (mesh,)) for mesh in all_meshes for g, names in enumerate(groups) if mesh in meshes[names[0]]
+        StackIndex(g, (mesh,)) for mesh in all_meshes for g, names in enumerate(groups) if mesh in meshes[names[0]]
     )
 
 

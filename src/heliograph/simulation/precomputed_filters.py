@@ -24,31 +24,31 @@ def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -
     they receive the measurements of all nodes.
     """
     # The nodes' filters, of one structure in each stack; then the central filters.
-    stacks = [_precompute_stack(stack, u) if filters.complete[stack.group] else stack for stack in filters.alike]
+    stacks = [_precompute_stack(stack, u) if filters.complete[stack.group] else stack for stack in filters.stacks]
     central_filters = filters.central if all(filters.complete) else {}
     precomputed = {
         name: compute_once(_precompute_filter, _precompute_by_xla, (filter, u, filters.smooths))
         for name, filter in central_filters.items()
     }
-    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(stacks), filters.central | precomputed))
+    changed = eqx.tree_at(lambda f: (f.stacks, f.central), filters, (tuple(stacks), filters.central | precomputed))
     return cast(AllFilters, to_numpy(changed))
 
 
-def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
+def _precompute_stack(stacked: StackedFilters, u: Array) -> StackedFilters:
     """Return a stack of filters with everything that depends on no data computed ahead, for the inputs u.
 
     One program computes all filters: this library's native code, or XLA if native code refuses them.
     """
-    count = alike.count * alike.nodes  # of filters in the stack
-    arguments = alike.filters, u, alike.smooths
+    count = stacked.count * stacked.nodes  # of filters in the stack
+    arguments = stacked.filters, u, stacked.smooths
     with jax.enable_x64(True):
         # Native code runs once for each filter, as it does elsewhere for each run.
         choice = choose_code(_precompute_filter, arguments, differs_by_run=(True, False, False))
         if choice.code is None:
-            return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
+            return replace(stacked, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
     # A result that is the same for all filters was computed once, and is repeated for each filter.
     planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
-    return replace(alike, filters=planned)
+    return replace(stacked, filters=planned)
 
 
 def _precompute_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
@@ -71,5 +71,5 @@ def can_precompute(filters: AllFilters) -> bool:
     `AbstractFilter.planned` returns the filter itself; a class with gains that depend on no data overrides it, to
     return the filter with these gains computed.
     """
-    all_filters = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
+    all_filters = [*(stacked.filters for stacked in filters.stacks), *filters.central.values()]
     return any(type(filter).planned is not AbstractFilter.planned for filter in all_filters)

@@ -20,7 +20,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.memories_of_channels import number_unnamed_memories
 from heliograph.simulation.arguments import Precision, check_precision, make_run_key, read_plant_inputs
-from heliograph.simulation.centres.mesh_building import build_meshes
+from heliograph.simulation.mesh.building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node
@@ -124,7 +124,7 @@ def monte_carlo(
         if by_native_code is not None:
             return _return_with_warnings(by_native_code, network)
     # Otherwise XLA: the world, with gains computed beforehand where they depend on no data, and what is collected.
-    filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
+    filters = AllFilters(network, None if smoothing is None else smoothing.stacks)
     planned = precompute_filters(filters, u) if can_precompute(filters) else filters
     job = _SimulationJob(
         world=World(number_unnamed_memories(network.plant), make_reception(network), planned),

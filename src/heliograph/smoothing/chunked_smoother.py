@@ -1,6 +1,6 @@
 """Smoothing of a long recording in chunks of rows side by side, where smoothed states forget data far before and after.
 
-A chunk is filtered from the state with which it begins (`heliograph.filters.chunks`), over its own rows and a number of
+A chunk is filtered from the state with which it begins (`filters.rows.chunks`), over its own rows and a number of
 rows after them. The backward pass begins there with the filtered law; when it reaches the chunk's own rows, it has
 forgotten that start. The smoothed law of the state between two chunks is then computed twice: as that after the earlier
 chunk, and as that before the later one. If the two differ, the earlier chunk is smoothed again from the latter.
@@ -16,17 +16,17 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.factored_gaussian import Gaussian
-from heliograph.filters.chunks import (
+from heliograph.filters.rows.chunks import (
     ChunkStarts,
     find_chunk_starts,
     replace_chunk,
     rescan_wrong_starts,
     scan_means_where_settled,
 )
-from heliograph.filters.gaussians_in_states import find_equal_states, select_state
-from heliograph.filters.linear_recursion import initial_state_if_linear, scan_chunk
-from heliograph.filters.row_windows import Which, take, take_windows
-from heliograph.filters.settled_covariance import SettledState
+from heliograph.filters.rows.gaussians_in_states import find_equal_states, select_state
+from heliograph.filters.rows.linear_recursion import initial_state_if_linear, scan_chunk
+from heliograph.filters.rows.row_windows import Which, take, take_windows
+from heliograph.filters.rows.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.filters.smoother_step import EarlierState, SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, instance

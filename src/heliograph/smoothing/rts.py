@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable

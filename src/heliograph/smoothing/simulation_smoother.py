@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.factors.pivots import square_root
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance

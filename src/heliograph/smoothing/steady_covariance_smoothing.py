@@ -15,11 +15,11 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.factored_gaussian import Gaussian
-from heliograph.filters.chunks import ChunkStarts
-from heliograph.filters.gaussians_in_states import means_of, with_means
-from heliograph.filters.linear_recursion import Recursion
-from heliograph.filters.row_windows import take
-from heliograph.filters.settled_covariance import SettledState, find_settled_state, scan_settled_rows, step_settled
+from heliograph.filters.rows.chunks import ChunkStarts
+from heliograph.filters.rows.gaussians_in_states import means_of, with_means
+from heliograph.filters.rows.linear_recursion import Recursion
+from heliograph.filters.rows.row_windows import take
+from heliograph.filters.rows.settled_covariance import SettledState, find_settled_state, scan_settled_rows, step_settled
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, make_smoother_step
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, PyTree

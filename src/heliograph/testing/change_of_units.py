@@ -36,8 +36,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.monomials import list_exponents
 from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.shaped_noise import Shaped
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.shaped_noise import Shaped
 
 Modes = TypeVar("Modes", ChannelByPattern, ChannelByMode)  # a channel at one step, mode by mode
 
@@ -278,8 +278,8 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
     values: Modes = stack_over_time(channel)
     of_mean, of_spread = _list_channel_factors(units)
     noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
-    gains = of_spread * values.gain_spread
-    scaled: Modes = replace(values, mean=of_mean * values.mean, gain_spread=gains, noise=noise)
+    gains = of_spread * values.gain_covariance
+    scaled: Modes = replace(values, mean=of_mean * values.mean, gain_covariance=gains, noise=noise)
     return OverTime(scaled) if isinstance(channel, OverTime) else scaled
 
 

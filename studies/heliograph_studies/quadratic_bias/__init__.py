@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.random_affine.moments.noise_from_moments import NoiseMoments
+from heliograph.random_affine.noises.noise_from_moments import NoiseMoments
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
 from heliograph_studies import Sampled, Statement, Study, stated
 from heliograph_studies.curves import Curve, Panel, curves_over_time

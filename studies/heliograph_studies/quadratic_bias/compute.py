@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
-from heliograph.filters.linear.polynomial import MemoryFilter
+from heliograph.filters.linear.memory_filter import MemoryFilter
 from heliograph.linear.lmmse_recursion import lmmse, true_covariance
 from heliograph.linear.monomial_lifted_system import lifted_system
 from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate, skewness

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments import about_mean
-from heliograph.random_affine.moments.noise_from_moments import CentredNoise
+from heliograph.random_affine.noises import about_mean
+from heliograph.random_affine.noises.noise_from_moments import CentredNoise
 from heliograph.testing import check_filter
 from tests.follow import last
 

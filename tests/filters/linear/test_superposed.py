@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.numerics.float64 import in_float64
-from heliograph.random_affine.noise import FiniteSupport
+from heliograph.random_affine.noises.noise import FiniteSupport
 from heliograph.simulation.description.doubts import doubts_before_data
 
 STEADY = 0.1 / (1 - 0.95**2)

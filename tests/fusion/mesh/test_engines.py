@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.fusion import MatrixWeights, TraceIntersection
-from heliograph.simulation.centres import build_mesh
+from heliograph.simulation.mesh import build_mesh
 from tests.fusion.mesh.worlds import PLANT, network
 
 BURSTS = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.2), 0.1, 0.4)

@@ -11,7 +11,7 @@ from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.service import Service
 from heliograph.serving.storage import InMemoryStore
-from heliograph.simulation.centres import build_mesh
+from heliograph.simulation.mesh import build_mesh
 from tests.fusion.mesh.worlds import LINK, RING, RULES, network
 
 BURSTS = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.1), 0.05, 0.3)

@@ -197,7 +197,7 @@ def test_fixed_shares_are_refused_where_errors_grow_as_those_before_data_do(loss
     plant, near = hg.LinearPlant([[1.2]], [[0.1]], [0.0], [[1.0]]), {"b": ["a"], "c": ["b"]}
     link = hg.erasure(hg.perfect(), 1 - loss)
     with monkeypatch.context() as unrefused:
-        unrefused.setattr("heliograph.simulation.centres.mesh_check.check_error_decay", lambda *_: None)
+        unrefused.setattr("heliograph.simulation.mesh.check.check_error_decay", lambda *_: None)
         net = network({"m": RULES["diffusion"]}, near, link, plant=plant, rows={"a": ([[1.0]], 0.3)})
     error = hg.simulation.mean_mesh_errors(net, "m", 240).mean_trace()
     growth = (error[-1] / error[-101]) ** 0.01

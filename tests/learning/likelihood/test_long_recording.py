@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters import chunks
+from heliograph.filters.rows import chunks
 from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
 from heliograph.learning.parametric_network import describe
 

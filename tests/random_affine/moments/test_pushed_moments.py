@@ -13,7 +13,7 @@ from heliograph.random_affine.moments import (
     push_moments,
     push_through_known_map,
 )
-from heliograph.random_affine.noise import noise_moment_vector
+from heliograph.random_affine.noises.noise import noise_moment_vector
 from tests.random_affine.test_contract import CHANNELS
 
 

@@ -190,4 +190,4 @@ def test_the_product_of_known_gains_has_no_spread():
     """(a b)^2 is a^2 b^2 but for the last digit: the difference is no variance, and may be below zero."""
     for gain in np.linspace(0.3, 1.7, 40):
         chain = Series([hg.hop(gain, 1e-3), hg.hop(0.93, 1e-3)])
-        assert not np.any(second_order(chain).gain_spread)
+        assert not np.any(second_order(chain).gain_covariance)

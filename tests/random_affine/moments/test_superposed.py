@@ -10,7 +10,7 @@ import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.moments import evaluate_monomials, moment_tensors, second_moments
-from heliograph.random_affine.noise import FiniteSupport
+from heliograph.random_affine.noises.noise import FiniteSupport
 from heliograph.random_affine.sum_of_maps import Superposed
 
 FAIR = hg.Discrete([0.4, 1.3, -0.2], [0.5, 0.2, 0.3], 0.05)

@@ -333,7 +333,7 @@ class EventFilter(AbstractSizedFilter):
         for j in range(1 if self.alike else status.shape[1]):
             status_of_mode = status if self.alike else jnp.zeros_like(status).at[:, j].set(status[:, j])
             mode = jnp.argmax(chance > 0) if self.alike else j
-            moments = channel.mean, channel.gain_spread, channel.noise
+            moments = channel.mean, channel.gain_covariance, channel.noise
             links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
             prior.append(xry.relabel_sender(s, status_of_mode))
             updated.append(

@@ -23,7 +23,7 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
 
 
 def event_filter(
@@ -146,21 +146,21 @@ def _may_lose_components(channel: ChannelByPattern) -> bool:
 
 def _has_known_gain(channel: ChannelByPattern) -> bool:
     """Return whether no gain is random, and what arrives is all that was sent, in every mode."""
-    return _has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_spread(channel)[..., :-1, :-1])
+    return _has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_covariance(channel)[..., :-1, :-1])
 
 
-def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
+def _gain_and_noise_covariance(channel: ChannelByPattern) -> np.ndarray:
     """Return the covariance of (G, n) by mode and pattern of arrivals, with z = G y + n, and 0 for mere rounding.
 
-    A known gain has the spread 0, but E[G G'] - M M' with M = E G is computed as some eps of |M M'|. `squared_gain`
+    A known gain has covariance 0, but E[G G'] - M M' with M = E G is computed as some eps of |M M'|. `squared_gain`
     holds |M M'|, with a last row and column of zeros for n.
     """
-    gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
+    gain, covariance = np.asarray(channel.mean)[..., :-1], np.asarray(channel.covariance)
     size = np.abs(gain)
     squared_gain = size[..., :, None, :, None] * size[..., None, :, None, :]
     leading_axes = squared_gain.ndim - 2
     squared_gain = np.pad(squared_gain, [(0, 0)] * leading_axes + [(0, 1)] * 2)
-    return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * squared_gain, 0.0, spread)
+    return np.where(np.abs(covariance) <= 100 * np.finfo(float).eps * squared_gain, 0.0, covariance)
 
 
 def _has_gaussian_noise(*models: PyTree) -> bool:
@@ -173,7 +173,7 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
     """Return whether whatever arrives determines y, without noise.
 
     The fact that y was sent then says nothing more. It holds if in each possible mode and pattern of arrivals all
-    components arrive, gain and noise have no spread, and the gain has as many independent rows as y has components.
+    components arrive, gain and noise have no covariance, and the gain has as many independent rows as y has components.
     """
     # The pairs (mode, pattern of arrivals) that can occur and in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
@@ -182,19 +182,19 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
         # Rows are scaled to 1, so that the rank does not depend on units.
         row_size = np.abs(gain).max(axis=1, keepdims=True)
         scaled_gain = gain / np.where(row_size > 0, row_size, 1.0)
-        is_noise_free = arrives.all() and not np.any(_gain_and_noise_spread(channel)[j, a])
+        is_noise_free = arrives.all() and not np.any(_gain_and_noise_covariance(channel)[j, a])
         if not is_noise_free or np.linalg.matrix_rank(scaled_gain) < gain.shape[1]:
             return False
     return True
 
 
 def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
-    """Return whether what arrives has the same mean and spread in every mode in which it can arrive."""
+    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive."""
     possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
     for a, modes in enumerate(possible.T):
         if not channel.present[a].any() or not modes.any():
             continue
-        for moment in (np.asarray(channel.mean), np.asarray(channel.spread)):  # (mode, pattern, ...) each
+        for moment in (np.asarray(channel.mean), np.asarray(channel.covariance)):  # (mode, pattern, ...) each
             by_mode = moment[modes, a]
             if not np.array_equal(by_mode, np.broadcast_to(by_mode[:1], by_mode.shape)):
                 return False
@@ -212,10 +212,12 @@ def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
     all_or_nothing = np.all(channel.present, axis=1) | ~np.any(channel.present, axis=1)
     if not all_or_nothing.all():
         return False
-    # E[(G, n)] = (I, 0) without spread, in each mode in which something arrives.
+    # E[(G, n)] = (I, 0) without covariance, in each mode in which something arrives.
     arriving = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].all()]
     identity = np.eye(m, p + 1)
-    return all(np.array_equal(channel.mean[j, a], identity) and not np.any(channel.spread[j, a]) for j, a in arriving)
+    return all(
+        np.array_equal(channel.mean[j, a], identity) and not np.any(channel.covariance[j, a]) for j, a in arriving
+    )
 
 
 def _check_threshold_rule(
@@ -254,6 +256,6 @@ def _has_independent_losses(channel: ChannelByPattern) -> bool:
     for a in np.flatnonzero(chance[0] > 0):
         arriving = channel.present[a]
         is_unchanged = np.array_equal(channel.mean[0, a][arriving], np.eye(m, m + 1)[arriving])  # E[(G, n)] = (I, 0)
-        if not is_unchanged or np.any(channel.spread[0, a]):
+        if not is_unchanged or np.any(channel.covariance[0, a]):
             return False
     return np.allclose(chance_if_independent, chance[0], rtol=0, atol=1e-12)

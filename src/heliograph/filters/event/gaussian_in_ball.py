@@ -150,8 +150,8 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
         moments = upper_tail((radius - sign * centre) / deviation)
     possible = jnp.isfinite(moments.log_mass)
     mean = jnp.where(possible, centre + deviation * sign * moments.mean, centre)
-    spread = jnp.where(possible, variance * moments.variance, variance)
-    return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], spread[:, None, None])
+    variance_inside = jnp.where(possible, variance * moments.variance, variance)
+    return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], variance_inside[:, None, None])
 
 
 def _join_pieces(pieces: BallMoments) -> BallMoments:

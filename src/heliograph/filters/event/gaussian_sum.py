@@ -186,13 +186,13 @@ def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int]) -> Gaussia
     # Weights over the largest one, so that not all of them underflow; where all are 0 there is no largest one.
     top = jnp.max(mixture.log_weight)
     weight = jnp.exp(mixture.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
-    centre, spread = (
+    centre, variance = (
         mixture.gaussian.mean[:, places],
         jax.vmap(lambda x: x.columns.diagonal)(mixture.gaussian)[:, places],
     )
-    # Cost of each pair, and the pair of least cost. A pair of no spread or no weight is divided by 1, not by 0.
+    # Cost of each pair, and the pair of least cost. A pair of no variance or no weight is divided by 1, not by 0.
     w1, w2 = weight[first], weight[second]
-    both = spread[first] + spread[second]
+    both = variance[first] + variance[second]
     apart = (centre[first] - centre[second]) ** 2 / jnp.where(both > 0, both, 1.0)
     cost = w1 * w2 / jnp.where(w1 + w2 > 0, w1 + w2, 1.0) * jnp.sum(apart, axis=1)
     least = jnp.argmin(cost)

@@ -27,10 +27,10 @@ from heliograph.numerics.linalg import outer
 
 
 class LinkMoments(NamedTuple):
-    """Moments of z = G y + n: E[(G, n)] (m, p + 1), spread of the gain and noise as in `SecondOrder`."""
+    """Moments of z = G y + n: E[(G, n)] (m, p + 1), covariance of the gain and of the noise as in `SecondOrder`."""
 
     mean: jax.Array
-    gain_spread: jax.Array
+    gain_covariance: jax.Array
     noise: WeightedColumns
 
     def select_sender(self, sender: slice, m: int) -> "LinkMoments":
@@ -40,7 +40,7 @@ class LinkMoments(NamedTuple):
         """
         rows = slice(None) if sender == slice(0, m) else sender
         noise = WeightedColumns(self.noise.matrix[rows], self.noise.weights)
-        return LinkMoments(self.mean[rows], self.gain_spread[rows, rows], noise)
+        return LinkMoments(self.mean[rows], self.gain_covariance[rows, rows], noise)
 
 
 def augment_by_signal(
@@ -189,5 +189,5 @@ def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Arra
     mean_y, slopes_y = x.mean[-m:], x.root[-m:]
     gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n
     second_moment = WeightedColumns(slopes_y, x.variances).covariance + outer(mean_y, mean_y)  # E[y y']
-    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second_moment, mean_y))
+    noise = join_columns(link.noise, factor_gain_noise(link.gain_covariance, second_moment, mean_y))
     return gain @ mean_y + offset, gain @ slopes_y, noise

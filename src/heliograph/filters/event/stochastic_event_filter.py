@@ -18,10 +18,10 @@ from heliograph.filters.gaussian.gaussian_prediction import (
     smoother_step_by_transform,
 )
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
-from heliograph.filters.gaussian.signal_moments import Signal, factor_spread, find_signal_moments
+from heliograph.filters.gaussian.signal_moments import Signal, factor_covariance, find_signal_moments
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag
+from heliograph.filters.modes.correction_by_mode import correct_in_every_mode
 from heliograph.filters.modes.mixing import replicate
-from heliograph.filters.modes.multiple_model import correct_in_every_mode
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
@@ -211,11 +211,11 @@ class StochasticEventFilter(AbstractSizedFilter):
         """
         # P(mode, pattern of arrivals), 0 unless all components arrive.
         joint_probability = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
-        gain, spread = (
+        gain, covariance = (
             jnp.tensordot(joint_probability, jnp.asarray(moment), 2) / jnp.sum(joint_probability)
-            for moment in (channel.mean, channel.spread)
+            for moment in (channel.mean, channel.covariance)
         )
-        return gain[:, :-1], spread
+        return gain[:, :-1], covariance
 
     def _find_moment_changes_given_sent(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
@@ -260,7 +260,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         """
         y = _law_of_signal(signal)
         slopes = gain @ y.root
-        noise = factor_spread(covariance - WeightedColumns(slopes, y.variances).covariance)
+        noise = factor_covariance(covariance - WeightedColumns(slopes, y.variances).covariance)
         y, _ = condition_on_observation(y, slopes, value, noise)
         log_silent, _ = self._observe_silence(y, y.root, zero_covariance(len(y.mean)), y.mean, reference)
         return jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_silent, 0.0)), FLOOR))

@@ -41,7 +41,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal
 from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 MEAN_STEPS = 4  # to the mean of attitudes: of a deviation of 0.3 rad some 1e-9 are left
 
@@ -245,13 +245,13 @@ def open_loop_filter(
     Source: the prediction step of any of the filters, alone.
     """
     start = read_first_plant(plant)
-    mean, spread, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
+    mean, covariance, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
     claim = lower_claim_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),
         initial_mean=mean,
-        initial_covariance=spread,
+        initial_covariance=covariance,
         **make_sizes(claim, start, 0),
     )

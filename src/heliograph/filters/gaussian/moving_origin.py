@@ -22,7 +22,7 @@ from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.compensated_arithmetic import Compensated, compensate, split_sum
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 
 class PlantAboutCenter(AbstractPlant):
@@ -207,7 +207,7 @@ def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFi
     base: Any = filter
     if not isinstance(first(base.plant), AbstractPlant) or first(base.plant).attitude:
         return filter
-    has_known_gain = all(not np.any(step.gain_spread) and not step.uncertain for step in unstack(base.channel))
+    has_known_gain = all(not np.any(step.gain_covariance) and not step.uncertain for step in unstack(base.channel))
     about_origin = CentredFilter(base=base, known_gain=has_known_gain, **make_sizes(base.claim, base, base.received))
     return with_premise(about_origin, base.premise)
 

@@ -72,7 +72,7 @@ def robust_filter(
         instance("rule", rule, AbstractWeightingRule, "one such as Huber(1.345), or None for the score update")
     move = Cubature() if transform is None else transform
     instance("transform", move, AbstractTransform, "one such as Cubature()")
-    mean, spread, _ = choose_initial_moments(start, initial_mean, initial_covariance)
+    mean, covariance, _ = choose_initial_moments(start, initial_mean, initial_covariance)
     # The channel without the noise that is weighed, and that noise. Its components must be independent where its law's
     # branches are used: by the score (no rule) and by StudentVB.
     needs_law = rule is None or isinstance(rule, StudentVB)
@@ -81,7 +81,7 @@ def robust_filter(
         rule = rule.of_law(_student_degrees_of(first(noise)))
     robust = RobustFilter(
         plant=plant, sensor=sensor, channel=plain, noise=noise, rule=rule, transform=move, initial_mean=mean,
-        initial_covariance=spread, received_angles=find_received_angles(plant, sensor, channel), claim="nominal",
+        initial_covariance=covariance, received_angles=find_received_angles(plant, sensor, channel), claim="nominal",
         states=start.states, inputs=start.inputs, received=first(channel).outputs,
     )  # fmt: skip
     if isinstance(rule, Gate) and rule.gives_in:

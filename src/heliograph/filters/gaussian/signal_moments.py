@@ -130,40 +130,42 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
     combination of components without noise is known to eps. What the random gain adds, E[(G - M) y y' (G - M)'], is
     formed as a matrix and eliminated, which leaves some hundred eps in a combination without a random gain.
     """
-    return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, take_link_noise(channel))
+    return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_covariance, take_link_noise(channel))
 
 
 def take_link_noise(channel: SecondOrder) -> WeightedColumns:
     """Return columns of Cov n; of a traced law those with its derivatives, where the program is differentiated."""
     if not (writes_for_derivatives() and is_traced(channel.noise)):
         return channel.noise
-    return columns_with_derivatives(channel.nominal.center[..., -1, -1] - channel.gain_spread[..., -1, -1])
+    return columns_with_derivatives(channel.nominal.center[..., -1, -1] - channel.gain_covariance[..., -1, -1])
 
 
-def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
+def noise_behind_gain(
+    signal: Signal, gain: jax.Array, gain_covariance: Array, link: WeightedColumns
+) -> WeightedColumns:
     """Return the columns of Cov(M v + (G - M) y + n), the noise of z = G y + n behind the mean gain M.
 
-    v is the noise of the signal y. `gain_spread` is Cov G, and `link` holds columns of Cov n. `signal.size` bounds
+    v is the noise of the signal y. `gain_covariance` is Cov G, and `link` holds columns of Cov n. `signal.size` bounds
     E[y_i^2], which gives the rounding of M y.
     """
     rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
     without_gain_noise = keep_for_derivatives(
         triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
     )
-    return join_columns(without_gain_noise, factor_gain_noise(gain_spread, signal.second, signal.mean))
+    return join_columns(without_gain_noise, factor_gain_noise(gain_covariance, signal.second, signal.mean))
 
 
-def factor_gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
+def factor_gain_noise(gain_covariance: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
-    return factor_spread(contract(gain_spread, augmented_second_moment(second, mean, 1.0)))
+    return factor_covariance(contract(gain_covariance, augmented_second_moment(second, mean, 1.0)))
 
 
-def factor_spread(spread: jax.Array) -> WeightedColumns:
+def factor_covariance(covariance: jax.Array) -> WeightedColumns:
     """Return factors of a covariance that was formed as a matrix; each pivot is at least 100 eps of its variance.
 
     So large is the rounding of a combination that has no variance.
     """
-    return eliminate(spread, LOST * unit_of(spread))
+    return eliminate(covariance, LOST * unit_of(covariance))
 
 
 def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
@@ -171,7 +173,7 @@ def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) 
 
     `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of the gain G are those of its nominal law.
     """
-    return join_columns(take_link_noise(channel), factor_gain_noise(channel.gain_spread, second, mean))
+    return join_columns(take_link_noise(channel), factor_gain_noise(channel.gain_covariance, second, mean))
 
 
 def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:

@@ -17,7 +17,12 @@ from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, 
 from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.factors.pivots import reciprocal_or_zero
 from heliograph.factors.repeated_measurements import triangularise_noise
-from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
+from heliograph.filters.gaussian.signal_moments import (
+    ArrivedInnovation,
+    Signal,
+    augmented_second_moment,
+    factor_covariance,
+)
 from heliograph.filters.gaussian.young_scalars import (
     find_trace_minimising_scalars,
     young_fixed_point_map,
@@ -102,7 +107,7 @@ def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInn
     # The Kalman update: a^2 Omega - a M H P H' M'.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
     inflated_prior = prior._replace(variances=a * prior.variances)
-    return condition_on_observation(inflated_prior, slopes, a * z.innovation, factor_spread(noise), present)[0]
+    return condition_on_observation(inflated_prior, slopes, a * z.innovation, factor_covariance(noise), present)[0]
 
 
 def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
@@ -144,7 +149,7 @@ def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: Arrive
         jnp.sum(explained**2 @ explained_weights),
     )
     beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, terms)[0]
-    noise = factor_spread(base + shift / beta - of_state)
+    noise = factor_covariance(base + shift / beta - of_state)
     after, _ = condition_on_observation(prior, slopes, z.innovation, noise, present)
     bounded = from_columns(
         after.mean, join_columns(after.columns, WeightedColumns(explained, beta * explained_weights))

@@ -34,7 +34,7 @@ from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import (
     SecondOrder,
     describe_second_moments,
-    nominal_spread,
+    nominal_covariance,
     second_order,
 )
 
@@ -306,6 +306,6 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
         spread=make_map(spread + shift**2, noise),
         shift=make_map(shift**2, zero),
         power=make_map(power, zero),
-        nominal=nominal_spread(channel),
+        nominal=nominal_covariance(channel),
         uncertain=shift > 0,
     )

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.factored_gaussian import Gaussian
-from heliograph.filters.gaussians_in_states import MomentSlopes
 from heliograph.filters.linear.linear_filter_state import LinearBelief, MomentsBeforeData
 from heliograph.filters.linear.step_by_covariances import (
     FactoredStep,
@@ -23,6 +22,7 @@ from heliograph.filters.linear.step_by_covariances import (
     find_moments_at_start,
     step_by_covariances,
 )
+from heliograph.filters.rows.gaussians_in_states import MomentSlopes
 from heliograph.numerics.types import Array
 
 

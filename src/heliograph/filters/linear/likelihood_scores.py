@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compute_once
-from heliograph.filters.chunks import is_long, scan_in_chunks, sum_in_chunks
 from heliograph.filters.linear.innovation_derivatives import (
     EstimateWithDerivatives,
     differentiate_start,
     differentiate_step,
 )
-from heliograph.filters.linear_recursion import Recursion
+from heliograph.filters.rows.chunks import is_long, scan_in_chunks, sum_in_chunks
+from heliograph.filters.rows.linear_recursion import Recursion
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.gaussian_density import differentiate_log_density
 from heliograph.numerics.types import Array, PyTree

@@ -44,7 +44,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memories_of_channels import is_memory_dependent
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 from heliograph.random_affine.words.rounding_noise import find_rounded_noises
 
 if TYPE_CHECKING:  # what few calls need is loaded by them
@@ -127,8 +127,8 @@ class LinearFilter(AbstractSizedFilter):
     @property
     def has_known_gain(self) -> bool:
         """True if no gain is random: then no covariance needs E[x x'] before data. A traced gain counts as random."""
-        spread = stack_over_time(self.channel).gain_spread
-        return not (is_traced(spread) or np.any(np.asarray(spread)))
+        gain_covariance = stack_over_time(self.channel).gain_covariance
+        return not (is_traced(gain_covariance) or np.any(np.asarray(gain_covariance)))
 
     def score_rows(
         self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array

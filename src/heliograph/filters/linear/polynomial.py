@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.linear.scheduled_gains import LinearSystemFilter, ScheduledFilter, ScheduleState
+from heliograph.filters.linear.scheduled_gains import LinearSystemFilter, ScheduledFilter
 from heliograph.filters.linear.unconditional_mean import UnconditionalMean, centre_plant, find_unconditional_mean
 from heliograph.filters.modes.jump_linear_filter import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.monomial_lifted_system import lifted_system
 from heliograph.linear.plant_and_measurement_maps import check_model
-from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
@@ -30,9 +29,8 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.base import check_forgets, check_maps
 from heliograph.random_affine.moments.monomials import count_monomials, evaluate_monomials, position
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 
 
 class CentredState(NamedTuple):
@@ -94,29 +92,29 @@ class PolynomialFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> PyTree:
         """Return the inner filter's initial state, and E[x_0], which is subtracted before that filter."""
-        return CentredState(self.inner.init(), _initial_mean(self.centre, len(self.states)))
+        return CentredState(self.inner.init(), initial_mean(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: CentredState, u: ArrayLike = (), k: Step = 0) -> CentredState:
         """Predict with the inner filter of x - E[x], and propagate E[x]."""
-        return CentredState(self.inner.predict(state.inner, u, k), _predict_mean(self.centre, state.mean, k))
+        return CentredState(self.inner.predict(state.inner, u, k), predict_mean(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
         """Correct the inner filter with all monomials up to `degree` of z, or of z - E[z] if a mean is subtracted."""
-        z = _subtract_mean(self.centre, z, state.mean, k)
+        z = subtract_mean(self.centre, z, state.mean, k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
         after, innovation = self.inner.correct(state.inner, monomials, k)
-        return CentredState(after, state.mean), _select_degree_one(innovation, z, self.degree)
+        return CentredState(after, state.mean), select_degree_one(innovation, z, self.degree)
 
     @estimates
     def estimate(self, state: CentredState) -> Estimate:
         """Return the estimate of x: that of x - E[x] by the inner filter, plus E[x]."""
-        return _add_mean(self.inner.estimate(state.inner), state.mean)
+        return add_mean(self.inner.estimate(state.inner), state.mean)
 
     def after_step(self, state: CentredState, k: Step) -> Estimate:
         """Return the estimate of x after step k: that of x - E[x] by the inner filter, plus E[x]."""
-        return _add_mean(self.inner.after_step(state.inner, k), state.mean)
+        return add_mean(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the inner filter, whose state are monomials of x - E[x], with E[x] as shift.
@@ -124,7 +122,7 @@ class PolynomialFilter(AbstractSizedFilter):
         The inner filter measures the monomials of z - E[z], so they replace z in the trace of its step. The smoother
         step's projection picks x - E[x] among the monomials, and `shift` adds E[x].
         """
-        z = _subtract_mean(self.centre, step.z, step.prior.mean, step.k)
+        z = subtract_mean(self.centre, step.z, step.prior.mean, step.k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
         inner_step = step.map_states(lambda state: state.inner)._replace(z=monomials)
         return replace(self.inner.smoother_step(inner_step), shift=jnp.asarray(step.after.mean))
@@ -138,14 +136,14 @@ class PolynomialFilter(AbstractSizedFilter):
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
 
-def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
+def initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
     """Return E[x_0] (n,), where the unconditional mean `centre` begins; zeros if `centre` is None."""
     start = np.zeros(n) if centre is None else centre.start
     mean: jax.Array = library(start).asarray(start)
     return mean
 
 
-def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Array:
+def predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Array:
     """Return E[x+] = A E[x] + b over step k.
 
     `centre` has A and b of each step. If it is None, no mean is subtracted, and `mean` is returned as it is.
@@ -157,7 +155,7 @@ def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Arr
     return predicted
 
 
-def _subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
+def subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
     """Return z - E[z] = z - G C E[x] (m,), with E[x] = `mean` and the known gain G; z itself if `centre` is None.
 
     `centre.received` is G C at each step.
@@ -165,12 +163,12 @@ def _subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, 
     return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
 
-def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
+def add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
     """Add the mean of the state to an estimate of x - E[x]."""
     return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
 
 
-def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
+def select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
     """Return the innovation of z itself, selected from the innovation of all monomials of (z, 1) of this degree."""
     # z_i is the monomial of exponent 1 in z_i and degree - 1 in the constant, the last factor.
     m, position_of = len(z), position(len(z) + 1, degree)
@@ -209,14 +207,14 @@ def polynomial_filter(
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
     # The linear system of the powers, about the state's mean or about 0; its filter; and around that the states alone.
-    centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
+    centre, system = lift_about_mean(plant, sensor, channel, degree, horizon)
     claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     filter = PolynomialFilter(inner, degree, endless=_is_steady(plant, sensor, channel, system), centre=centre)
     return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
-def _lift_about_mean(
+def lift_about_mean(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
     """Lift the model to monomials up to `degree`, about its mean where the gain is known.
@@ -258,121 +256,10 @@ def scheduled_polynomial_filter(
 
     Source: as `polynomial_filter`.
     """
-    centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
+    centre, system = lift_about_mean(plant, sensor, channel, degree, horizon)
     schedule = lmmse(system, polynomial_claim(plant, sensor, channel, degree))
     filter = PolynomialFilter(ScheduledFilter(schedule, first(plant).states), degree, centre=centre)
     return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
-
-
-class MemoryState(NamedTuple):
-    """States of a linear filter and of a quadratic one (`products`), both of x - E[x], and the mean E[x] (n,)."""
-
-    linear: ScheduleState
-    products: ScheduleState
-    mean: Float[Array, " n"]
-
-
-class MemoryFilter(AbstractSizedFilter):
-    """Quadratic filter with memory: its measurement is z, its squares, and the products of z and the linear estimate.
-
-    A linear filter runs beside it. The products with its estimate, which sums up all earlier z, are the memory. Both
-    filters have saved gains, for complete data: after a gap the covariance is NaN. The innovation is that of z itself,
-    with its exact covariance. `centre` is the recursion of the unconditional mean E[x] if both filters are of x - E[x],
-    else None.
-    """
-
-    linear: ScheduledFilter
-    products: ScheduledFilter
-    centre: UnconditionalMean | None
-
-    def __init__(
-        self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: UnconditionalMean | None = None
-    ):
-        """Join the two filters.
-
-        Args:
-            linear: filter of z, which gives the linear estimate xhat.
-            products: filter of the measurement (z, z z', z xhat'), which gives the final estimate.
-            claim: what the covariance is said to be: exact, an upper bound or nominal.
-            centre: recursion of the unconditional mean that is subtracted before both, or None.
-        """
-        self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
-        self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
-        self.kept = products.kept
-
-    @in_float64
-    def init(self) -> MemoryState:
-        """Return the initial states of both filters, and E[x_0], which is subtracted before them."""
-        return MemoryState(self.linear.init(), self.products.init(), _initial_mean(self.centre, len(self.states)))
-
-    @predicts
-    def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
-        """Predict with the linear and the quadratic filter of x - E[x], and propagate E[x]."""
-        linear, products = self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k)
-        return MemoryState(linear, products, _predict_mean(self.centre, state.mean, k))
-
-    @corrects
-    def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
-        """Correct the linear filter with z, then the quadratic one with (z, z z', z xhat'), xhat the linear estimate.
-
-        If the gain is known, z - E[z] replaces z: moments about the mean lose no digits to a large mean. The returned
-        innovation is that of z alone.
-        """
-        z = _subtract_mean(self.centre, z, state.mean, k)
-        linear, _ = self.linear.correct(state.linear, z, k)
-        monomials = evaluate_monomials(z, degree=2)[:-1]  # z and its squares, without the constant
-        measurement = jnp.concatenate([monomials, jnp.outer(z, linear.mean).reshape(-1)])
-        products, innovation = self.products.correct(state.products, measurement, k)
-        return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, degree=2)
-
-    @estimates
-    def estimate(self, state: MemoryState) -> Estimate:
-        """Return the estimate of x: that of x - E[x] by the quadratic filter, plus E[x]."""
-        return _add_mean(self.products.estimate(state.products), state.mean)
-
-    def after_step(self, state: MemoryState, k: Step) -> Estimate:
-        """Return the estimate of x after step k: that of x - E[x] by the quadratic filter, plus E[x]."""
-        return _add_mean(self.products.after_step(state.products, k), state.mean)
-
-
-def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
-    """Return the quadratic filter whose products reach into the past through the linear filter's estimate.
-
-    Its measurement is z, the products of the components of z, and the products of z with the estimate of the linear
-    filter (LMMSE). That estimate is a linear function of all earlier z, so products with it bring in the past at little
-    cost.
-
-    Args:
-        plant: a linear plant without inputs, n states.
-        sensor: a linear sensor, m outputs.
-        channel: from the sensor to the filter, without memory.
-        horizon: number of steps.
-
-    Claim: what the covariance is said to be is as for `polynomial_filter` at degree 2, "exact" if all laws are known,
-    else "nominal". The error is never larger than that of the quadratic filter, whose measurements are among these.
-
-    Raises:
-        ValueError: what `polynomial_filter` refuses; a channel with memory.
-
-    Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
-    """
-    check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
-    claim = polynomial_claim(plant, sensor, channel, degree=2)
-    centre, system = _lift_about_mean(plant, sensor, channel, degree=1, horizon=horizon)
-    # First the linear filter, whose gains decide the moments of the products of its estimate with z. Then the LMMSE
-    # filter of the system whose state is all products up to degree 2 of (x, linear estimate, z), about the mean of x.
-    linear = lmmse(system, claim)
-    centred_plant = plant if centre is None else centre_plant(plant)
-    products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
-    names = first(plant).states
-    filter = MemoryFilter(
-        linear=ScheduledFilter(linear, names),
-        products=ScheduledFilter(products, names),
-        claim=products.claim,
-        centre=centre,
-    )
-    # Covariances of products of two numbers are moments of order 4.
-    return with_premise(filter, Premise(plant, sensor, channel, order=4))
 
 
 def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:

@@ -68,15 +68,15 @@ def find_model_matrices(
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)  # law of the sensor's noise, and M = E[G]
     F, b, Q = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-    # `nominal` has the covariances of the entries of (G, n), that of n_i and n_j at [i, j, -1, -1]. `gain_spread` has
-    # those of G alone, or of (G, n) if G and n are correlated; then n is counted below, with G.
-    uncorrelated_noise = jnp.asarray(channel.nominal.center[..., -1, -1] - channel.gain_spread[..., -1, -1])
+    # `nominal` has the covariances of the entries of (G, n), that of n_i and n_j at [i, j, -1, -1]. `gain_covariance`
+    # has those of G alone, or of (G, n) if G and n are correlated; then n is counted below, with G.
+    uncorrelated_noise = jnp.asarray(channel.nominal.center[..., -1, -1] - channel.gain_covariance[..., -1, -1])
     R = gain @ jnp.asarray(law.covariance) @ gain.T + uncorrelated_noise  # M Cov(v) M' + Cov n
     if moments is not None:
         moments = moments.predict(F, b, Q)
         # A random gain adds the noise (G - M) y: R_ij += sum_ab Cov(G_ia, G_jb) E[(y, 1)_a (y, 1)_b].
         y = moments.measure(sensor)
-        R = R + contract(channel.gain_spread, augmented_second_moment(y.second, y.mean, 1.0))
+        R = R + contract(channel.gain_covariance, augmented_second_moment(y.second, y.mean, 1.0))
     H, c = gain @ jnp.asarray(sensor.matrix), gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset)
     return ModelMatrices(F=F, b=b, Q=Q, H=H, c=c, R=R), moments
 

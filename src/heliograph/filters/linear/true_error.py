@@ -157,7 +157,7 @@ def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: Channel
     Args:
         moments: E[r r' 1{mode}] after the prediction.
         sensor: the true sensor.
-        channel: E[(G, n)] (M, m, p + 1) and the covariances of its rows, `spread` (M, m, m, p + 1, p + 1), by mode.
+        channel: E[(G, n)] (M, m, p + 1) and the covariances of its rows, `covariance` (M, m, m, p + 1, p + 1), by mode.
         step: the filter's K, C and c.
     """
     # K, E[(G, n)] by mode, D, and the covariance of (v, 0).
@@ -175,7 +175,7 @@ def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: Channel
     # Second moment of the zero-mean terms without K, an m x m matrix for each mode j: entry (i, l) of the first is
     # sum_ab Cov[(G, n)_ia, (G, n)_lb] E[(y, 1)_a (y, 1)_b 1{mode j}].
     signal_moments = propagate_by_mode(D, moments[:, : n + 1, : n + 1], probability * noise)
-    by_channel = np.einsum("jilab,jab->jil", np.asarray(channel.spread), signal_moments)
+    by_channel = np.einsum("jilab,jab->jil", np.asarray(channel.covariance), signal_moments)
     by_sensor = probability * propagate_by_mode(mean, noise, 0.0)
     # A_j E[r r' 1{mode j}] A_j', and K (...) K' in the block of s.
     after: np.ndarray = propagate_by_mode(A, moments, 0.0)

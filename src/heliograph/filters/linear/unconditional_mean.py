@@ -11,8 +11,8 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.moments.noise_from_moments import about_mean
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise_from_moments import about_mean
 
 T = TypeVar("T")
 

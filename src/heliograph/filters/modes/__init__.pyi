@@ -9,6 +9,7 @@ from .arrival_patterns import describe_by_pattern as describe_by_pattern
 from .arrival_patterns import pattern_of as pattern_of
 from .channel_by_mode import ChannelByMode as ChannelByMode
 from .channel_by_mode import channels_by_mode as channels_by_mode
+from .correction_by_mode import correct_in_every_mode as correct_in_every_mode
 from .finite_support_filter import AtomCombinations as AtomCombinations
 from .finite_support_filter import MixtureFilter as MixtureFilter
 from .jump_linear_filter import ModalFilter as ModalFilter
@@ -19,7 +20,6 @@ from .mode_observed import ModeObservedFilter as ModeObservedFilter
 from .models_by_mode import find_models as find_models
 from .multiple_model import ModalBeliefs as ModalBeliefs
 from .multiple_model import MultipleModelFilter as MultipleModelFilter
-from .multiple_model import correct_in_every_mode as correct_in_every_mode
 from .multiple_model import imm_filter as imm_filter
 from .side_information import SideInformationFilter as SideInformationFilter
 from .side_information import side_information_filter as side_information_filter

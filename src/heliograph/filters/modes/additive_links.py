@@ -28,7 +28,7 @@ from heliograph.factors.covariance_factors import (
 )
 from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
-from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.gaussian.signal_moments import factor_covariance
 from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.filters.modes.jump_linear_filter import (
     AbstractModalFilter,
@@ -198,7 +198,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         ]
         draw = _block_diagonal_columns(np.zeros((1, 0)), draw_covariances)
         # Cov(e (x) A~ x~) = Cov e (x) A~ E[x~ x~'] A~'
-        moved_state = factor_spread(A @ state.second @ A.T)
+        moved_state = factor_covariance(A @ state.second @ A.T)
         noise_of_draw = WeightedColumns(
             kron(draw.matrix, moved_state.matrix), outer(draw.weights, moved_state.weights).reshape(-1)
         )
@@ -236,14 +236,14 @@ class AdditiveModalFilter(AbstractModalFilter):
         known_noise += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
         # Random gain about its mean in mode j: sum_j P(j) E[(G - E G) E[y~ y~'] (G - E G)' | j].
         gain_noise = sum(
-            jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_spread), signal_moment)
+            jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_covariance), signal_moment)
             for term, law in zip(terms, state.laws, strict=True)
         )
         # Rounding errors of z, in proportion to its second moments (m,) sum_c weight_c (D_c E[y~ y~'] D_c')_mm.
         rounding = rounding_of(
             jnp.einsum("c,cmp,pq,cmq->m", gamma.weights, gain_by_column, signal_moment, gain_by_column)
         )
-        noise = join_columns(*known_noise, rounding, factor_spread(jnp.asarray(gain_noise)))
+        noise = join_columns(*known_noise, rounding, factor_covariance(jnp.asarray(gain_noise)))
         # H is `output` by function without its constant, which is in `common`.
         return MeasurementModel(concatenate_modes(output.at[0, :, -1].set(0.0)), common, noise)
 
@@ -294,7 +294,7 @@ def _block_diagonal_columns(first_factor: np.ndarray, covariances: Sequence[jax.
 
     `first_factor` (1, columns) is the factor `one` of the first block. An empty C_i adds nothing.
     """
-    factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
+    factors = [factor_covariance(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(first_factor.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)
     blocks: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)

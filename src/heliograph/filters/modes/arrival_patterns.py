@@ -22,10 +22,10 @@ class ChannelByPattern(Module):
     """A channel at one step, by mode and by pattern of arrivals.
 
     transition: of the modes from the step before to this one. For each pattern of components that arrive: `present`,
-    its `chance` in each mode, and in that mode and pattern E[(G, n)] and, as in `SecondOrder`, `gain_spread` and
+    its `chance` in each mode, and in that mode and pattern E[(G, n)] and, as in `SecondOrder`, `gain_covariance` and
     `noise`. flags: P(flag | mode).
 
-    Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), gain_spread (M, A, m, m, p + 1,
+    Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), gain_covariance (M, A, m, m, p + 1,
     p + 1), noise (M, A, m, m), flags (M, F).
     """
 
@@ -33,17 +33,17 @@ class ChannelByPattern(Module):
     present: Bool[Array, "A m"]
     chance: Float[Array, "M A"]
     mean: Float[Array, "M A m p1"]
-    gain_spread: Float[Array, "M A m m p1 p1"]
+    gain_covariance: Float[Array, "M A m m p1 p1"]
     noise: WeightedColumns
     flags: Float[Array, "M F"]
 
     @property
-    def spread(self) -> Float[Array, "M A m m p1 p1"]:
+    def covariance(self) -> Float[Array, "M A m m p1 p1"]:
         """Covariances Cov((G, n)_ik, (G, n)_jl | mode, pattern of arrivals), for z = G y + n.
 
         Axes: mode, pattern, i, j (components of z), k, l (components of y, and n as the last).
         """
-        return join_gain_and_noise(self.gain_spread, self.noise)
+        return join_gain_and_noise(self.gain_covariance, self.noise)
 
 
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[ChannelByPattern]:
@@ -107,7 +107,7 @@ def _describe_step_by_pattern(
         present=np.array(patterns).reshape(len(patterns), m),
         chance=chance,
         mean=xp.reshape(xp.stack(means), (*shape, m, p)),
-        gain_spread=xp.reshape(xp.stack(gains), (*shape, m, m, p, p)),
+        gain_covariance=xp.reshape(xp.stack(gains), (*shape, m, m, p, p)),
         noise=noise,
         flags=flags,
     )

@@ -8,29 +8,29 @@ from heliograph.numerics.numpy_or_jax import stack_parts
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.gain_and_noise_covariances import join_gain_and_noise, split_off_noise
-from heliograph.random_affine.moments.second_moments import nominal_spread
+from heliograph.random_affine.moments.second_moments import nominal_covariance
 
 
 class ChannelByMode(Module):
     """A channel z = G y + n at one step, mode by mode: E[(G, n) | mode], and the covariance of (G, n) about it.
 
     transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
-    gain_spread and noise: as in `SecondOrder`, for each mode.
+    gain_covariance and noise: as in `SecondOrder`, for each mode.
 
-    Shapes: transition and radius (M, M), mean (M, m, p + 1), gain_spread (M, m, m, p + 1, p + 1), noise (M, m, m).
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), gain_covariance (M, m, m, p + 1, p + 1), noise (M, m, m).
     """
 
     transition: Float[Array, "M M"]
     radius: Float[Array, "M M"]
     mean: Float[Array, "M m p1"]
-    gain_spread: Float[Array, "M m m p1 p1"]
+    gain_covariance: Float[Array, "M m m p1 p1"]
     noise: WeightedColumns
 
     @property
-    def spread(self) -> Float[Array, "M m m p1 p1"]:
+    def covariance(self) -> Float[Array, "M m m p1 p1"]:
         """Covariances Cov((G, n)_ik, (G, n)_jl | mode) as [mode, i, j, k, l], for z = G y + n."""
-        spread: Array = join_gain_and_noise(self.gain_spread, self.noise)
-        return spread
+        covariance: Array = join_gain_and_noise(self.gain_covariance, self.noise)
+        return covariance
 
 
 def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
@@ -54,7 +54,7 @@ def channel_by_mode(step: JointModes, step_before: JointModes) -> ChannelByMode:
     """
     # E[(G, n)] by mode, and Cov(G, n) under the nominal law as the gains' covariance and columns of the noise.
     mean = stack_parts([affine.moments(1).mean[:-1] for affine in step.maps])
-    gains, noises = zip(*(split_off_noise(nominal_spread(affine).center) for affine in step.maps), strict=True)
+    gains, noises = zip(*(split_off_noise(nominal_covariance(affine).center) for affine in step.maps), strict=True)
     noise = WeightedColumns(
         stack_parts([noise.matrix for noise in noises]), stack_parts([noise.weights for noise in noises])
     )
@@ -62,6 +62,6 @@ def channel_by_mode(step: JointModes, step_before: JointModes) -> ChannelByMode:
         transition=step_before.transition,
         radius=step_before.radius,
         mean=mean,
-        gain_spread=stack_parts(gains),
+        gain_covariance=stack_parts(gains),
         noise=noise,
     )

@@ -30,7 +30,7 @@ from heliograph.factors.covariance_factors import (
 from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
-from heliograph.filters.gaussian.signal_moments import condition_on_measurement, factor_spread
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement, factor_covariance
 from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.filters.modes.linear_by_mode import (
@@ -248,7 +248,9 @@ class ModalFilter(AbstractJointModalFilter):
         # Y_j = E[y~ y~' 1{mode = j}] = C~_j E[x~ x~' 1{mode = j}] C~_j' + P(j) R~_j (M, p + 1, p + 1)
         signal_moments = propagate_by_mode(sensor_matrices, state.moments, law[:, None, None] * sensor_noises)
         # Cov v, first the random gains: sum_j E[(G - Hbar_j) Y_j (G - Hbar_j)' | j].
-        gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), signal_moments))
+        gain_noise = factor_covariance(
+            jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_covariance), signal_moments)
+        )
         # Then noise of sensor and links, sum_j P(j) (Hbar_j R_j Hbar_j' + Cov n_j), and rounding.
         known_noise = factor_known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
         rounding = rounding_of_received(gains, signal_moments)

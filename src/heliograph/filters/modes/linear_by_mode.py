@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns, rounding_of
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
-from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.gaussian.signal_moments import factor_covariance
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.linalg import outer
@@ -171,7 +171,7 @@ def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
     last, whose block is minus the sum of the others. So the singular covariance of all is never factored.
     """
     other_modes, size = covariance.shape[:2]
-    factors = factor_spread(covariance.reshape(other_modes * size, other_modes * size))
+    factors = factor_covariance(covariance.reshape(other_modes * size, other_modes * size))
     minus_sum = -np.tile(np.eye(size), (1, other_modes))
     return factors.through(np.concatenate([np.eye(other_modes * size), minus_sum]))
 

@@ -224,7 +224,7 @@ def mix_and_predict(
     # A m + B u + E w and the covariance A P A'.
     matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, initial_power).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(components.mean)
-    spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(components)
+    covariances = jax.vmap(lambda x: x.columns.through(matrix).covariance)(components)
 
     def mix_moved(weights: jax.Array) -> Gaussian:
         """Return the Gaussian of one mixture of the moved components, with process noise: Cov(mixture) + Q.
@@ -232,7 +232,7 @@ def mix_and_predict(
         With the means m_c and covariances A P_c A' of the moved components and `weights` w_c: m = sum w_c m_c, and
         Cov(mixture) = sum w_c (A P_c A' + (m_c - m) (m_c - m)').
         """
-        mean, covariance = moments_of_mixture(means, spreads, weights)
+        mean, covariance = moments_of_mixture(means, covariances, weights)
         return from_covariance_by_elimination(mean, covariance + noise)
 
     moved: Gaussian = jax.vmap(mix_moved, in_axes=1)(shares)

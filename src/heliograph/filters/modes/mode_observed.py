@@ -37,7 +37,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memories_of_channels import condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.second_moment_map import QuadraticMap
-from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments, nominal_spread
+from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments, nominal_covariance
 
 
 class ModeObservedBelief(NamedTuple):
@@ -211,17 +211,17 @@ def _find_moments_of_next_states(
 
 
 def _find_nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the mean and spread of the channel under the nominal law, for numbers that may be traced.
+    """Return the mean and covariance of the channel under the nominal law, for numbers that may be traced.
 
     The nominal law has the probabilities as given, without their radii of uncertainty. Traced numbers are those that a
     fit searches.
     """
-    mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
-    spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
+    mean, covariance = jnp.asarray(channel.moments(1).mean[:-1]), nominal_covariance(channel)
+    covariance = QuadraticMap(jnp.asarray(covariance.center), jnp.asarray(covariance.radius))
     # Bounds of an uncertain law are not used: their maps are zero.
-    zero_map = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
+    zero_map = QuadraticMap(jnp.zeros_like(covariance.center), jnp.zeros_like(covariance.radius))
     return describe_second_moments(
-        mean=mean, spread=spread, shift=zero_map, power=zero_map, nominal=spread, uncertain=False
+        mean=mean, spread=covariance, shift=zero_map, power=zero_map, nominal=covariance, uncertain=False
     )
 
 

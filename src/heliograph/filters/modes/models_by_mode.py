@@ -42,17 +42,17 @@ def _check_density(channel: ChannelByPattern) -> None:
     """Raise ValueError unless z has a density in every mode and pattern of arrivals, for an x that has one.
 
     Otherwise z in this mode lies in a subspace, and such a value would have an infinite likelihood in it.
-    `channel.present` says which components arrive in a pattern. `channel.mean` and `channel.spread` are the mean and
-    covariance of (G, n) with z = G y + n. Traced moments have no numbers, and are not checked: their assumed values
+    `channel.present` says which components arrive in a pattern. `channel.mean` and `channel.covariance` are those of
+    (G, n) with z = G y + n. Traced moments have no numbers, and are not checked: their assumed values
     were checked before.
     """
-    if is_traced((channel.mean, channel.gain_spread, channel.noise)):
+    if is_traced((channel.mean, channel.gain_covariance, channel.noise)):
         return
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         # With E[y y'] = I, E[z z'] = E[G] E[G]' + sum_a Cov(G_ia, G_la) + Cov n. It is regular if every combination of
         # the components that arrive is random.
         arriving, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
-        second_moment = gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a]))
+        second_moment = gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.covariance[j, a]))
         if np.linalg.matrix_rank(second_moment[np.ix_(arriving, arriving)]) < len(arriving):
             raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
 

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import (
     Gaussian,
     from_covariance,
@@ -34,12 +33,10 @@ from heliograph.filters.gaussian.gaussian_prediction import (
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import (
     Signal,
-    condition_on_measurement,
     find_signal_moments,
-    noise_behind_gain,
 )
-from heliograph.filters.innovation import mixed_innovation, posterior_weights
-from heliograph.filters.modes.arrival_patterns import ChannelByPattern, pattern_of
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.correction_by_mode import correct_in_every_mode
 from heliograph.filters.modes.mixing import (
     AbstractMerging,
     MergeAll,
@@ -61,61 +58,8 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-
-
-def correct_in_every_mode(
-    signal: Signal,
-    channel: ChannelByPattern,
-    mode: jax.Array,
-    weight: jax.Array,
-    z: jax.Array,
-    angles: Angles = (),
-) -> tuple[Gaussian, jax.Array, Innovation]:
-    """Return the posteriors of several Gaussians, each corrected in its mode, their weights, the mixture's innovation.
-
-    The weight becomes proportional to weight P(which components arrive | mode) N(z; ...). The innovation's likelihood
-    is that of z given which components arrive.
-
-    Args:
-        signal: moments of the sensor's signal y under each Gaussian of the state x (K, ...).
-        channel: moments of z = G y + n and probability of arrival, by mode and pattern (which components arrive).
-        mode: the mode in which each Gaussian is corrected (K,).
-        weight: probability of each Gaussian and its mode (K,).
-        z: measurement (m,), NaN for what did not arrive.
-        angles: components of z that are angles.
-    """
-    # Channel moments by mode, given which components arrived.
-    pattern = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
-    moments = channel.mean, channel.gain_spread, channel.noise
-    links = jax.tree.map(lambda by_mode: jnp.asarray(by_mode)[mode, pattern], moments)
-    # Prior weights given which components arrived, as they were if that is impossible in all modes.
-    joint = weight * jnp.asarray(channel.chance)[mode, pattern]
-    total = jnp.sum(joint)
-    prior = jnp.where(total > 0, joint / jnp.where(total > 0, total, 1.0), weight)
-    correct = partial(_correct_in_mode, z=z, angles=angles)
-    posteriors, innovations = jax.vmap(correct)(signal, *links)
-    # Posterior weights. A Gaussian stays as it is if its mode, or every mode, cannot produce such a value.
-    weights, density, excluded = posterior_weights(prior, jnp.where(joint > 0, innovations.log_likelihood, -jnp.inf))
-    is_possible = (joint > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
-    corrected = jax.tree.map(lambda a, b: jnp.where(is_possible[:, None], a, b), posteriors, signal.prior)
-    value = wrap_near(jnp.asarray(innovations.value), innovations.value[jnp.argmax(prior)], angles)
-    return corrected, weights, mixed_innovation(prior, value, innovations.covariance, density)
-
-
-def _correct_in_mode(
-    signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
-) -> tuple[Gaussian, Innovation]:
-    """Correct the prior of a signal y with z = G y + n in one mode of the channel.
-
-    In this mode `mean` is E[(G, n)], `gain_spread` is Cov G and `link` holds columns of Cov n; `angles` are those of z.
-    """
-    gain = mean[:, :-1]
-    expected = gain @ signal.mean + mean[:, -1]
-    z = wrap_near(z, expected, angles)
-    slopes, noise = gain @ signal.slopes, noise_behind_gain(signal, gain, gain_spread, link)
-    return condition_on_measurement(signal.prior, slopes, noise, z, expected)
 
 
 class ModalBeliefs(NamedTuple):

@@ -23,9 +23,9 @@ from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, se
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.correction_by_mode import correct_in_every_mode
 from heliograph.filters.modes.mixing import align_angles, replicate
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
-from heliograph.filters.modes.multiple_model import correct_in_every_mode
 from heliograph.filters.particles.factory import build_partly_drawn
 from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (

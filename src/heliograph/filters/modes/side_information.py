@@ -21,7 +21,7 @@ from heliograph.factors.factored_gaussian import Innovations, from_covariance
 from heliograph.factors.pivots import reciprocal_or_zero, square_root, unit_of
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
-from heliograph.filters.gaussian.signal_moments import bound_signal_power_at_start, factor_spread
+from heliograph.filters.gaussian.signal_moments import bound_signal_power_at_start, factor_covariance
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag, describe_by_pattern, pattern_of
 from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows, spoil_where_known
 from heliograph.filters.modes.jump_linear_filter import concatenate_modes, make_mode_sum_matrix, subtract_mean_output
@@ -169,7 +169,7 @@ class SideInformationFilter(AbstractSizedFilter):
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
         excess = jnp.asarray(weight - 1)[:, None] * state.variances
         links = jax.tree.map(
-            lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
+            lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_covariance, channel.noise)
         )
         power = second_moments_at_start(self.plant)
         size = bound_signal_power_at_start(sensor, power)
@@ -220,7 +220,7 @@ def _make_measurement_model(
     sensor: LinearSensor,
     size: jax.Array,
     gains: jax.Array,
-    gain_spread: jax.Array,
+    gain_covariance: jax.Array,
     link: WeightedColumns,
 ) -> StackedMeasurementModel:
     """Return what is received of zeta = x~ 1{mode}: the output matrix, the mean output, and the noise in each mode.
@@ -235,7 +235,7 @@ def _make_measurement_model(
         sensor: the linear sensor, which gives C~ and R~ = Cov v~.
         size: squares of the numbers that are summed in y, for rounding (p,).
         gains: Hbar_j (M, m, p + 1).
-        gain_spread: the tensor of T_j (M, m, m, p + 1, p + 1).
+        gain_covariance: the tensor of T_j (M, m, m, p + 1, p + 1).
         link: columns of Cov n_j (M, m, m).
     """
     measure, noise = centred_measurement(sensor, state.centre)  # C~ and R~
@@ -243,23 +243,23 @@ def _make_measurement_model(
     law = mode_probabilities(x, weights)
 
     def describe_noise(
-        gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
+        gain: jax.Array, covariance: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
-        """Return the noise of z = G y + n in one mode of probability p: sensor, link, rounding and the gain's spread.
+        """Return the noise of z = G y + n in one mode of probability p: sensor, link, rounding and random gain.
 
-        `gain` and `spread` are the mean and covariance of (G, n), and `link` holds columns of Cov n. `x` holds columns
+        `gain` and `covariance` are mean and covariance of (G, n), and `link` holds columns of Cov n. `x` holds columns
         of E[x~ x~' 1{mode}], x~ = (x, 1). (y, 1) = measure x~ + noise. `size` is E[x_i^2] at the start, for rounding.
         """
         signal_moments = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
         known_noise = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
-        gain_noise = factor_spread(jnp.einsum("mlab,ab->ml", spread, signal_moments))
+        gain_noise = factor_covariance(jnp.einsum("mlab,ab->ml", covariance, signal_moments))
         return triangularise(join_columns(known_noise, rounding, gain_noise))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = subtract_mean_output(gains @ measure, law)
     output = concatenate_modes(jnp.where(law[:, None, None] > 0, output, 0.0))
-    noises = jax.vmap(describe_noise)(gains, gain_spread, link, WeightedColumns(x, weights), law)
+    noises = jax.vmap(describe_noise)(gains, gain_covariance, link, WeightedColumns(x, weights), law)
     return StackedMeasurementModel(output=output, common=common, noise=noises)
 
 

@@ -24,7 +24,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns, join_columns, triangularise
 from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
-from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.gaussian.signal_moments import factor_covariance
 from heliograph.filters.modes.jump_linear_filter import (
     AbstractJointModalFilter,
     MeasurementModel,
@@ -157,7 +157,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         modes_bound = J_m + jnp.where(b > 0, 1 + 1 / jnp.where(b > 0, b, 1.0), 0.0) * D_m
         chain_noise = factor_with_last_mode(jnp.einsum("jl,ab->jalb", modes_bound[:-1, :-1], X))
         low, high = _bound_next_law(transition, radius, state.low, state.high)
-        process_noise = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
+        process_noise = self.process_noise_by_mode(u, k, factor_covariance(_bound_diagonal(low, high)))
         return slopes, b, join_columns(chain_noise, process_noise)
 
     @corrects
@@ -173,14 +173,14 @@ class UncertainModalFilter(AbstractJointModalFilter):
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         gains, (C, R) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)  # Hbar_j, C~ and R~
         signal_moment = C @ state.second @ C.T + R  # E[y~ y~']
-        gain_noise = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), signal_moment)
+        gain_noise = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.covariance), signal_moment)
         noise_by_mode = gain_noise + gains @ R @ gains.swapaxes(1, 2)  # V_j
         middle, reach = _find_middle_law(state.low, state.high)
         noise_bound = _bound_mean(noise_by_mode, middle, reach)
         # A part of Hbar_j C~ x~ that is the same in all modes is a constant, as the modes' indicators sum to 1.
         matrix, common = subtract_mean_output(gains @ C, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * signal_moment)
-        noise = join_columns(rounding, factor_spread(noise_bound))
+        noise = join_columns(rounding, factor_covariance(noise_bound))
         # state.gaussian is about (x, 1) 1{mode = j}, with x from 0, but H acts on x~, from the centre: `deviation` is
         # E[x~ 1{mode = j}], mode after mode.
         deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)

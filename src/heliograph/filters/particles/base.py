@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step
-from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected_measurement import find_reference_particle
 from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.native_particle_loop import filter_particles
 from heliograph.filters.particles.received_density import ReceivedDensity
 from heliograph.filters.particles.resampling import effective_number, resample_systematically
+from heliograph.filters.rows.chunks import ScanResult
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, first

@@ -17,7 +17,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance, items, scalar
 from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
 
 
 def build_partly_drawn(

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compute_once
-from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected_measurement import find_reference_particle
 from heliograph.filters.particles.moments import pack_sums, unpack_sums
 from heliograph.filters.particles.resampling import (
@@ -22,6 +21,7 @@ from heliograph.filters.particles.resampling import (
     draw_keys_of_rows_by_xla,
     resample_concrete_weights,
 )
+from heliograph.filters.rows.chunks import ScanResult
 from heliograph.numerics.types import Array, PyTree
 
 Call = Callable[..., Any]

@@ -16,7 +16,7 @@ from heliograph.filters.particles.resampling import draw_uniforms
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angles.angle import Angles, wrap_near
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 PRIOR_SHARE = 0.1  # of the proposal: weights are then bounded, where h saturates too
 
@@ -89,9 +89,9 @@ def propose_particles(
         lower = jnp.linalg.cholesky(jnp.eye(len(center)) + columns.T @ scaled)
         # As matrices rather than solves for each particle: of a linear sensor they are the same for all particles.
         kalman_gain = jax.scipy.linalg.cho_solve((lower, True), scaled.T)
-        spread = jax.scipy.linalg.solve_triangular(lower.T, jnp.eye(len(center)), lower=False)
+        factor = jax.scipy.linalg.solve_triangular(lower.T, jnp.eye(len(center)), lower=False)
         mean = kalman_gain @ jnp.where(arrived, innovation, 0.0)
-        from_posterior = mean + spread @ draw
+        from_posterior = mean + factor @ draw
         e = jnp.where(from_prior | ~jnp.all(jnp.isfinite(from_posterior)), draw, from_posterior)
         # log N(e; 0, I) - log q(e), without the constants that both have; q with its share of N(0, I).
         log_prior = -e @ e / 2

@@ -30,7 +30,7 @@ from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
 
 Proposal = Literal["optimal", "prior"]
 PROPOSALS: tuple[Proposal, ...] = ("optimal", "prior")

@@ -11,7 +11,7 @@ from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cub
 from heliograph.filters.words.bit_likelihoods import is_free_of_flips, make_link_of_bits
 from heliograph.filters.words.two_hypothesis_filter import make_two_hypotheses_filter
 from heliograph.filters.words.word_filter import WordFilter
-from heliograph.filters.wrappers.delay import late_filter
+from heliograph.filters.wrappers.late_data import late_filter
 from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import at_each_step, first, unstack

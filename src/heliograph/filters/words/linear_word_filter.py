@@ -27,7 +27,7 @@ from heliograph.model.words.word_channel import FLAG, find_carried_components, r
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
 from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded_noises
 
 SEEN = 0.01  # share of the rms error that overload may change a claim by

@@ -221,7 +221,7 @@ def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np
     # A random gain acts as noise: Cov noise = E[G] Cov(v + r) E[G]' + Cov n + sum_kl Cov(G_ik, G_jl) E[(s, 1)(s,
     # 1)']_kl.
     moments = np.block([[second, mean[:, None]], [mean[None], np.ones((1, 1))]])  # E[(s, 1)(s, 1)']
-    gain, gain_noise = np.asarray(link.mean_gain), np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
+    gain, gain_noise = np.asarray(link.mean_gain), np.einsum("ijkl,kl->ij", np.asarray(link.gain_covariance), moments)
     columns = np.asarray(link.noise.matrix)
     covariance = sensing.covariance + sensing.rounding
     noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T

@@ -3,38 +3,35 @@
 A delay line holds the signals of the last steps, which may still be under way: y_k, y_k-1, ..., y_k-D.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns
-from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
+from heliograph.filters.base import AbstractFilter, Step, make_sizes, predicts
 from heliograph.filters.gaussian.signal_moments import factor_link_noise
 from heliograph.filters.linear.linear_filter_state import LinearBelief, PlantMotion, predict_belief
 from heliograph.filters.linear.precomputed_filter import PlannedFilter, plan_filter
-from heliograph.filters.modes.arrival_patterns import append_flag
+from heliograph.filters.wrappers.late_data import LateFilter, Make, build_known_delay_filter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.augmented.bias import append_driving_plant
 from heliograph.model.augmented.past_outputs import with_past
-from heliograph.model.channel import Channel, check_link, delayed
-from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import at_each_step, first, stack
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
-from heliograph.model.premises.premise import believes, with_premise
+from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.delay import DelayedLink, RelayedLinks, place_on_delay_line, signal_size
+from heliograph.random_affine.delay import DelayedLink, place_on_delay_line, signal_size
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.relayed_links import RelayedLinks
 from heliograph.random_affine.series_and_stack import Series
 
 
@@ -208,137 +205,6 @@ def relayed_filter(plant: AnyPlant, channel: RelayedLinks, base: AbstractFilter,
     )
 
 
-class LateState(NamedTuple):
-    """State of the filter `delay` steps ago, when the last received signal was sent, the inputs since, and the step."""
-
-    base: PyTree
-    inputs: Float[jax.Array, "delay inputs"]
-    step: Int[jax.Array, ""]
-
-
-class LateFilter(AbstractWrapper):
-    """A filter behind a link with constant delay d: it filters at time k - d and predicts d steps ahead.
-
-    This is the best linear filter with the past as states, without its cost. Built by `late_filter`.
-    """
-
-    base: AbstractFilter
-    delay: int = eqx.field(static=True)
-
-    def __init__(self, base: AbstractFilter, delay: int):
-        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late."""
-        self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
-        self.inputs, self.received = base.inputs, base.received
-
-    @compile_on_call
-    def init(self) -> LateState:
-        """Return the state before any signal was sent."""
-        start = jax.tree.map(jnp.asarray, self.base.init())
-        return LateState(start, jnp.zeros((self.delay, len(self.inputs))), jnp.asarray(-1))
-
-    @predicts
-    def predict(self, state: LateState, u: ArrayLike = (), k: Step = 0) -> LateState:
-        """Predict over step k - delay, with the input of that step.
-
-        `state.inputs` holds the last `delay` inputs, which are still to be used. Before step 0 nothing is predicted.
-        """
-        inputs = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])  # of steps k - delay to k
-        sent_at = jnp.asarray(k) - self.delay
-        predicted = self._predict_if_begun(state.base, inputs[0], sent_at)
-        return LateState(predicted, inputs[1:], jnp.asarray(k, dtype=state.step.dtype))
-
-    def _predict_if_begun(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Predict over step k, or return the state as it is where k < 0."""
-        after = self.base.predict(base, u, jnp.maximum(k, 0))
-        return jax.tree.map(lambda new, old: jnp.where(k >= 0, new, old), after, base)
-
-    @corrects
-    def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
-        """Correct with what was sent at step k - delay.
-
-        Before the first signal arrives, the state does not change and the log-likelihood is 0.
-        """
-        sent_at = jnp.asarray(k) - self.delay
-        after, innovation = self.base.correct(state.base, z, jnp.maximum(sent_at, 0))
-        base = jax.tree.map(lambda new, old: jnp.where(sent_at >= 0, new, old), after, state.base)
-        log_likelihood = jnp.where(sent_at >= 0, innovation.log_likelihood, 0.0)
-        weight = None if innovation.weight is None else jnp.where(sent_at >= 0, innovation.weight, jnp.nan)
-        return state._replace(base=base), replace(innovation, log_likelihood=log_likelihood, weight=weight)
-
-    @estimates
-    def estimate(self, state: LateState) -> Estimate:
-        """Return the prediction over the last `delay` steps."""
-
-        def predict_over(j: jax.Array, base: PyTree) -> PyTree:
-            """Predict over the step j after that of the last signal."""
-            return self._predict_if_begun(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
-
-        if not self.delay:
-            return self.base.estimate(state.base)
-        present = jax.lax.fori_loop(0, self.delay, predict_over, jax.tree.map(jnp.asarray, state.base))
-        return self.base.estimate(present)
-
-    def after_step(self, state: LateState, k: Step) -> Estimate:
-        """Return the prediction over the last `delay` steps."""
-        return self.estimate(state)
-
-
-def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
-    """Return a filter behind a link with a constant delay, which filters the past and predicts to the present.
-
-    Args:
-        filter: a filter made for the link without delay.
-        delay: whole number of steps, from 0.
-
-    Claim: that of `filter`, for a prediction over `delay` steps.
-
-    Raises:
-        ValueError: no filter, a delay that is no whole number of steps.
-
-    Source: prediction from the last filtered time; equal to augmenting the state with past signals.
-    """
-    instance("filter", filter, AbstractFilter, "a filter")
-    delayed_filter = LateFilter(filter, check_count("delay", delay, least=0))
-    premise = filter.premise
-    if premise is None or not delay or premise.channel is None:
-        return with_premise(delayed_filter, premise)
-    channel = at_each_step(lambda link: delayed(link, delay), premise.channel)
-    return with_premise(delayed_filter, premise.replaced(channel=channel))
-
-
-class KnownDelayFilter(AbstractWrapper):
-    """The best linear filter behind a link with time stamps: the delay of each value is its last received component.
-
-    It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint
-    noise R 11' + N I. Given all delays it is the best linear estimate.
-
-    base: a filter of (x, y_k, ..., y_{k-D}) whose field `channel` can be replaced. channels: the moments of its channel
-    for each delay, with a leading axis of the delays 0, ..., D.
-    """
-
-    base: AbstractFilter
-    channels: SecondOrder
-
-    @corrects
-    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct by the channel of the received delay, the last number of z; without a delay z is not used."""
-        z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
-        is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
-        d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
-        channel = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
-        base = eqx.tree_at(lambda filter: filter.channel, self.base, channel)
-        after, innovation = base.correct(state, z, k)
-        after = jax.tree.map(lambda new, old: jnp.where(is_known, new, old), after, state)
-        # The delay is a component of z too. Its innovation is 0, or NaN without a delay.
-        delay_innovation, covariance = append_flag(innovation.covariance, delay)
-        log_likelihood = jnp.where(is_known, innovation.log_likelihood, 0.0)
-        weight = None if innovation.weight is None else jnp.append(innovation.weight, jnp.nan)
-        return after, Innovation(jnp.append(innovation.value, delay_innovation), covariance, log_likelihood, weight)
-
-
-Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
-
-
 @believes
 def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
     """Build a filter for a link that may be late from `make`, which builds one for a link without delay.
@@ -348,7 +214,7 @@ def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, ma
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
     if isinstance(start, DelayedLink) and start.timestamped:
-        return _build_known_delay_filter(plant, sensor, channel, make)
+        return build_known_delay_filter(plant, sensor, channel, make)
     if isinstance(channel, DelayedLink) and channel.constant:
         return LateFilter(make(plant, sensor, channel.link), channel.past)
     if isinstance(start, RelayedLinks):
@@ -367,21 +233,6 @@ def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, m
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
     enlarged_plant, last_line_sensor, last_link, lines = enlarge_by_relays(plant, sensor, channel)
     return relayed_filter(plant, channel, make(enlarged_plant, last_line_sensor, last_link), lines)
-
-
-def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
-    """Build the filter that receives each value's delay with it, with the channel's moments at every delay."""
-    if not isinstance(channel, DelayedLink):
-        raise fail("channel with time stamps", "one that does not vary", "one in over_time")
-    check_forgets("link with time stamps", channel.link)
-    enlarged_plant, line_sensor, _ = with_past(plant, sensor, channel)  # a sensor that outputs all past signals
-    links = [channel.given(d) for d in range(channel.past + 1)]  # one for each delay
-    base, start = make(enlarged_plant, line_sensor, links[0]), first(plant)
-    return KnownDelayFilter(
-        base=base,
-        channels=stack([second_order(link) for link in links]),
-        **make_sizes(base.claim, start, channel.outputs),
-    )
 
 
 def deliver_line_as_current(channel: Channel) -> Channel:

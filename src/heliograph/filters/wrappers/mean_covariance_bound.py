@@ -24,7 +24,7 @@ from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.laws.gain_given_reading import gain_quadrature, reading_quadrature
 from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, MarkovChain
-from heliograph.random_affine.noise import FiniteSupport
+from heliograph.random_affine.noises.noise import FiniteSupport
 from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 
 MOST = 20_000  # combinations of numbers that are summed over

@@ -171,7 +171,7 @@ class ToldFilter(AbstractWrapper):
             return False
         moments = second_order(link)
         largest_gain = np.max(np.abs(np.asarray(moments.mean_gain)), initial=0.0)
-        gain_covariances = np.abs(np.asarray(moments.gain_spread))
+        gain_covariances = np.abs(np.asarray(moments.gain_covariance))
         return bool(np.all(gain_covariances <= ROUNDING * largest_gain**2))
 
     def with_models(self, plant: AnyPlant, sensor: AnySensor, link: Channel) -> "ToldFilter":

@@ -16,7 +16,7 @@ from heliograph.model.readings.repeated_readings import (
     delivers_as_sent,
 )
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.simulation.node import Node
 
 FIRST = Repeats()  # before the first reading

@@ -113,9 +113,9 @@ def _number_state_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, di
     """
     network, flat, counter = fleet.network, fleet.pool.step_rows.state, _ColumnCounter(covariances)
     # A row's state has the filters of nodes by kind, the central ones by name, then what fusions remember.
-    states_by_kind, central, *memory = flat.tree(np.zeros(flat.size))
+    states_by_stack, central, *memory = flat.tree(np.zeros(flat.size))
     # Filters of one kind stand side by side: the leading axis of each part is (filter x node).
-    for (group, filters), state in zip(network.kinds, states_by_kind, strict=True):
+    for (group, filters), state in zip(network.stacks, states_by_stack, strict=True):
         names = [f"{node}/{name}" for name in filters for node in network.groups[group]]
         for path, columns in counter.number_parts(state).items():
             for name, columns_of_filter in zip(names, columns, strict=True):

@@ -14,7 +14,7 @@ from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float, rename
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
 
 Biases = TypeAliasType("Biases", Float[ArrayLike, " biases"])  # or one number for all
 OfBiases = TypeAliasType("OfBiases", Float[ArrayLike, "rows biases"])

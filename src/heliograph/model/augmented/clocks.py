@@ -15,7 +15,7 @@ from heliograph.numerics.check import array, fail, function, instance, scalar, t
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float, rename
-from heliograph.random_affine.noise import AbstractNoise, Matrix
+from heliograph.random_affine.noises.noise import AbstractNoise, Matrix
 
 Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
 

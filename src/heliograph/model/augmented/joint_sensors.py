@@ -16,7 +16,7 @@ from heliograph.numerics.check import fail, instance, names, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import rename
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
 
 
 class JointSensor(AbstractSensor):

@@ -13,8 +13,8 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import rename
 from heliograph.random_affine.delay import place_on_delay_line
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.shaped_noise import Shaped
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.shaped_noise import Shaped
 
 
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:

@@ -16,7 +16,7 @@ from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import rounding
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noises.noise import AbstractNoise
 
 LONGEST = 2.0**53  # units of a time step; a double counts no time beyond it
 WRAPPED = 2.0**32  # a difference of unsigned counters of 32 bits that is -d reads 2^32 - d

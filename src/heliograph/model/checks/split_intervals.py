@@ -53,10 +53,10 @@ def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
         plant: the plant, whose time step is an input.
         dt: index of this input.
     """
-    mean, spread = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
+    mean, deviation = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
-    for x in (mean, mean + spread):
+    for x in (mean, mean + deviation):
         # f, A and Q over s + t at once, and over s and then t, for every cut (s, t).
         whole = _predict_over_intervals(plant, dt, x, cuts.sum(axis=1, keepdims=True))
         parts = _predict_over_intervals(plant, dt, x, cuts)

@@ -15,8 +15,8 @@ from heliograph.numerics.check import fail, is_whole, show_value
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
 from heliograph.random_affine.hop import AbstractHop
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.outlier_noise import Contaminated, StudentT
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noises.outlier_noise import Contaminated, StudentT
 from heliograph.random_affine.words.rounding_noise import RoundedNoise
 
 SELDOM = 1e-9  # probability that a run as long begins at a reading by chance: one in a year at 32 Hz

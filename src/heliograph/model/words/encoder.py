@@ -116,8 +116,8 @@ class Words(Module):
 
     def each(self, values: Float[np.ndarray, "..."], outputs: int) -> Float[np.ndarray, " outputs"]:
         """Return numbers that all components share, or that each has, as one for each."""
-        spread: np.ndarray = library(values).broadcast_to(values, (outputs,))
-        return spread
+        values_of_outputs: np.ndarray = library(values).broadcast_to(values, (outputs,))
+        return values_of_outputs
 
     def draw_dither(self, key: jax.Array, outputs: int) -> Float[jax.Array, " outputs"]:
         """Draw the dither of one message: noise that is added to each output before it is rounded to a word.

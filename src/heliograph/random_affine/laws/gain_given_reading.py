@@ -73,10 +73,11 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
     if isinstance(law, Discrete):
         log_density = jnp.log(law.probabilities) - jnp.square(a - law.values) / (2 * variance)
         return Discrete(law.values, jnp.where(known, jax.nn.softmax(log_density), law.probabilities))
-    mean, spread = _integrate_posterior(law, a, jnp.asarray(variance))
+    mean, variance_given_reading = _integrate_posterior(law, a, jnp.asarray(variance))
     own_mean, own_square = law.moment(1), law.moment(2)
     return GainLawGivenReading(
-        mean=jnp.where(known, mean, own_mean), variance=jnp.where(known, spread, own_square - own_mean**2)
+        mean=jnp.where(known, mean, own_mean),
+        variance=jnp.where(known, variance_given_reading, own_square - own_mean**2),
     )
 
 

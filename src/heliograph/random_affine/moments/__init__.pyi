@@ -39,7 +39,6 @@ from .monomials import position as position
 from .monomials import product_table as product_table
 from .monomials import refuse_if_too_large as refuse_if_too_large
 from .monomials import symmetric_power as symmetric_power
-from .noise_from_moments import about_mean as about_mean
 from .pushed_moments import TabulatedNoise as TabulatedNoise
 from .pushed_moments import products_of_monomials as products_of_monomials
 from .pushed_moments import push_moments as push_moments
@@ -49,7 +48,7 @@ from .second_moments import SecondOrder as SecondOrder
 from .second_moments import describe_second_moments as describe_second_moments
 from .second_moments import has_known_mean as has_known_mean
 from .second_moments import has_random_gain as has_random_gain
-from .second_moments import nominal_spread as nominal_spread
+from .second_moments import nominal_covariance as nominal_covariance
 from .second_moments import second_order as second_order
 from .signal_path import ChannelPosition as ChannelPosition
 from .signal_path import Second as Second

@@ -9,17 +9,17 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.random_affine.moments.moment_tensors import Tensor
 
 
-def split_off_noise(spread: Tensor, factor: Any = columns_with_derivatives) -> tuple[Tensor, WeightedColumns]:
+def split_off_noise(covariance: Tensor, factor: Any = columns_with_derivatives) -> tuple[Tensor, WeightedColumns]:
     """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
 
-    `spread` (m, m, p + 1, p + 1) has at [i, j] the covariance of the rows i and j of (A, n), with n last. If A and n
-    are correlated, nothing is split: they are returned as they are, with columns of zeros. `factor` is for Cov n.
+    `covariance` (m, m, p + 1, p + 1) has at [i, j] the covariance of the rows i and j of (A, n), with n last. If A and
+    n are correlated, nothing is split: they are returned as they are, with columns of zeros. `factor` is for Cov n.
     """
-    xp, noise_covariance = library(spread), spread[..., -1, -1]
-    uncorrelated = xp.all(spread[..., :-1, -1] == 0)
+    xp, noise_covariance = library(covariance), covariance[..., -1, -1]
+    uncorrelated = xp.all(covariance[..., :-1, -1] == 0)
     removed = xp.where(uncorrelated, noise_covariance, 0.0)
     noise = pad_columns(factor(removed))  # m columns, some of them zero if the covariance has fewer
-    return spread - removed[..., None, None] * make_power_of_constant(spread.shape[-1]), noise
+    return covariance - removed[..., None, None] * make_power_of_constant(covariance.shape[-1]), noise
 
 
 def pad_columns(noise: WeightedColumns) -> WeightedColumns:

@@ -28,7 +28,7 @@ from heliograph.random_affine.moments.monomials import (
     product_table,
     symmetric_power,
 )
-from heliograph.random_affine.noise import AbstractNoise, Number, noise_moment_vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Number, noise_moment_vector
 from heliograph.random_affine.series_and_stack import Series
 
 Array1 = Float[jax.Array | np.ndarray, " n"]

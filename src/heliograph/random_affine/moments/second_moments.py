@@ -50,11 +50,11 @@ class SecondOrder(Module):
 
     mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)']; shift: ((M_v
     - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored). nominal: the spread under
-    the nominal law itself, which is gain_spread : W + Cov n with the columns `noise` of the latter: apart from the
+    the nominal law itself, which is gain_covariance : W + Cov n with the columns `noise` of the latter: apart from the
     gain, so that a combination of outputs that is free of noise stays free of it. Where gain and noise are correlated,
-    gain_spread is all and noise zero.
+    gain_covariance is all and noise zero.
 
-    Shapes: mean_gain (m, p), offset (m,), gain_spread (m, m, p + 1, p + 1), noise (m, m).
+    Shapes: mean_gain (m, p), offset (m,), gain_covariance (m, m, p + 1, p + 1), noise (m, m).
     """
 
     mean_gain: Matrix
@@ -63,7 +63,7 @@ class SecondOrder(Module):
     shift: QuadraticMap
     power: QuadraticMap
     nominal: QuadraticMap
-    gain_spread: Tensor
+    gain_covariance: Tensor
     noise: WeightedColumns
     uncertain: bool = eqx.field(static=True)
 
@@ -81,7 +81,7 @@ def describe_second_moments(
         nominal: W to the spread under the nominal law, split here in the share of G and the noise Cov n.
         uncertain: True if several laws are possible.
     """
-    gain_spread, noise = split_off_noise(nominal.center, columns_of)
+    gain_covariance, noise = split_off_noise(nominal.center, columns_of)
     return SecondOrder(
         mean_gain=mean[:, :-1],
         offset=mean[:, -1],
@@ -89,7 +89,7 @@ def describe_second_moments(
         shift=shift,
         power=power,
         nominal=nominal,
-        gain_spread=gain_spread,
+        gain_covariance=gain_covariance,
         noise=noise,
         uncertain=uncertain,
     )
@@ -144,7 +144,7 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
         shift=bounds.shift,
         power=bounds.power,
         nominal=bounds.nominal,
-        gain_spread=np.zeros(bounds.nominal.center.shape),
+        gain_covariance=np.zeros(bounds.nominal.center.shape),
         noise=pad_columns(columns_of(_noise_covariance(channel))),
         uncertain=uncertain,
     )
@@ -186,7 +186,7 @@ def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
     """
     # Maps in a sum or stack are independent. Their covariances give the spread without the channel's large moments.
     if isinstance(channel, Superposed | Stack):
-        mean, covariance = _compute_mean_and_spread(channel)
+        mean, covariance = _compute_mean_and_covariance(channel)
         spread = map_of_known_law(covariance)
         power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
         return MomentBounds(
@@ -230,10 +230,10 @@ def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bo
     else:
         bounds = bound_from_intervals(channel, nominal, mean)
     spread, shift, power = bounds
-    return MomentBounds(mean=mean, spread=spread, shift=shift, power=power, nominal=nominal_spread(channel))
+    return MomentBounds(mean=mean, spread=spread, shift=shift, power=power, nominal=nominal_covariance(channel))
 
 
-def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
+def nominal_covariance(channel: AbstractRandomAffine) -> QuadraticMap:
     """Return the map from W = E[(y, 1) (y, 1)'] to the covariance of z = G y + n about E[G] y + E[n], nominal law.
 
     Its center (m, m, p + 1, p + 1) has at [i, j, a, b] the covariance of entries (i, a) and (j, b) of (G, n), made
@@ -296,7 +296,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     ]
 
 
-def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
+def _compute_mean_and_covariance(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
     """Return mean and spread of a map z = G y + n of known law; those of a stack or sum come from its parts.
 
     The mean is E[(G, n)] (m, p + 1). The spread has at [i, j, a, b] the covariance of entries (i, a) and (j, b).
@@ -305,9 +305,9 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
         moments = channel.moments(2)
         mean = moments.mean[:-1]
         return mean, _drop_known_gain(channel, moments.second - symmetric_product(mean, mean))
-    means, spreads = zip(*(_compute_mean_and_spread(affine) for affine in channel.maps), strict=True)
+    means, spreads = zip(*(_compute_mean_and_covariance(affine) for affine in channel.maps), strict=True)
     if isinstance(channel, Stack):
-        return library(means).concatenate(means), _stack_spreads(spreads)
+        return library(means).concatenate(means), _stack_covariances(spreads)
     # In a sum the spreads of the parts and of its own noise add up.
     mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * make_power_of_constant(size)
@@ -323,11 +323,11 @@ def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.nda
     elif isinstance(channel, Superposed):
         covariance = sum((_noise_covariance(affine) for affine in channel.maps), channel.noise.covariance)
     else:
-        covariance = _compute_mean_and_spread(channel)[1][..., -1, -1]  # the spread's entry at the constant 1
+        covariance = _compute_mean_and_covariance(channel)[1][..., -1, -1]  # the spread's entry at the constant 1
     return covariance
 
 
-def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
+def _stack_covariances(spreads: Sequence[Tensor]) -> Tensor:
     """Return the covariances of the entries of (G, n) of a stack, from those of its independent maps of one y.
 
     `spreads` has for each map the covariances (m, m, p + 1, p + 1) of its (G, n); they are diagonal blocks.

@@ -16,7 +16,7 @@ from heliograph.random_affine.composite import write_percentage
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import JointMoments
-from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.noises.noise import Gaussian
 from heliograph.random_affine.series_and_stack import Series, Stack
 
 MOST_ATOMS = 64  # of the error rate of a chain

@@ -14,7 +14,7 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers, SignalNoise
 from heliograph.random_affine.moments.monomials import Exponents
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Number, Square, Vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Number, Square, Vector
 
 TERMS = 32  # of the series of E f(1 - f); what is left is added as a bound
 DITHERLESS = 1 - 1e-9  # deviations of Gaussian noise, in steps, from which on rounding needs no other dither

@@ -1,9 +1,9 @@
 """Names that other folders take; the package loads them when first used."""
 
+from .centre_filter import CentreFilter as CentreFilter
 from .fused_innovation import FusedInnovation as FusedInnovation
 from .fused_innovation import following_prior as following_prior
 from .fused_innovation import make_fused_innovations as make_fused_innovations
-from .fusion_centre import CentreFilter as CentreFilter
 from .fusion_centre import CentreState as CentreState
 from .fusion_centre import FusionCentre as FusionCentre
 from .fusion_centre import find_claim_of_informed_fusion as find_claim_of_informed_fusion
@@ -17,15 +17,10 @@ from .fusions import list_centres as list_centres
 from .fusions import list_stacked_fusions as list_stacked_fusions
 from .linearised_centre import LinearisedCentre as LinearisedCentre
 from .linearised_centre import LinearisedFusionState as LinearisedFusionState
-from .mesh import Mesh as Mesh
-from .mesh_building import DENSE as DENSE
-from .mesh_building import build_mesh as build_mesh
-from .mesh_building import build_meshes as build_meshes
-from .mesh_check import check_mesh as check_mesh
-from .mesh_check import find_claim_of_mesh as find_claim_of_mesh
 from .named_filter import find_filter_by_name as find_filter_by_name
-from .node_filter import NodeFilter as NodeFilter
-from .node_filter import node_network as node_network
+from .observation_model import ObservationModel as ObservationModel
+from .observation_model import SeparateObservations as SeparateObservations
+from .observation_model import stack_nodes as stack_nodes
 from .uplinks import SentReports as SentReports
 from .uplinks import Uplink as Uplink
 from .uplinks import UplinkDraws as UplinkDraws

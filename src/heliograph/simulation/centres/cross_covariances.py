@@ -258,7 +258,7 @@ def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
         covariances: dict[str, jax.Array] = {}
         next_centre_states = []
         for centre, state in zip(filters.linear_centres, centre_states, strict=True):
-            means = [jnp.zeros((filters.alike[kind].nodes, filters.n)) for kind, _ in centre.sources]
+            means = [jnp.zeros((filters.stacks[stack].nodes, filters.n)) for stack, _ in centre.sources]
             matrices = filters.list_step_matrices(centre, states, u_k, k)
             after, estimates = centre.step(state, matrices, means, u_k, k)
             next_centre_states.append(after)

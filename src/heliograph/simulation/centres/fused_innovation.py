@@ -24,7 +24,7 @@ from heliograph.simulation.centres.fusions import find_source_filters
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.runs.stacked_filters import StackedFilters
 
-UNROLLED = 16  # nodes of a kind whose corrections are written out: more are a loop
+UNROLLED = 16  # nodes of a stack whose corrections are written out: more are a loop
 WHOLE = Gaussian, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x
 
 
@@ -58,37 +58,37 @@ class FusedInnovation(Module):
 
     Args:
         start: the plant's initial law, before the first fusion.
-        sources: (kind, number within the kind) of the filters whose estimates are fused.
+        sources: (stack, number within the stack) of the filters whose estimates are fused.
     """
 
     start: Gaussian
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     def step(
-        self, before: Gaussian, alike: Sequence[StackedFilters], states: Sequence[PyTree], z: Sequence[jax.Array],
+        self, before: Gaussian, stacks: Sequence[StackedFilters], states: Sequence[PyTree], z: Sequence[jax.Array],
         u: jax.Array, k: jax.Array, skip: Sequence[jax.Array | None],
     ) -> FusedSquaredInnovation:  # fmt: skip
         """Return e' S^-1 e of the fused estimate `before`, predicted over step k, by the measurements of that step.
 
         e are the innovations of all nodes' measurements and S is their covariance under the fused estimate: the sum
         tests whether the fused estimate's claimed covariance holds. It is summed node by node, each correcting the
-        estimate for the next. A kind is a group of filters that differ in numbers alone, so that they are stacked in
-        arrays; `self.sources` lists (kind, number of the filter in it) for each group of nodes that is fused.
+        estimate for the next. Filters that differ in numbers alone are stacked in
+        arrays; `self.sources` lists (stack, number of the filter in it) for each group of nodes that is fused.
 
         Args:
             before: the fused estimate after step k - 1.
-            alike: the nodes' filters, stacked by kind.
-            states: the states of these filters before step k, by kind.
+            stacks: the nodes' filters, those of one structure stacked.
+            states: the states of these filters before step k, by stack.
             z: measurements (node, received) by group of nodes, NaN where one is missing.
             u: inputs of the plant over the step.
             k: number of the step.
-            skip: by kind, codes of the reason not to use a node's measurement (filter, node), 0 where it is used; None
+            skip: by stack, codes of the reason not to use a node's measurement (filter, node), 0 where it is used; None
                 where all are.
         """
         corrected: _CorrectedEstimate | None = None
-        for kind, f in self.sources:
-            stacked, reasons = alike[kind], skip[kind]
-            filters, beliefs = stacked.take_filter(f, states[kind])
+        for stack, f in self.sources:
+            stacked, reasons = stacks[stack], skip[stack]
+            filters, beliefs = stacked.take_filter(f, states[stack])
             received = z[stacked.group]
             # A measurement that is not used becomes NaN, which counts as missing.
             if reasons is not None:
@@ -166,8 +166,8 @@ def following_prior(estimate: Estimate) -> Gaussian:
     return from_covariance(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
 
 
-def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
-    """Return the test of each fusion of estimates in the network, by name; `alike`: its filters, stacked by kind.
+def make_fused_innovations(network: Network, stacks: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
+    """Return the test of each fusion of estimates in the network, by name; `stacks`: its filters, stacked.
 
     There is none where a filter's state is more than a mean and a covariance of the plant's states (a mixture, or past
     signals behind a link of random delay), or where a fusion claims no covariance. Nor where nodes share a channel,
@@ -176,13 +176,15 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
         return tests
-    places, plant = network.places, at(network.plant, k=0)
+    indices_by_filter, plant = network.estimate_indices, at(network.plant, k=0)
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
-            sources, _ = find_source_filters(network, places, network.nodes_with(fusion.filter), fusion.filter)
+            sources, _ = find_source_filters(
+                network, indices_by_filter, network.nodes_with(fusion.filter), fusion.filter
+            )
             # Each filter's state is to be a mean and a covariance of the plant's states, and no more.
-            beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
+            beliefs = [eqx.filter_eval_shape(stacks[stack].init) for stack, _ in sources]
             if all(isinstance(b, WHOLE) and gaussian_of(b).mean.shape[-1] == len(network.states) for b in beliefs):
                 start = in_float64(from_covariance)(
                     np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)

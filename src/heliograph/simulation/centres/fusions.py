@@ -19,10 +19,9 @@ from heliograph.model.over_time import at, first, stack, structure_key
 from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
+from heliograph.simulation.centres.centre_filter import CentreFilter, NodeFiltersWithoutData
 from heliograph.simulation.centres.fusion_centre import (
-    CentreFilter,
     FusionCentre,
-    NodeFiltersWithoutData,
     find_claim_of_report_fusion,
     has_data_dependent_gains,
 )
@@ -35,7 +34,7 @@ from heliograph.simulation.centres.observation_model import (
 )
 from heliograph.simulation.centres.uplinks import ReportsInTransit, UplinkDraws, Uplinks, build_uplinks
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.network_index import EstimatePlace
+from heliograph.simulation.network_index import EstimateIndex
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.runs.stacked_filters import initial_state, map_all
 
@@ -48,7 +47,7 @@ class StackedFusions(Module):
         quantizers: through which it receives each node's estimate (fusion, node); None where there are none.
         order: brings what is gathered from the sources into the order of the fusion's nodes (fusion, node).
         names: of the fusions.
-        sources: by fusion, (kind, number within the kind) of the filters whose estimates it fuses, one group of nodes
+        sources: by fusion, (stack, number within the stack) of the filters whose estimates it fuses, one group of nodes
             after another.
         claims: of what each fuses.
         angles: which states are angles, and their periods.
@@ -82,7 +81,7 @@ class StackedFusions(Module):
         Args:
             states: states of the quantizers before the step, (fusion, node, ...). A quantizer rounds the mean that a
                 node sends to the fusion centre.
-            estimates: estimates of the filters by kind (filters of one structure, stacked), (filter, node, ...).
+            estimates: estimates of the filters by stack, (filter, node, ...).
             k: number of the step.
 
         Returns:
@@ -113,14 +112,14 @@ class StackedFusions(Module):
         }
         return states, fused, uplinks
 
-    def _gather_by_fusion(self, values_by_kind: Sequence[jax.Array | np.ndarray]) -> jax.Array:
+    def _gather_by_fusion(self, values_by_stack: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters as (fusion, node, ...), in the order of each fusion's nodes.
 
-        `values_by_kind`: (filter, node, ...) for each kind of filter. `self.sources`: for each fusion, the pairs
-        (kind, filter) that it fuses. `self.order`: for each fusion, the order of their joined rows.
+        `values_by_stack`: (filter, node, ...) for each stack of filters. `self.sources`: for each fusion, the pairs
+        (stack, filter) that it fuses. `self.order`: for each fusion, the order of their joined rows.
         """
         values_by_fusion = [
-            jnp.concatenate([values_by_kind[kind][filter] for kind, filter in sources]) for sources in self.sources
+            jnp.concatenate([values_by_stack[stack][filter] for stack, filter in sources]) for sources in self.sources
         ]
         are_in_order = all(np.array_equal(order, np.arange(len(order))) for order in self.order)
         if are_in_order:  # so that no gather is compiled
@@ -135,7 +134,7 @@ class ReportFusion(Module):
         uplinks: from the nodes to the centre.
         centre: filter of what arrives.
         order: brings what is gathered from the sources into the order of the nodes.
-        sources: (kind, number within the kind) of the filters whose means are sent, one group of nodes after another.
+        sources: (stack, number within the stack) of the filters whose means are sent, one group of nodes after another.
         nodes: their names.
     """
 
@@ -193,7 +192,7 @@ def build_report_fusions(
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and fusion.by_report:
             nodes = network.nodes_with(fusion.filter)
-            sources, order = find_source_filters(network, network.places, nodes, fusion.filter)
+            sources, order = find_source_filters(network, network.estimate_indices, nodes, fusion.filter)
             results[name] = ReportFusion(
                 uplinks=build_uplinks(fusion, nodes, len(network.states)),
                 centre=build_centre_filter(network, name, fusion, step_filters),
@@ -260,25 +259,28 @@ def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
             # Fusions stack if their rules and quantizers have one structure, and they fuse equally many nodes.
             key = structure_key((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
             names_by_structure.setdefault(key, []).append(name)
-    places, claims = network.places, network.claims().get(FUSED, {})
+    indices_by_filter, claims = network.estimate_indices, network.claims().get(FUSED, {})
     return tuple(
-        _stack_fusions(network, names, places, [claims[name] for name in names])
+        _stack_fusions(network, names, indices_by_filter, [claims[name] for name in names])
         for names in names_by_structure.values()
     )
 
 
 def _stack_fusions(
-    network: Network, names: Sequence[str], places: Mapping[tuple[str, str], EstimatePlace], claims: list[Claim]
+    network: Network,
+    names: Sequence[str],
+    indices_by_filter: Mapping[tuple[str, str], EstimateIndex],
+    claims: list[Claim],
 ) -> StackedFusions:
     """Return the fusions of these names, of one structure, stacked.
 
-    `places`: of all estimates, by (node, filter). `claims`: of each fusion.
+    `indices_by_filter`: of all estimates, by (node, filter). `claims`: of each fusion.
     """
     fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
     sources, orders, quantizers = [], [], []
     for fusion in fusions:
         nodes = network.nodes_with(fusion.filter)
-        source, order = find_source_filters(network, places, nodes, fusion.filter)
+        source, order = find_source_filters(network, indices_by_filter, nodes, fusion.filter)
         sources.append(source)
         orders.append(order)
         quantizers.append(fusion.uplinks(nodes))
@@ -313,11 +315,11 @@ def _build_centre(
     The centre propagates the joint covariance of the nodes' errors, which its rules need, from models of all nodes.
     `rules`: the fusion rules by name of the fusion.
     """
-    places, claims = network.places, network.claims()[FUSED]
+    indices_by_filter, claims = network.estimate_indices, network.claims()[FUSED]
     nodes = network.nodes_with(name)
-    # sources: (kind, number in the kind) of the filters' stacks; order: brings their nodes into the order of `nodes`.
-    sources, order = find_source_filters(network, places, nodes, name)
-    groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    # sources: (stack, number in the stack) of the filters; order: brings their nodes into the order of `nodes`.
+    sources, order = find_source_filters(network, indices_by_filter, nodes, name)
+    groups = [network.groups[network.stacks[stack].group] for stack, _ in sources]
     longest_measurement = max(network.nodes[node].received for node in nodes)
     claim = claims[next(iter(rules))]  # the same of all rules on one filter
     # Where gains depend on data, errors are propagated along the estimates of each run.
@@ -342,23 +344,23 @@ def _build_centre(
 
 
 def find_source_filters(
-    network: Network, places: Mapping[tuple[str, str], EstimatePlace], nodes: Sequence[str], name: str
+    network: Network, indices_by_filter: Mapping[tuple[str, str], EstimateIndex], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Return the sources of a fusion, each as (kind, number of the filter within the kind), and an order of their rows.
+    """Return the sources of a fusion, each as (stack, number of the filter in the stack), and an order of their rows.
 
-    A kind is a stack of filters of one structure, over a group of nodes. Join the estimates (node, n) of the sources,
+    A stack has filters of one structure, at all nodes of a group. Join the estimates (node, n) of the sources,
     one source after another, and index them by the order: row i is then the estimate of nodes[i].
 
     Args:
         network: the network.
-        places: of all estimates, by (node, filter).
+        indices_by_filter: of all estimates, by (node, filter).
         nodes: names of the nodes, each of which has the filter.
         name: of the filter.
     """
-    indices = [places[node, name] for node in nodes]
-    sources = tuple(dict.fromkeys((index.kind, index.filter) for index in indices))  # each once, in order
+    indices = [indices_by_filter[node, name] for node in nodes]
+    sources = tuple(dict.fromkeys((index.stack, index.filter) for index in indices))  # each once, in order
     # The row of each node, if the sources' rows stand one source after another.
-    groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    groups = [network.groups[network.stacks[stack].group] for stack, _ in sources]
     row_of_node = {node: row for row, node in enumerate(node for names in groups for node in names)}
     return sources, np.array([row_of_node[node] for node in nodes])
 

@@ -6,8 +6,8 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
-from heliograph.simulation.centres.node_filter import node_filter
 from heliograph.simulation.centres.uplinks import build_uplinks
+from heliograph.simulation.mesh.node_filter import node_filter
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_filters import centre_filter
 

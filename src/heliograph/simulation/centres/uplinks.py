@@ -309,7 +309,7 @@ def _gather_link_moments(links: Sequence[PyTree], received: Sequence[int], error
         gains.append(np.pad(link.mean_gain, (padding, (0, 0))))
         offsets.append(np.pad(link.offset, padding))
         covariances.append(np.pad(link.nominal.center, (padding, padding, (0, 0), (0, 0))))
-    return ReportModel(gain=np.stack(gains), offset=np.stack(offsets), spread=np.stack(covariances), error=error)
+    return ReportModel(gain=np.stack(gains), offset=np.stack(offsets), covariance=np.stack(covariances), error=error)
 
 
 @readable

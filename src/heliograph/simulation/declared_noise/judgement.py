@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.run_over_data import check_data
+from heliograph.filters.rows.run_over_data import check_data
 from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant

@@ -28,7 +28,7 @@ from heliograph.random_affine.channel_state_information import (
     list_told_maps,
     list_told_numbers_of_outputs,
 )
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.map_over_runs import over_runs
 

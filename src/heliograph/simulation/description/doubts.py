@@ -14,7 +14,8 @@ from heliograph.filters.wrappers.told_link_law import ToldFilter, believe_typica
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix
+from heliograph.model.premises.agreement import CHANNEL
+from heliograph.model.premises.same_plant_and_sensor import find_sensor_matrix
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import DOUBLE
@@ -112,8 +113,8 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
     """
     # At a state drawn around the initial mean, since a symmetric point may hide what every other one shows.
     plant = first(network.plant)
-    spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
-    state = np.asarray(plant.initial_mean) + spread * np.random.default_rng(SEED).normal(size=len(plant.states))
+    deviation = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
+    state = np.asarray(plant.initial_mean) + deviation * np.random.default_rng(SEED).normal(size=len(plant.states))
     matrix = make_observability_matrix(plant, list_sensors(network), state, len(plant.states))
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")

@@ -10,7 +10,7 @@ from heliograph.engine.choice import explain_refusal
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.sensor import without_output_names
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.mesh_building import DENSE, build_mesh
+from heliograph.simulation.mesh.building import DENSE, build_mesh
 from heliograph.simulation.network import Network
 
 SHOWN = 3  # of many that are refused for one reason

@@ -14,7 +14,7 @@ Place = tuple[str, str]  # node and filter
 
 def find_remarking_filters(network: Network) -> tuple[Place, ...]:
     """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node"."""
-    places = [(node, name) for node, name in network.places if network.nodes[node].filters[name].remarks]
+    places = [(node, name) for node, name in network.estimate_indices if network.nodes[node].filters[name].remarks]
     fused = [
         (FUSED, name) for name, filter in network.fused.items() if isinstance(filter, AbstractFilter) and filter.remarks
     ]
@@ -26,19 +26,19 @@ def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Rema
 
     Args:
         network: the network.
-        state: states of all filters, as `NetworkFilters.init` returns them: stacks by kind, then central ones by name.
+        state: states of all filters, as `NetworkFilters.init` returns them: stacks, then central ones by name.
     """
-    alike, central, *_ = state
+    stacks, central, *_ = state
     for node, name in find_remarking_filters(network):
         if node == FUSED:
             fusion = network.fused[name]
             assert isinstance(fusion, AbstractFilter)
             yield (node, name), fusion.remark(central[name])
             continue
-        place = network.places[node, name]
+        index = network.estimate_indices[node, name]
         # A stack has the first filter of all nodes, then the second filter of all nodes, and so on.
-        row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
-        filter_state = jax.tree.map(lambda leaf, row=row: leaf[row], alike[place.kind])
+        row = index.filter * len(network.groups[network.stacks[index.stack].group]) + index.node
+        filter_state = jax.tree.map(lambda leaf, row=row: leaf[row], stacks[index.stack])
         yield (node, name), network.nodes[node].filters[name].remark(filter_state)
 
 

@@ -107,7 +107,7 @@ def run(
     # Measurements, filters, and where they go on behind earlier rows.
     z = {name: read_measurements(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
-    filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
+    filters = AllFilters(network, None if smoothing is None else smoothing.stacks, judges=True)
     before = None if after is None else read_recording_start(filters, after, smooths=smooth is not None)
     first = 0 if before is None else int(before.step)
     network.check_horizon(first + steps)

@@ -14,7 +14,7 @@ from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import UplinkDraws
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_filters import AllFilters
-from heliograph.simulation.network_index import EstimatePlace
+from heliograph.simulation.network_index import EstimateIndex
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
 
@@ -31,9 +31,9 @@ def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
 
 
 def read_refusal_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
-    """Return each filter's reason not to use its measurement, 0 for none: of nodes by kind, of central ones by name."""
-    by_kind = [judgement.reason for judgement in outputs["judged"]]
-    return by_kind, {name: judgement.reason for name, judgement in outputs["judged_centrally"].items()}
+    """Return each filter's reason to pass over its data, 0 for none: by stack, and by name of central filters."""
+    by_stack = [judgement.reason for judgement in outputs["judged"]]
+    return by_stack, {name: judgement.reason for name, judgement in outputs["judged_centrally"].items()}
 
 
 # Traced once, for the shapes of its results and for the loop's body: tracing is most of what a step takes to compile.
@@ -65,8 +65,8 @@ def step_plausibly(
         The states after the step, and its outputs by name: estimates, and judgements of the measurements.
     """
     # The loop begins with outputs of zeros, in which nothing is implausible; their shapes are those of a step's.
-    by_kind = [jnp.zeros((stacked.count, stacked.nodes)) for stacked in filters.alike]
-    none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
+    by_stack = [jnp.zeros((stacked.count, stacked.nodes)) for stacked in filters.stacks]
+    none_skipped = by_stack, {name: jnp.zeros(()) for name in filters.central}
     _, output_shapes = eqx.filter_eval_shape(_step_filters, filters, states, z, u, k, drawn, none_skipped)
 
     def needs_pass(carry: tuple[jax.Array, Stepped]) -> jax.Array:
@@ -100,36 +100,36 @@ class JudgementReader:
 
     def __init__(self, network: Network):
         """List, for each node, where its filters that receive measurements stand in the network's stacks of filters."""
-        self._places: dict[str, list[EstimatePlace]] = {name: [] for name in network.names}
-        for (node, name), place in network.places.items():
+        self._indices: dict[str, list[EstimateIndex]] = {name: [] for name in network.names}
+        for (node, name), index in network.estimate_indices.items():
             if network.nodes[node].filters[name].received:
-                self._places[node].append(place)
+                self._indices[node].append(index)
 
     def read_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of the filters that receive from a node; where it has none, of the central ones."""
-        return self._stack_judgements(outputs, self._places[node], not self._places[node])
+        return self._stack_judgements(outputs, self._indices[node], not self._indices[node])
 
     def read_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of all filters: first those of the nodes by kind, then those of central filters.
+        """Return the judgements of all filters: first those of the nodes by stack, then those of central filters.
 
-        A kind is a stack (filter, node) of filters of one structure. The last axis holds the fields of a Judgement.
+        A stack (filter, node) has filters of one structure. The last axis holds the fields of a Judgement.
         """
-        places = []
-        for kind, judgement in enumerate(outputs["judged"]):
+        indices = []
+        for stack, judgement in enumerate(outputs["judged"]):
             filters, nodes = judgement.distance.shape[-2:]
-            places += [EstimatePlace(kind, filter, node) for filter, node in np.ndindex(filters, nodes)]
-        return self._stack_judgements(outputs, places, central=True)
+            indices += [EstimateIndex(stack, filter, node) for filter, node in np.ndindex(filters, nodes)]
+        return self._stack_judgements(outputs, indices, central=True)
 
     def _stack_judgements(
-        self, outputs: Mapping[str, PyTree], places: Sequence[EstimatePlace], central: bool
+        self, outputs: Mapping[str, PyTree], indices: Sequence[EstimateIndex], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of these filters, followed by those of the central filters if `central` is True.
 
-        `places`: (kind, filter, node) of each filter in the stacked outputs. The result has the recording's axes, then
-        filters, then the fields of a Judgement.
+        `indices`: (stack, filter, node) of each filter in the stacked outputs. The result has the recording's axes,
+        then filters, then the fields of a Judgement.
         """
         judgements = [
-            [field[..., place.filter, place.node] for field in outputs["judged"][place.kind]] for place in places
+            [field[..., index.filter, index.node] for field in outputs["judged"][index.stack]] for index in indices
         ]
         judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
         if not judgements:
@@ -139,7 +139,7 @@ class JudgementReader:
     @property
     def nodes_without_judge(self) -> list[str]:
         """Names of the nodes without a filter that judges their measurements; only central filters judge these."""
-        return [name for name, places_of_filters in self._places.items() if not places_of_filters]
+        return [name for name, indices in self._indices.items() if not indices]
 
 
 def find_refused_rows(
@@ -183,8 +183,8 @@ def describe_doubts(
 
     Args:
         network: the network that the recording ran through.
-        outputs: output of filtering, by row: "judged" holds judgements by kind of filter (reason (row, filter, node), 0
-            for a plausible row, and distance), "judged_centrally" those of fusions by name.
+        outputs: output of filtering, by row: "judged" holds judgements by stack of filters (reason (row, filter, node),
+            0 for a plausible row, and distance), "judged_centrally" those of fusions by name.
         refused: rows that all filters of a node refuse: {node: {row: reason}}.
         u: inputs of the plant, (steps, inputs).
     """
@@ -197,11 +197,10 @@ def describe_doubts(
         named = [faults.name_fault(node, name, first_row) for name in network.nodes[node].filters]
         fault = next((words for words in named if words), "")
         lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
-    # Rows that one filter alone skips. `places` says where in the arrays of a kind the judgements of (node, filter)
-    # are.
+    # Rows that one filter alone skips.
     judgements = {
-        place: Judgement(*(field[:, at.filter, at.node] for field in outputs["judged"][at.kind]))
-        for place, at in network.places.items()
+        of_filter: Judgement(*(field[:, i.filter, i.node] for field in outputs["judged"][i.stack]))
+        for of_filter, i in network.estimate_indices.items()
     }
     judgements |= {(FUSED, name): judgement for name, judgement in outputs["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
@@ -243,8 +242,8 @@ class _NonFiniteFunctionFinder:
         elif central:
             before = jax.tree.map(lambda leaf: leaf[row - 1], self.outputs["fused"][name])
         else:
-            at = self.network.places[node, name]
-            before = jax.tree.map(lambda leaf: leaf[row - 1, at.filter, at.node], self.outputs["estimates"][at.kind])
+            i = self.network.estimate_indices[node, name]
+            before = jax.tree.map(lambda leaf: leaf[row - 1, i.filter, i.node], self.outputs["estimates"][i.stack])
         fault = describe_non_finite_function(filter, before, self.u[row], row)
         return f"; {fault}" if fault else ""
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compute_once, scan_rows
-from heliograph.filters.chunks import scan_in_chunks
-from heliograph.filters.linear_recursion import Recursion
+from heliograph.filters.rows.chunks import scan_in_chunks
+from heliograph.filters.rows.linear_recursion import Recursion
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy

@@ -41,33 +41,33 @@ class NetworkSmoother(Module):
     Args:
         smoothing: which estimates are made, such as those of a fixed interval.
         fusions: of smoothed estimates of the same time.
-        kinds: numbers of the kinds of filters that are smoothed.
+        stacks: numbers of the stacks of filters that are smoothed.
         groups: numbers of the groups of nodes that have them.
     """
 
     smoothing: AbstractSmoothing
     fusions: tuple[StackedFusions, ...]
-    kinds: tuple[int, ...] = eqx.field(static=True)
+    stacks: tuple[int, ...] = eqx.field(static=True)
     groups: tuple[int, ...] = eqx.field(static=True)
 
     def smooth_run(self, outputs: PyTree) -> PyTree:
         """Return a run's results "filtered" and "smoothed", each as a reducer reads a step, and sums of the "nis".
 
         NIS: e' S^-1 e of an innovation e of covariance S, which is about its number of components if a filter is
-        consistent. A reducer turns steps into results, such as statistics. A kind is a stack of filters of one
-        structure, a group a stack of nodes.
+        consistent. A reducer turns steps into results, such as statistics. A stack has filters of one structure,
+        a group nodes.
 
         Args:
             outputs: all that the filters' steps put out (time, ...): measurements and true states, and the terms of
-                the backward pass, by kind ("smoother_steps") and of filters at the centre by name ("central_steps").
+                the backward pass, by stack ("smoother_steps") and of filters at the centre by name ("central_steps").
         """
         # Terms of the backward pass, and apart from them the filters' own outputs.
-        steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
+        steps_by_stack = [outputs["smoother_steps"][k] for k in self.stacks]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
-        # Smoothed estimates of nodes and central filters, then their fusions. Steps of one kind are
+        # Smoothed estimates of nodes and central filters, then their fusions. Steps of one stack are
         # (time, filter, node, ...): each filter of each node is swept back over time by itself.
         sweep = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
-        estimates = tuple(sweep(steps) for steps in steps_by_kind)
+        estimates = tuple(sweep(steps) for steps in steps_by_stack)
         fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
         for fusion in self.fusions:
             fused |= _fuse_at_each_time(fusion, estimates)
@@ -85,24 +85,24 @@ class NetworkSmoother(Module):
             truth = self.smoothing.select_reference(outputs["truth"])
             smoothed |= {
                 "truth": truth,
-                **_turn_angles_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
+                **_turn_angles_to_truth(truth, smoothed, [steps.angles for steps in steps_by_stack]),
             }
         # Sums of the NIS, for the test of consistency.
         sum_nis = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
-        nis = tuple(sum_nis(steps) for steps in steps_by_kind)
+        nis = tuple(sum_nis(steps) for steps in steps_by_stack)
         centrally = {name: nis_sums(steps) for name, steps in outputs["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
 
 def _turn_angles_to_truth(
-    truth: jax.Array, smoothed: Mapping[str, PyTree], angles_of_kinds: Sequence[Angles]
+    truth: jax.Array, smoothed: Mapping[str, PyTree], angles_of_stacks: Sequence[Angles]
 ) -> dict[str, PyTree]:
     """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error.
 
     Args:
         truth: states x (time, n).
-        smoothed: "estimates" by kind and "fused" by name, (time, ..., n).
-        angles_of_kinds: which states are angles for the filters of each kind.
+        smoothed: "estimates" by stack and "fused" by name, (time, ..., n).
+        angles_of_stacks: which states are angles for the filters of each stack.
     """
 
     def wrap(estimate: Estimate, angles: Angles) -> Estimate:
@@ -111,17 +111,17 @@ def _turn_angles_to_truth(
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
         return replace(estimate, mean=wrap_near(mean, truth_at_each, angles))
 
-    # All kinds that have angles have the plant's.
-    of_plant = next((angles for angles in angles_of_kinds if angles), ())
-    estimates = tuple(wrap(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_kinds, strict=True))
+    # All stacks that have angles have the plant's.
+    of_plant = next((angles for angles in angles_of_stacks if angles), ())
+    estimates = tuple(wrap(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_stacks, strict=True))
     return {"estimates": estimates, "fused": {name: wrap(e, of_plant) for name, e in smoothed["fused"].items()}}
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by kind."""
+    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by stack."""
 
     def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-        """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by kind."""
+        """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by stack."""
         no_state, step_number = (), jnp.asarray(0)
         _, fused, _ = fusion.step(no_state, estimates, step_number)
         return fused
@@ -154,20 +154,20 @@ class SmoothingPlan(NamedTuple):
     Args:
         network: the part, as a network.
         smoothing: which estimates are made.
-        kinds: numbers of its kinds of filters in the whole network.
+        stacks: numbers of its stacks of filters in the whole network.
         groups: numbers of its groups of nodes in the whole network.
         claims: of smoothed estimates and their fusions, by node and filter.
     """
 
     network: Network
     smoothing: AbstractSmoothing
-    kinds: tuple[int, ...]
+    stacks: tuple[int, ...]
     groups: tuple[int, ...]
     claims: Claims
 
     def smoother(self, filters: AllFilters) -> NetworkSmoother:
         """Build the smoother for these filters of the whole network."""
-        return NetworkSmoother(self.smoothing, filters.fusions, self.kinds, self.groups)
+        return NetworkSmoother(self.smoothing, filters.fusions, self.stacks, self.groups)
 
 
 def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothingPlan:
@@ -182,8 +182,8 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         horizon: number of steps.
 
     Returns:
-        The smoothed part as a network, the smoothing, the numbers of the part's kinds and groups in the whole network
-        (a group: nodes of one structure; a kind: filters of one structure in a group), and its claims: what the
+        The smoothed part as a network, the smoothing, the numbers of the part's stacks and groups in the whole network
+        (a group: nodes of one structure; a stack: filters of one structure in a group), and its claims: what the
         smoothed covariances are said to be.
 
     Raises:
@@ -210,10 +210,10 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         claims[FUSED] = {
             name: _find_claim_of_fusion(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()
         }
-    # Numbers of the part's groups of nodes and kinds of filters in the whole network.
+    # Numbers of the part's groups of nodes and stacks of filters in the whole network.
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
-    kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
-    return SmoothingPlan(smoothed, smoothing, kinds, groups, claims)
+    stacks = tuple(k for k, stack in enumerate(network.stacks) if stack.group in groups)
+    return SmoothingPlan(smoothed, smoothing, stacks, groups, claims)
 
 
 def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
@@ -258,7 +258,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
 
     The NIS, the normalised innovation squared, is on average the number of components if a filter's claim is right.
     """
-    for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
+    for (group, names), sums in zip(network.stacks, nis["estimates"], strict=True):
         for filter_index, name in enumerate(names):
             for node_index, node in enumerate(network.groups[group]):
                 warn_if_inconsistent(f"{node}/{name}", np.asarray(sums[filter_index, node_index]))

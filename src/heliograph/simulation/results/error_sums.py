@@ -37,7 +37,7 @@ class RunSums(NamedTuple):
             then not finite or indefinite (1), (time, 2, part).
         failed_runs: in how many runs this happened at some step (2, 1, part).
         uplinks: sums of what the quantizers did.
-        order: whose estimates the parts are, by number: kinds first and then fused ones.
+        order: whose estimates the parts are, by number: stacks first and then fused ones.
         by_run: how many of these, the first ones, have covariances that differ between runs.
     """
 
@@ -64,9 +64,9 @@ class Statistics(AbstractReducer[StatisticsByName]):
         the nodes' quantizers sent. Their means over runs show if B is right. The flags are also returned as `ever`, to
         count the runs in which they are true at some step.
 
-        `step`: the truth, estimates by kind (a stack of filters of one structure), and fused ones by name. All lie one
-        after another along one axis (`part`). But covariances are a tuple with an array for each kind: if a filter's
-        covariance is the same in all runs, it need be held only once, and that may differ between kinds.
+        `step`: the truth, estimates by stack (filters of one structure), and fused ones by name. All lie one
+        after another along one axis (`part`). But covariances are a tuple with an array for each stack: if a filter's
+        covariance is the same in all runs, it need be held only once, and that may differ between stacks.
         """
         truth = jnp.asarray(step["truth"])
         estimates = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
@@ -95,13 +95,13 @@ class Statistics(AbstractReducer[StatisticsByName]):
         """Return the sums over all runs, with filters whose covariance differs between runs first, the others last.
 
         Each estimate has one index of the axis `part`, and each entry (i <= j) of a symmetric matrix one of the axis
-        `pair`. Filters of one structure (a kind) have consecutive indices. "claimed" is the covariance that a filter
+        `pair`. Filters of one structure (a stack) have consecutive indices. "claimed" is the covariance that a filter
         states; if it is the same in all runs, as with linear filters without losses, one copy is held.
 
         Args:
             sums: what was summed over runs: "pairs" (time, part, pair, batch), "nees" (time, part, batch), "failed"
                 (time, 2, part, batch), `ever` (2, part, batch), "uplinks" (..., batch), and "claimed", an array
-                (time, part of the kind, pair, batch) for each kind.
+                (time, part of the stack, pair, batch) for each stack.
             common: for each array whether all runs share it: then it is the value of one run, without a batch axis.
             count: number of runs in each batch.
         """
@@ -113,15 +113,15 @@ class Statistics(AbstractReducer[StatisticsByName]):
             (sums.sums | {"claimed": ()}, sums.ever),
             (common.sums | {"claimed": ()}, common.ever),
         )
-        # Order of the kinds: those whose claimed covariance differs between runs come first (False < True).
+        # Order of the stacks: those whose claimed covariance differs between runs come first (False < True).
         claimed = sums.sums["claimed"]
         order = tuple(sorted(range(len(is_shared)), key=is_shared.__getitem__))
         # The same order for the parts of all other sums.
         sizes = [values.shape[1] for values in claimed]
-        parts_of_kind = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        parts = np.concatenate([parts_of_kind[i] for i in order])
+        parts_of_stack = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        parts = np.concatenate([parts_of_stack[i] for i in order])
         # Claimed covariances by run, and of all runs. Each list begins with an empty array, so that it can be joined
-        # where no kind is in it.
+        # where no stack is in it.
         steps, _, pairs, _ = totals["pairs"].shape
         by_run = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not is_shared[i])]
         of_all = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if is_shared[i])]
@@ -147,11 +147,13 @@ class Statistics(AbstractReducer[StatisticsByName]):
             collected: not used, as no single run is kept.
             network: the network, which tells which estimate is whose.
         """
-        # Split the axis of estimates into kinds (stacks of filters of one structure) and fused estimates.
-        all_kinds = network.kinds + network.mesh_kinds
-        count, sums = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
-        sums_of_kinds, sums_of_fused = sums[: len(all_kinds)], sums[len(all_kinds) :]
-        named = {"estimates": sums_of_kinds, "fused": dict(zip(sorted(network.fused), sums_of_fused, strict=True))}
+        # Split the axis of estimates into stacks (filters of one structure) and fused estimates.
+        all_stacks = network.stacks + network.mesh_stacks
+        count, sums = _split_sums(
+            carry, [(len(stack.filters), len(network.groups[stack.group])) for stack in all_stacks]
+        )
+        sums_of_stacks, sums_of_fused = sums[: len(all_stacks)], sums[len(all_stacks) :]
+        named = {"estimates": sums_of_stacks, "fused": dict(zip(sorted(network.fused), sums_of_fused, strict=True))}
         # Each sum by node and filter. The axis of filters is -3 in a sum (..., filter, node, pair) of products e_i e_j,
         # and -2 in a sum (..., filter, node).
         filter_axes = _FilterSums(pairs=-3, nees=-2, claimed=-3, failed=-2, failed_runs=-2)
@@ -196,7 +198,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
 
 class _FilterSums(NamedTuple):
-    """Sums over runs of a kind, a fused estimate or one filter; or a number for each of these sums.
+    """Sums over runs of a stack, a fused estimate or one filter; or a number for each of these sums.
 
     Shapes: pairs and claimed (batch, time, filter, node, pair), nees (batch, time, filter, node), failed (2, time,
     filter, node), failed_runs (2, 1, filter, node); of one filter, or of what is fused, without filter and node.
@@ -228,17 +230,17 @@ def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> Erro
     )
 
 
-def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[_FilterSums]]:
-    """Return the number of runs in each batch, and the sums of each kind and then of each fused estimate, as views.
+def _split_sums(carry: RunSums, stacks: list[tuple[int, int]]) -> tuple[np.ndarray, list[_FilterSums]]:
+    """Return the number of runs in each batch, and the sums of each stack and then of each fused estimate, as views.
 
-    A kind is a stack of filters of one structure. All estimates lie along one axis `part` of the sums, which is cut
-    here: filters times nodes for each kind, one for a fused estimate, in the order `carry.order`.
+    A stack has filters of one structure. All estimates lie along one axis `part` of the sums, which is cut
+    here: filters times nodes for each stack, one for a fused estimate, in the order `carry.order`.
 
     Args:
         carry: sums over the runs of error products, normalised errors, covariances and failures, axes (time, part, ...,
-            batch). `order` has the numbers of kinds (0, 1, ...) and of fused estimates, which follow the kinds; the
+            batch). `order` has the numbers of stacks (0, 1, ...) and of fused estimates, which follow the stacks; the
             first `by_run` in this order have covariances that differ between runs.
-        kinds: numbers of filters and of nodes of each kind.
+        stacks: numbers of filters and of nodes of each stack.
     """
     # Axes (batch, time, part, ...); failures have their two sorts in place of batches.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed
@@ -248,9 +250,9 @@ def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarra
     varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
     first_shared = varying.shape[2]  # the first part whose covariances all runs share
-    sums_of_kind, start = {}, 0
-    for position, kind in enumerate(carry.order):
-        axes = kinds[kind] if kind < len(kinds) else ()  # a fused estimate has no axes of filters and nodes
+    sums_of_stack, start = {}, 0
+    for position, stack in enumerate(carry.order):
+        axes = stacks[stack] if stack < len(stacks) else ()  # a fused estimate has no axes of filters and nodes
         parts = slice(start, start + int(np.prod(axes)))
         if position < carry.by_run:
             claimed = varying[:, :, parts]
@@ -264,11 +266,11 @@ def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarra
             failed_runs=failed_runs[:, :, parts],
         )
         # The axis `part` becomes those of filters and nodes.
-        sums_of_kind[kind] = _FilterSums(
+        sums_of_stack[stack] = _FilterSums(
             *(values.reshape(*values.shape[:2], *axes, *values.shape[3:]) for values in flat)
         )
         start = parts.stop
-    return count, [sums_of_kind[kind] for kind in range(len(sums_of_kind))]
+    return count, [sums_of_stack[stack] for stack in range(len(sums_of_stack))]
 
 
 def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
@@ -298,7 +300,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
     none_common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
-    count, (filter_sums,) = _split_sums(Statistics().summed(OfStep(sums, ever), none_common, count), kinds=[])
+    count, (filter_sums,) = _split_sums(Statistics().summed(OfStep(sums, ever), none_common, count), stacks=[])
     sent = record.uplinks.get(name) if node == FUSED else None
     uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
     return replace(_make_statistics(count, filter_sums, estimate.claim), uplink=uplink)

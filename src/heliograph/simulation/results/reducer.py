@@ -51,8 +51,8 @@ class OfStep(NamedTuple):
 class AbstractReducer(Module, Generic[Result]):
     """Reduction of simulated runs: numbers of each step that are summed over runs, and others that are collected.
 
-    A step is {"truth": (n,), "measurements": (node, received) of each group of nodes, "estimates": of each kind an
-    `Estimate` with mean (filter, node, n), "fused": estimates by name, "uplinks"}, as `Network` has groups and kinds.
+    A step is {"truth": (n,), "measurements": (node, received) of each group of nodes, "estimates": of each stack an
+    `Estimate` with mean (filter, node, n), "fused": estimates by name, "uplinks"}, as `Network` has groups and stacks.
     """
 
     def of_step(self, step: PyTree) -> OfStep:
@@ -161,14 +161,14 @@ class Trajectories(AbstractReducer[Record]):
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Return the record of trajectories, with nodes in the network's order.
 
-    A scan returns arrays grouped by kind of filter and node. A user reads them by name: this function sorts them into a
-    `Record`, one entry for each node and filter.
+    A scan returns arrays grouped by stack of filters and node. A user reads them by name: this function sorts them into
+    a `Record`, one entry for each node and filter.
 
     Args:
         network: the simulated network, which has the order and the names of nodes and filters.
         batch: output of the scan over steps, with leading axes (run, time) or (time): "truth" (..., n), "measurements",
-            "estimates" with mean (..., filter, node, n) for each kind of filter, "uplinks" and "reports" (what arrived
-            at the centre), and more where the network has it.
+            "estimates" with mean (..., filter, node, n) for each stack of filters, "uplinks" and "reports" (what
+            arrived at the centre), and more where the network has it.
         time: times of the steps (time,).
     """
     measurements = split_measurements(network, batch["measurements"])

@@ -1,4 +1,4 @@
-"""Results by names of nodes and filters, from arrays whose axes are groups of nodes and kinds of filters."""
+"""Results by names of nodes and filters, from arrays whose axes are groups of nodes and stacks of filters."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -86,33 +86,33 @@ def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> di
 def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
     """Return the probabilities of the plant's modes (..., M), by (node, filter), of the filters that estimate them.
 
-    `batch`: "estimates" of many steps, in one stack (..., filter, node, M) for filters of one structure (a kind), and
+    `batch`: "estimates" of many steps, in one stack (..., filter, node, M) for filters of one structure, and
     "fused" estimates by name. Fused estimates have FUSED in place of a node.
     """
-    estimates_by_kind = batch["estimates"]
+    estimates_by_stack = batch["estimates"]
     fused = batch["fused"] if network.fused else {}
     modes = {
         (FUSED, name): np.asarray(estimate.modes) for name, estimate in fused.items() if estimate.modes is not None
     }
-    for name, place in network.places.items():
-        # A kind's probabilities are (..., filter, node, M), if the batch has estimates of this kind.
-        if place.kind < len(estimates_by_kind) and estimates_by_kind[place.kind].modes is not None:
-            modes[name] = np.asarray(estimates_by_kind[place.kind].modes)[..., place.filter, place.node, :]
+    for name, index in network.estimate_indices.items():
+        # A stack's probabilities are (..., filter, node, M), if the batch has estimates of this stack.
+        if index.stack < len(estimates_by_stack) and estimates_by_stack[index.stack].modes is not None:
+            modes[name] = np.asarray(estimates_by_stack[index.stack].modes)[..., index.filter, index.node, :]
     return modes
 
 
 def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Return innovations with the weight that each component got, by node and filter, of filters that weigh components.
 
-    `batch["weighed"]` has them by kind, a stack of filters of one structure (time, filter, node, m), with None for
-    kinds that do not weigh. Those of central filters are under "weighed_centrally" by name, and under FUSED in the
+    `batch["weighed"]` has them by stack (time, filter, node, m), with None for
+    stacks that do not weigh. Those of central filters are under "weighed_centrally" by name, and under FUSED in the
     result.
     """
-    weighed_by_kind = batch.get("weighed", ())
+    weighed_by_stack = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
-    for (node, name), index in network.places.items() if weighed_by_kind else ():
-        if weighed_by_kind[index.kind] is not None:
-            fields = [np.asarray(field)[:, index.filter, index.node] for field in weighed_by_kind[index.kind]]
+    for (node, name), index in network.estimate_indices.items() if weighed_by_stack else ():
+        if weighed_by_stack[index.stack] is not None:
+            fields = [np.asarray(field)[:, index.filter, index.node] for field in weighed_by_stack[index.stack]]
             weighed.setdefault(node, {})[name] = Weighed(*fields)
     central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
     return weighed | ({FUSED: central} if central else {})
@@ -124,20 +124,20 @@ def split_by_name(
     """Return arrays that are stacked over filters and nodes as one array for each node and filter, by their names.
 
     Simulations stack filters of one structure, for speed: those that differ in numbers alone, at nodes that do so too
-    (a group), are of one kind, and have their arrays along one axis. Users ask by the names of node and filter.
+    (a group), are of one structure, and have their arrays along one axis. Users ask by the names of node and filter.
 
     Args:
-        network: the network; its `kinds` are (group, names of the filters) of each stack, and `mesh_kinds` those of
+        network: the network; its `stacks` are (group, names of the filters) of each stack, and `mesh_stacks` those of
             fusions between neighbours, which have an estimate at each node too.
-        batch: "estimates" with an entry for each kind, and "fused" by name, without axes of filters and nodes.
+        batch: "estimates" with an entry for each stack, and "fused" by name, without axes of filters and nodes.
         read: returns the array of an entry of `batch`.
         axis: index of the axis of filters in that array; the axis of nodes follows it.
     """
     by_node: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
     entries = batch["estimates"]
     # Judgements of measurements are made by filters alone: then there is no entry for fusions between neighbours.
-    kinds = (network.kinds + network.mesh_kinds)[: len(entries)]
-    for (group, filters), entry in zip(kinds, entries, strict=True):
+    stacks = (network.stacks + network.mesh_stacks)[: len(entries)]
+    for (group, filters), entry in zip(stacks, entries, strict=True):
         values = np.moveaxis(np.asarray(read(entry)), (axis, axis + 1), (0, 1))  # (filter, node, ...)
         for name, values_of_filter in zip(filters, values, strict=True):
             for node, value in zip(network.groups[group], values_of_filter, strict=True):

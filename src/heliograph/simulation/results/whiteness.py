@@ -9,7 +9,7 @@ import scipy
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import HALF
-from heliograph.filters.run_over_data import check_data, step_over_known_rows
+from heliograph.filters.rows.run_over_data import check_data, step_over_known_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.confidence_intervals import average_correlated

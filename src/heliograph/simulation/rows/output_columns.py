@@ -112,12 +112,12 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
     filters have FUSED in place of a node.
 
     `outcome`: the outputs of a step as a tree that has the number of its column in place of each value. It is stacked
-    by kind of filter and then (filter, node), with None for kinds that do not weigh.
+    by stack of filters and then (filter, node), with None for stacks that do not weigh.
     """
     columns_of_nodes = {
-        name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
-        for name, place in network.places.items()
-        if outcome["weighed"][place.kind] is not None
+        name: [np.asarray(field)[index.filter, index.node] for field in outcome["weighed"][index.stack]]
+        for name, index in network.estimate_indices.items()
+        if outcome["weighed"][index.stack] is not None
     }
     weighed_centrally = outcome["weighed_centrally"].items()
     columns_of_central = {(FUSED, name): list(columns) for name, columns in weighed_centrally if columns is not None}

@@ -30,7 +30,7 @@ from heliograph.simulation.recordings.implausible_data import read_refusal_reaso
 from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.rows.row_step import NetworkStep
 
-NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
+NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by stack, and by name
 
 
 class BackwardSweep(Module):
@@ -39,12 +39,12 @@ class BackwardSweep(Module):
     Args:
         network_step: step of the network's filters that can be smoothed.
         fusions: of their estimates.
-        kinds: numbers of the kinds that can be smoothed.
+        stacks: numbers of the stacks that can be smoothed.
     """
 
     network_step: NetworkStep
     fusions: tuple[StackedFusions, ...]
-    kinds: tuple[int, ...] = eqx.field(static=True)
+    stacks: tuple[int, ...] = eqx.field(static=True)
 
     def step(
         self, history: RowHistory, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
@@ -62,59 +62,59 @@ class BackwardSweep(Module):
         Returns:
             The filters' states after the step, and their smoother steps.
         """
-        # Refuse again the measurements that were refused when the row was filtered. Reasons are by kind of the nodes'
+        # Refuse again the measurements that were refused when the row was filtered. Reasons are by stack of the nodes'
         # filters (a stack of one structure), and by name of central ones.
-        by_kind, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
-        skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
+        by_stack, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
+        skip = by_stack, {name: central[name] for name in self.network_step.filters.central}
         z = self.network_step.group_measurements(received)
         after, outputs = self.network_step.filters.step(state, z, u, k, skip=skip)
-        steps_by_kind = {kind: outputs["smoother_steps"][kind] for kind in self.kinds}
-        return after, (steps_by_kind, outputs["central_steps"])
+        steps_by_stack = {stack: outputs["smoother_steps"][stack] for stack in self.stacks}
+        return after, (steps_by_stack, outputs["central_steps"])
 
     def states_after(self, history: RowHistory, row: jax.Array) -> PyTree:
         """Return the states after a row of the filters that can be smoothed, in the form in which a step takes them.
 
-        That is a tuple of six: states of the nodes' filters by kind, and of central ones by name; the states of
+        That is a tuple of six: states of the nodes' filters by stack, and of central ones by name; the states of
         quantizers, centres, fusions by message, and fused estimates under test are empty, since nothing is fused here.
         """
-        by_kind, central, *_ = history.state_after(row)
+        by_stack, central, *_ = history.state_after(row)
         central_states = {name: central[name] for name in self.network_step.filters.central}
         quantizers, centres, exchanges, tested = (), (), dict[str, PyTree](), dict[str, PyTree]()
-        return by_kind, central_states, quantizers, centres, exchanges, tested
+        return by_stack, central_states, quantizers, centres, exchanges, tested
 
     def make_estimates(
         self, steps: NetworkSmootherStep, later: PyTree
     ) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
-        """Return the smoothed estimates after a step, those of nodes by kind, central and fused ones by name.
+        """Return the smoothed estimates after a step, those of nodes by stack, central and fused ones by name.
 
         `steps`: the smoother steps into it, which hold what each filter's backward pass needs. `later`: for each
         filter, the Gaussian law of the state given all data, in the same form.
         """
-        by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
-        # Fusions find estimates by the number of the kind. Kinds that cannot be smoothed are None, and are not fused.
-        estimates_by_kind = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
+        by_stack, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
+        # Fusions find estimates by the number of the stack. Stacks that cannot be smoothed are None, and are not fused.
+        estimates_by_stack = [by_stack.get(stack) for stack in range(max(self.stacks, default=-1) + 1)]
         for fusion in self.fusions:
             no_state, step_number = (), jnp.asarray(0)
-            _, fused, _ = fusion.step(no_state, estimates_by_kind, step_number)
+            _, fused, _ = fusion.step(no_state, estimates_by_stack, step_number)
             central |= fused
-        return by_kind, central
+        return by_stack, central
 
 
 def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
-    """Return function(smoother step, ...) of every filter, as a pair: nodes' filters by kind, and central ones by name.
+    """Return function(smoother step, ...) of every filter, as a pair: nodes' filters by stack, central ones by name.
 
-    Results of a kind have leading axes (filter, node). `rest`: further arguments of the function, each a pair like
+    Results of a stack have leading axes (filter, node). `rest`: further arguments of the function, each a pair like
     `steps`.
     """
-    steps_by_kind, central_steps = steps
+    steps_by_stack, central_steps = steps
     function_of_stack = jax.vmap(jax.vmap(function))  # over filters and nodes
-    by_kind = {}
-    for kind, step in steps_by_kind.items():
-        by_kind[kind] = function_of_stack(step, *(rest_by_kind[kind] for rest_by_kind, _ in rest))
+    by_stack = {}
+    for stack, step in steps_by_stack.items():
+        by_stack[stack] = function_of_stack(step, *(rest_by_stack[stack] for rest_by_stack, _ in rest))
     central = {}
     for name, step in central_steps.items():
         central[name] = function(step, *(rest_by_name[name] for _, rest_by_name in rest))
-    return by_kind, central
+    return by_stack, central
 
 
 StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
@@ -241,36 +241,36 @@ class RowSmoother:
     def __init__(self, network: Network, dt: int | None):
         """Prepare the backward sweep of the network's filters as arrays and code; `dt`: index of the time step in u.
 
-        The sweep smooths a history of rows from the last to the first, the filters of all nodes side by side. A kind is
-        filters that differ in numbers alone, stacked in arrays; a central filter uses the measurements of all nodes.
+        The sweep smooths a history of rows from the last to the first, the filters of all nodes side by side. A stack
+        has filters that differ in numbers alone; a central filter uses the measurements of all nodes.
         """
         instance("network", network, Network, "a Network")
         if dt is not None and not (is_whole(dt) and 0 <= dt < len(network.inputs)):
             raise fail("dt", f"the place of one of {len(network.inputs)} inputs, or None", show_value(dt))
         self.network = network
-        # Filters that can be smoothed: numbers of the kinds of the nodes' filters, and central filters by name.
-        kinds = tuple(
-            k for k, kind in enumerate(network.kinds) if _can_smooth(_get_filter(network, k, kind.filters[0]))
+        # Filters that can be smoothed: numbers of the stacks of the nodes' filters, and central filters by name.
+        stacks = tuple(
+            k for k, stack in enumerate(network.stacks) if _can_smooth(_get_filter(network, k, stack.filters[0]))
         )
         all_central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         central = {name: filter for name, filter in all_central.items() if _can_smooth(filter)}
-        if not kinds and not central:
+        if not stacks and not central:
             raise fail(
                 "smoothing", "a filter that keeps its covariance and says how its state moves", "none in the network"
             )
         # The network's filters without its fusions, which have no state to sweep back: they fuse smoothed estimates.
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
-        fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
+        fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, stacks))
         # The sweep as a function of its arrays, compiled when a history's length is known.
         with jax.enable_x64(True):
-            self.sweep = BackwardSweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
+            self.sweep = BackwardSweep(NetworkStep(network, AllFilters(alone, stacks)), fusions, stacks)
             self._numbers, static = split_structure(self.sweep)
         self._run, self._by_xla = make_backward_sweep(static, dt)
         self._programs = dict[tuple[int, str], Callable[[RowHistory, np.ndarray], PyTree]]()
 
-    def _fuses(self, fusion: StackedFusions, kinds: tuple[int, ...]) -> bool:
-        """Return whether a fusion takes nothing but estimates of these kinds, as they are."""
-        return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
+    def _fuses(self, fusion: StackedFusions, stacks: tuple[int, ...]) -> bool:
+        """Return whether a fusion takes nothing but estimates of these stacks, as they are."""
+        return fusion.quantizers is None and all(stack in stacks for source in fusion.sources for stack, _ in source)
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
         """Return the program for histories of this length: native code, or XLA if native code refuses it.
@@ -298,11 +298,11 @@ class RowSmoother:
             stop: number after that of the last row that is used.
         """
         with jax.enable_x64(True):
-            by_kind, fused = self._find_program(history)(history, np.array([begin, stop], dtype=np.int32))
+            by_stack, fused = self._find_program(history)(history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
-        for k, outputs in by_kind.items():
-            for f, name in enumerate(self.network.kinds[k].filters):
-                for i, node in enumerate(self.network.groups[self.network.kinds[k].group]):
+        for k, outputs in by_stack.items():
+            for f, name in enumerate(self.network.stacks[k].filters):
+                for i, node in enumerate(self.network.groups[self.network.stacks[k].group]):
                     results[node][name] = _take_estimate(outputs, outputs.claim, (f, i))
         # Fused ones; a rule's claim follows from those of what it fuses.
         claims = {node: {name: outputs.claim for name, outputs in filters.items()} for node, filters in results.items()}
@@ -329,9 +329,9 @@ def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> E
     return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
 
 
-def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
-    """Return the filter `name` of a kind at the first node of its group, which stands for all of the kind."""
-    return network.nodes[network.groups[network.kinds[kind].group][0]].filters[name]
+def _get_filter(network: Network, stack: int, name: str) -> AbstractFilter:
+    """Return the filter `name` of a stack at the first node of its group, which stands for all of the stack."""
+    return network.nodes[network.groups[network.stacks[stack].group][0]].filters[name]
 
 
 def _can_smooth(filter: AbstractFilter) -> bool:

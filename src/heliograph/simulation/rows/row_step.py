@@ -53,9 +53,9 @@ class NetworkStep(Module):
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Return all filters' states after step k, without implausible measurements, and the outputs.
 
-        `received`: measurements of all nodes in their order. The outputs are "estimates" by kind of filter and "fused"
-        by name, and the judgements of the measurements, "judged" by kind and "judged_centrally" by name. Filters that
-        weigh also have "weighed" by kind and "weighed_centrally" by name.
+        `received`: measurements of all nodes in their order. The outputs are "estimates" by stack of filters and
+        "fused" by name, and the judgements of the measurements, "judged" by stack and "judged_centrally" by name.
+        Filters that weigh also have "weighed" by stack and "weighed_centrally" by name.
         """
         z = self.group_measurements(received)
         after, outputs = step_plausibly(self.filters, state, z, u, k)

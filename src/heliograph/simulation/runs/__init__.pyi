@@ -21,7 +21,7 @@ from .stacked_filters import StepOutput as StepOutput
 from .stacked_filters import filter_step as filter_step
 from .stacked_filters import initial_state as initial_state
 from .stacked_filters import map_all as map_all
-from .stacked_filters import stack_by_kind as stack_by_kind
+from .stacked_filters import stack_filters as stack_filters
 from .xla_runs import apply_to_each_run as apply_to_each_run
 from .xla_runs import list_used_leaves as list_used_leaves
 from .xla_runs import simulate_trajectories as simulate_trajectories

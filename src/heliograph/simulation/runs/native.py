@@ -395,6 +395,6 @@ def compile_network_runs(
 
     `smoothing`: which estimates are smoothed; None for none.
     """
-    world = build_world(network, None if smoothing is None else smoothing.kinds)
+    world = build_world(network, None if smoothing is None else smoothing.stacks)
     smoother = None if smoothing is None else smoothing.smoother(world.filters)
     return compile_runs(world, inputs, key, reducer, runs, smoother, precision=precision)

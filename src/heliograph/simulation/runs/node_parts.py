@@ -15,7 +15,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import number_unnamed_memories
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
-from heliograph.simulation.network_index import AlikeFilters, find_estimate_places
+from heliograph.simulation.network_index import StackIndex, find_estimate_indices
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.stacked_filters import StackedFilters
 from heliograph.simulation.simulation_step import World
@@ -39,12 +39,12 @@ def is_apart(network: Network) -> bool:
 
 
 @cache_by_object
-def build_world(network: Network, smoothed_kinds: tuple[int, ...] | None = None) -> World:
+def build_world(network: Network, smoothed_stacks: tuple[int, ...] | None = None) -> World:
     """Return the world of a network, plant, transmission and filters, once for all simulations of it.
 
-    `smoothed_kinds`: numbers of the kinds of filters (stacks of one structure) that are smoothed; None: no smoothing.
+    `smoothed_stacks`: numbers of the stacks of filters that are smoothed; None: no smoothing.
     """
-    return World(number_unnamed_memories(network.plant), make_reception(network), AllFilters(network, smoothed_kinds))
+    return World(number_unnamed_memories(network.plant), make_reception(network), AllFilters(network, smoothed_stacks))
 
 
 def count_parts(network: Network) -> int:
@@ -81,9 +81,9 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
     Its fields are set without the constructor, which would check again what the whole network has passed.
     """
     # In the whole network these nodes are part of one group (nodes of one structure); here they are the only group,
-    # number 0. A kind is the filters of one structure at the nodes of a group.
+    # number 0. A stack is the filters of one structure at the nodes of a group.
     group = next(g for g, members in enumerate(network.groups) if names[0] in members)
-    kinds = tuple(AlikeFilters(group=0, filters=kind.filters) for kind in network.kinds if kind.group == group)
+    stacks = tuple(StackIndex(group=0, filters=stack.filters) for stack in network.stacks if stack.group == group)
     size = network.nodes[names[0]].received  # numbers that each of them receives
     claimed = {(name, f): network.claimed[name, f] for name in names for f in network.nodes[name].filters}
     return _with_fields(
@@ -91,8 +91,8 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
         nodes={name: network.nodes[name] for name in names},
         names=names,
         groups=(names,),
-        kinds=kinds,
-        places=FrozenMapping(find_estimate_places((names,), kinds)),  # where each filter's estimate stands
+        stacks=stacks,
+        estimate_indices=FrozenMapping(find_estimate_indices((names,), stacks)),  # where each filter's estimate stands
         rows=FrozenMapping({name: range(i * size, (i + 1) * size) for i, name in enumerate(names)}),
         claimed=FrozenMapping(claimed),  # what each filter claims of its covariance
     )
@@ -119,8 +119,8 @@ def _select_rows(world: World, nodes: slice) -> World:
         return leaf[nodes] if eqx.is_array(leaf) else leaf
 
     medium = SeparateChannels(jax.tree.map(select, world.medium.groups))
-    stacks = tuple(_select_filters(stacked, nodes) for stacked in world.filters.alike)
-    return World(world.plant, medium, _with_fields(world.filters, alike=stacks))
+    stacks = tuple(_select_filters(stacked, nodes) for stacked in world.filters.stacks)
+    return World(world.plant, medium, _with_fields(world.filters, stacks=stacks))
 
 
 def _select_filters(stacked: StackedFilters, nodes: slice) -> StackedFilters:

@@ -214,30 +214,30 @@ def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
     return jax.tree.map(add_axis, function(*jax.tree.map(drop_axis, stacked)))
 
 
-def stack_by_kind(network: Network, smoothed_kinds: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
+def stack_filters(network: Network, smoothed_stacks: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
     """Return the filters of a network's nodes as stacks: filters that differ in numbers alone along one axis.
 
     Filters of one structure differ in numbers alone, so that one `vmap` steps them all. A group holds the nodes of one
-    structure. A kind holds filters of one structure at all nodes of one group; along its axis are the first filter of
+    structure. A stack holds filters of one structure at all nodes of one group; along its axis are the first filter of
     all nodes, then the second one, and so on.
 
     Args:
         network: the network.
-        smoothed_kinds: indices of the kinds whose estimates are to be smoothed.
+        smoothed_stacks: numbers of the stacks whose estimates are to be smoothed.
         judges: whether filters judge if their measurements are plausible.
     """
-    alike = []
-    for number, kind in enumerate(network.kinds):
-        nodes = network.groups[kind.group]
-        filters = [without_output_names(network.nodes[node].filters[f]) for f in kind.filters for node in nodes]
-        alike.append(
+    stacks = []
+    for number, index in enumerate(network.stacks):
+        nodes = network.groups[index.group]
+        filters = [without_output_names(network.nodes[node].filters[f]) for f in index.filters for node in nodes]
+        stacks.append(
             StackedFilters(
                 filters=stack(filters),
-                group=kind.group,
-                count=len(kind.filters),
+                group=index.group,
+                count=len(index.filters),
                 nodes=len(nodes),
-                smooths=number in smoothed_kinds,
+                smooths=number in smoothed_stacks,
                 judges=judges,
             )
         )
-    return tuple(alike)
+    return tuple(stacks)

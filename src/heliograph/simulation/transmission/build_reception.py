@@ -57,7 +57,7 @@ def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
     hops = {name: hop.channel for name, hop in find_hops_with_memory(relays).items()}
     return SlottedRelays(
         relays=relays,
-        estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
+        estimates_at=tuple(network.estimate_indices[name, LOCAL] for name in relays.relays),
         groups=tuple(listeners_by_group),
         memories=number_memory_seeds(hops),
     )
@@ -85,7 +85,7 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
     reference: PyTree = None
     if filter_name is not None:
         reference = stack([without_output_names(node.filters[filter_name]) for node in nodes.values()])
-    place = None if filter_name is None else network.places[first_name, filter_name]
+    index_of_reference = None if filter_name is None else network.estimate_indices[first_name, filter_name]
     triggers: PyTree = [node.trigger for node in nodes.values()]
     encoders: PyTree = [node.encoder for node in nodes.values()]
     return NodeGroup(
@@ -98,7 +98,7 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
         reference_filter=reference,
         trigger=None if triggers[0] is None else stack(triggers),
         encoder=None if encoders[0] is None else stack(encoders),
-        informed_at=None if place is None else (place.kind, place.filter),
+        informed_at=None if index_of_reference is None else (index_of_reference.stack, index_of_reference.filter),
         reader=None if encoders[0] is None else make_word_reader(first_node.channel),
     )
 

@@ -58,7 +58,7 @@ class AbstractMedium(Module):
         raise unwritten(self, "receive")
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
-        """Return the medium's state with the filters' `estimates` after their step, by kind, (filter, node, ...)."""
+        """Return the medium's state with the filters' `estimates` after their step, by stack, (filter, node, ...)."""
         return state
 
     def reasons(self, state: PyTree) -> dict[str, jax.Array]:
@@ -79,7 +79,7 @@ class NodeGroup(Module):
         reference_filter: filters whose estimates are fed back to the sensors, or predict for the triggers; or None.
         trigger: when nodes send; None where they always do.
         encoder: of the words that nodes send; None where they send y.
-        informed_at: (kind, number within the kind) of the `reference_filter`; None without.
+        informed_at: (stack, number within the stack) of the `reference_filter`; None without.
         reader: puts the bits that arrive together to words; None without words.
     """
 
@@ -177,18 +177,18 @@ class SeparateChannels(AbstractMedium):
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Return the links' state with the present estimate of each filter that is fed back to its sensor.
 
-        `estimates`: the nodes' estimates by kind of filter, (filter, node, ...).
+        `estimates`: the nodes' estimates by stack of filters, (filter, node, ...).
         """
 
         def feed_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> PyTree:
             """Return the links of one group of nodes with the estimates that are fed back to their senders.
 
-            `group.informed_at`: (kind, filter) of these estimates, or None if nothing is fed back.
+            `group.informed_at`: (stack, filter) of these estimates, or None if nothing is fed back.
             """
             if group.informed_at is None:
                 return link
-            kind, filter = group.informed_at
-            return link._replace(feed_back=estimates[kind].mean[filter])
+            stack, filter = group.informed_at
+            return link._replace(feed_back=estimates[stack].mean[filter])
 
         return tuple(feed_group(group, link) for group, link in zip(self.groups, state, strict=True))
 

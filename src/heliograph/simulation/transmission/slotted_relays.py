@@ -14,7 +14,7 @@ from heliograph.model.over_time import OverTime, at, first, over_time, structure
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.network_index import EstimatePlace
+from heliograph.simulation.network_index import EstimateIndex
 from heliograph.simulation.random_keys import SENSOR, Number, checksum, draw_key
 from heliograph.simulation.transmission.channel_draws import deliver_signal, start_channel
 from heliograph.simulation.transmission.medium import AbstractMedium, Measurements
@@ -40,7 +40,7 @@ class SlottedRelays(AbstractMedium):
     """
 
     relays: RelayNetwork
-    estimates_at: tuple[EstimatePlace, ...] = eqx.field(static=True)
+    estimates_at: tuple[EstimateIndex, ...] = eqx.field(static=True)
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     memories: dict[str, np.ndarray]
 
@@ -94,7 +94,7 @@ class SlottedRelays(AbstractMedium):
 
     def feed_back(self, state: RelayStates, estimates: Sequence[Estimate]) -> RelayStates:
         """Return the state with the relays' estimates, to be sent at the next step."""
-        means = [estimates[place.kind].mean[place.filter, place.node] for place in self.estimates_at]
+        means = [estimates[index.stack].mean[index.filter, index.node] for index in self.estimates_at]
         return RelayStates(jnp.stack(means) if means else state.estimates, state.hops)
 
     def _sum_without_memory(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:

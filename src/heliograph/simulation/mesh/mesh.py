@@ -26,14 +26,16 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.late_and_quantized_messages import (
+from heliograph.simulation.centres.observation_model import SeparateObservations
+from heliograph.simulation.mesh.late_and_quantized_messages import (
     ArrivingEstimates,
     MessagesOnTheWay,
     find_event_senders,
     gather_messages,
     step_messages_on_the_way,
 )
-from heliograph.simulation.centres.mesh_state_and_step import (
+from heliograph.simulation.mesh.neighbour_edges import MeshEdges
+from heliograph.simulation.mesh.state_and_step import (
     Arrived,
     MeshState,
     MeshStep,
@@ -45,8 +47,6 @@ from heliograph.simulation.centres.mesh_state_and_step import (
     weigh_measurements,
     widen_for_events,
 )
-from heliograph.simulation.centres.neighbour_edges import MeshEdges
-from heliograph.simulation.centres.observation_model import SeparateObservations
 
 
 class Mesh(Module):

@@ -22,12 +22,12 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.simulation.centres.late_and_quantized_messages import MessagesOnTheWay, quantize_estimate
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_state_and_step import MeshState, NodeBucket
-from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.centres.observation_model import SeparateObservations, stack_nodes
 from heliograph.simulation.covariance_claims import find_premise
+from heliograph.simulation.mesh.late_and_quantized_messages import MessagesOnTheWay, quantize_estimate
+from heliograph.simulation.mesh.mesh import Mesh
+from heliograph.simulation.mesh.neighbour_edges import MeshEdges
+from heliograph.simulation.mesh.state_and_step import MeshState, NodeBucket
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 

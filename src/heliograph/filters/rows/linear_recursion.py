@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussians_in_states import gaussians_of, select_state
+from heliograph.filters.rows.gaussians_in_states import gaussians_of, select_state
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import Array, PyTree
 

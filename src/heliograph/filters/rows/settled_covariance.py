@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.gaussians_in_states import ROUNDING, find_equal_states, means_of, select_state, with_means
-from heliograph.filters.linear_recursion import Recursion, make_row_numbers, sum_rows
-from heliograph.filters.row_windows import take
+from heliograph.filters.rows.gaussians_in_states import ROUNDING, find_equal_states, means_of, select_state, with_means
+from heliograph.filters.rows.linear_recursion import Recursion, make_row_numbers, sum_rows
+from heliograph.filters.rows.row_windows import take
 from heliograph.numerics.process.repeated_rows_in_memory import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 from straightline import present

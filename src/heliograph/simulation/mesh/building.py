@@ -7,10 +7,10 @@ import numpy as np
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_state_and_step import NodeBucket
-from heliograph.simulation.centres.neighbour_edges import build_edges
 from heliograph.simulation.centres.observation_model import ObservationModel, SeparateObservations, stack_nodes
+from heliograph.simulation.mesh.mesh import Mesh
+from heliograph.simulation.mesh.neighbour_edges import build_edges
+from heliograph.simulation.mesh.state_and_step import NodeBucket
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -34,11 +34,9 @@ def build_mesh(network: Network, name: str) -> Mesh:
         buckets.append(NodeBucket(rule=fusion.rule.placed(part), rows=members, width=width))
     # Place of each node among the results of all buckets, one after another: the inverse of the order of the members.
     ranks = np.argsort(np.concatenate([bucket.rows for bucket in buckets]))
-    # A group has nodes of equal models; a kind is a group with its filters. For each group that has the mesh's
-    # estimates: the numbers of its nodes in the mesh.
+    # For each group of nodes of one structure that has the mesh's estimates: the numbers of its nodes in the mesh.
     index = {node: i for i, node in enumerate(nodes)}
-    kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
-    kind_places = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
+    groups = [network.groups[stacked.group] for stacked in network.mesh_stacks if stacked.filters == (name,)]
     return Mesh(
         plant=network.plant,
         buckets=tuple(buckets),
@@ -46,7 +44,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
         edges=build_edges(fusion, graph),
         observation_model=_model_measurements(network, nodes),
         senders=graph.senders,
-        places=tuple(kind_places),
+        places=tuple(tuple(index[node] for node in group) for group in groups),
         nodes=graph.nodes,
         alpha=None if fusion.alpha is None else np.asarray(fusion.alpha),  # an argument of the program, no constant
         quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 from tests.draws import draw
 
 R = np.array([[1.0, 0.3], [0.3, 2.0]])

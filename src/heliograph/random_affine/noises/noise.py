@@ -18,7 +18,6 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.factor_of_covariance import FACTOR_TOLERANCE, WeightsOfFactor, factor_by_eigenvectors
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import (
     GaussianBranches,
@@ -29,6 +28,11 @@ from heliograph.random_affine.moments.mixture_components import (
     stack_branches,
 )
 from heliograph.random_affine.moments.monomials import Exponents, list_exponents
+from heliograph.random_affine.noises.factor_of_covariance import (
+    FACTOR_TOLERANCE,
+    WeightsOfFactor,
+    factor_by_eigenvectors,
+)
 
 Number = float | jax.Array
 Vector = Float[jax.Array | np.ndarray, " n"]

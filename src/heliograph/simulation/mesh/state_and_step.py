@@ -23,7 +23,7 @@ from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeigh
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
-from heliograph.simulation.centres.late_and_quantized_messages import MessagesOnTheWay
+from heliograph.simulation.mesh.late_and_quantized_messages import MessagesOnTheWay
 
 # Which messages arrive, each node's from itself first; where they may be late, their ages in steps, -1 of none.
 Arrived = Bool[Array, "node rounds degree"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.factors.factored_gaussian import Gaussian
-from heliograph.filters import gaussians_in_states
+from heliograph.filters.rows import gaussians_in_states
 
 DEVIATION = 2.0
 PRIOR = Gaussian(np.array([[1.0]]), np.zeros((1, 0)), np.array([[DEVIATION**2]]))

@@ -30,11 +30,11 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import make_run_key, read_plant_inputs
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_building import build_mesh
-from heliograph.simulation.centres.mesh_check import find_claim_of_errors
-from heliograph.simulation.centres.mesh_state_and_step import MeshStep
-from heliograph.simulation.centres.neighbour_edges import MeshEdges
+from heliograph.simulation.mesh.building import build_mesh
+from heliograph.simulation.mesh.check import find_claim_of_errors
+from heliograph.simulation.mesh.mesh import Mesh
+from heliograph.simulation.mesh.neighbour_edges import MeshEdges
+from heliograph.simulation.mesh.state_and_step import MeshStep
 from heliograph.simulation.network import Network
 
 SPARSE = 2000  # nodes whose joint covariance fits in memory

@@ -8,7 +8,7 @@ from heliograph.numerics.check import array, instance
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseAtom, NoiseWithoutOutliers
 from heliograph.random_affine.moments.monomials import Exponents, multiply_by_linear_form
-from heliograph.random_affine.noise import AbstractNoise, Matrix, Number, Square, Vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Matrix, Number, Square, Vector
 
 
 class Shaped(AbstractNoise):

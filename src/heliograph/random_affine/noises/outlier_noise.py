@@ -16,7 +16,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers
 from heliograph.random_affine.moments.monomials import Exponents
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
+from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
 
 PRECISIONS = 10.0 ** (-5 + 5.7 * np.arange(25) / 24)
 """Precisions, in units of the scale's, at which Student's law is read as a mixture of Gaussian ones."""
@@ -149,13 +149,13 @@ class Contaminated(AbstractNoise):
         outliers = _read_matrices("covariance of the outliers", outlier_covariance, kinds, are_several)
         biases = _read_matrices("bias of the outliers", bias, kinds, are_several)
         xp = library(inlier, outlier_shares, outliers, biases)
-        spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
+        outlier_covariances = [check.covariance("covariance of the outliers", r, n) for r in outliers]
         centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
                    for b in biases]  # fmt: skip
         # The first branch is the noise without outliers; mean and covariance are those of the mixture.
         self.shares = xp.concatenate([xp.stack([1 - sum(outlier_shares)]), xp.stack(outlier_shares)])
         self.means = xp.stack([xp.zeros(n), *centers])
-        self.covariances = xp.stack([inlier, *spreads])
+        self.covariances = xp.stack([inlier, *outlier_covariances])
         self.mean = self.shares @ self.means
         deviations = self.means - self.mean
         between = deviations[:, :, None] * deviations[:, None]

@@ -16,7 +16,7 @@ from heliograph.numerics.check import array, check_count, fail, rank
 from heliograph.numerics.numpy_or_jax import is_traced, plain
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.monomials import Exponents, list_exponents
-from heliograph.random_affine.noise import (
+from heliograph.random_affine.noises.noise import (
     AbstractNoise,
     FiniteSupport,
     Gaussian,
@@ -25,7 +25,7 @@ from heliograph.random_affine.noise import (
     Square,
     Vector,
 )
-from heliograph.random_affine.shaped_noise import Shaped
+from heliograph.random_affine.noises.shaped_noise import Shaped
 
 MOMENT_TOLERANCE = 1e-10  # of moments scaled to unit second moment: rounding of the numbers given
 MOMENT_ERROR = 0.1  # standard error of an estimated moment, relative to its largest possible size, that is tolerated

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters import chunks
+from heliograph.filters.rows import chunks
 
 ROWS = 40_001  # a chunk that is not full at the end
 RNG = np.random.default_rng(7)

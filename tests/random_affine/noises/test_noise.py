@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.moments import list_exponents
-from heliograph.random_affine.noise import noise_moment_vector
+from heliograph.random_affine.noises.noise import noise_moment_vector
 from tests.draws import draw
 
 COVARIANCE = np.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.8]])

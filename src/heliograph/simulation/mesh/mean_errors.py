@@ -36,11 +36,11 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_check import find_claim_of_errors
-from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
-from heliograph.simulation.centres.mesh_state_and_step import MeshStep, NodeBucket
-from heliograph.simulation.centres.neighbour_edges import find_arrival_probability, links_by_edge
+from heliograph.simulation.mesh.check import find_claim_of_errors
+from heliograph.simulation.mesh.errors import MeshErrors, compute_full_step, find_mesh
+from heliograph.simulation.mesh.mesh import Mesh
+from heliograph.simulation.mesh.neighbour_edges import find_arrival_probability, links_by_edge
+from heliograph.simulation.mesh.state_and_step import MeshStep, NodeBucket
 from heliograph.simulation.network import Network
 
 NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node

@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.gaussians_in_states import beside_gaussians, find_equal_states, means_of, with_gaussians
-from heliograph.filters.linear_recursion import (
+from heliograph.filters.rows.gaussians_in_states import beside_gaussians, find_equal_states, means_of, with_gaussians
+from heliograph.filters.rows.linear_recursion import (
     FilterRecursion,
     Recursion,
     initial_state_if_linear,
@@ -33,8 +33,8 @@ from heliograph.filters.linear_recursion import (
     state_after_rows,
     sum_chunk,
 )
-from heliograph.filters.row_windows import Which, run_and_join, take, take_windows, take_windows_in_parts
-from heliograph.filters.settled_covariance import (
+from heliograph.filters.rows.row_windows import Which, run_and_join, take, take_windows, take_windows_in_parts
+from heliograph.filters.rows.settled_covariance import (
     CompleteBlocks,
     SettledState,
     find_complete_blocks,

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import scan_rows
-from heliograph.filters.chunks import ScanResult, filter_in_chunks
-from heliograph.filters.linear_recursion import initial_state_if_linear
+from heliograph.filters.rows.chunks import ScanResult, filter_in_chunks
+from heliograph.filters.rows.linear_recursion import initial_state_if_linear
 from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.checks.row_times import find_common_dates, read_row_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation

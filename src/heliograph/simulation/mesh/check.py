@@ -20,9 +20,9 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.simulation.centres.fixed_share_stability import check_error_decay
 from heliograph.simulation.centres.fusion_centre import find_claim_of_informed_fusion
-from heliograph.simulation.centres.neighbour_edges import (
+from heliograph.simulation.mesh.fixed_share_stability import check_error_decay
+from heliograph.simulation.mesh.neighbour_edges import (
     build_edges,
     find_arrival_probability,
     find_loss_decay,
