@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from heliograph.files.estimates.forecasts_table import ByFilter
-    from heliograph.files.recording import Recording
+    from heliograph.files.recordings.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
@@ -226,7 +226,7 @@ def _write_estimates(
     from heliograph.files.estimates.estimates_table import estimate_columns
     from heliograph.files.estimates.forecasts_table import make_forecast_columns
     from heliograph.files.stores.store_tables import write_columns_to_store
-    from heliograph.files.table import write_table
+    from heliograph.files.tables.table import write_table
 
     columns = make_forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
     if isinstance(place, Path):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from heliograph.cli.filter_plant import filter_rows
 from heliograph.cli.measured_data import ReadingOptions, describe_refusals
-from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.stores.store_address import StoreAddress
+from heliograph.files.tables.block_size import USUAL_BLOCK, BlockSize
 
 if TYPE_CHECKING:
     from heliograph.report.progress import Advance
@@ -143,9 +143,9 @@ def filter_in_blocks(
         ValueError: what cannot be read; more than `most` rows that are out of order.
     """
     from heliograph.files.estimates.estimates_table import estimate_columns
-    from heliograph.files.recording_blocks import RecordingBlocks
-    from heliograph.files.row_order_across_blocks import RowsNotInBlocksError
-    from heliograph.files.table_writer import open_table
+    from heliograph.files.recordings.recording_blocks import RecordingBlocks
+    from heliograph.files.recordings.row_order_across_blocks import RowsNotInBlocksError
+    from heliograph.files.tables.table_writer import open_table
     from heliograph.numerics.check import InputError
 
     def progress(done: int, total: int) -> None:

@@ -18,7 +18,7 @@ from heliograph.files.event_columns import (
     number_rows,
     place_values_in_rows,
 )
-from heliograph.files.recording import Recording
+from heliograph.files.recordings.recording import Recording
 from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.learning.packet_losses.delay_law import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
