@@ -88,21 +88,24 @@ def run(
         measured = list[MeasuredPlant]()
         if not said_of_blocks:
             measured = read_measured_plants(measurements, network, loaded, module, options, advance, lag)
-        # Each plant by itself, with the place where its estimates are written.
-        places = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
-        _refuse_losing_files(network, measurements, places, lag, report)
+        # Each plant by itself, with where its estimates are written.
+        destinations = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
+        _refuse_losing_files(network, measurements, destinations, lag, report)
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
-        for data, place in zip(measured, places, strict=True):
+        for data, destination in zip(measured, destinations, strict=True):
             advance(f"filtering {len(data.recording.time)} rows")
             plant = filter_plant(loaded, data, smoother, horizons, predicted)
-            if place is not None:
-                advance(f"writing {place}")
-                plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
-            done.append((plant, place))
+            if destination is not None:
+                advance(f"writing {destination}")
+                plant.said.extend(write_plant_estimates(plant, destination, loaded, module, lag, options))
+            done.append((plant, destination))
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, [plant for plant, _ in done], report)
-    lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
+    lines = [
+        (plant.doubted, [*_describe_results(plant.written, destination, report), *plant.said])
+        for plant, destination in done
+    ]
     for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
         _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
 
@@ -176,15 +179,15 @@ def _check_options(
     tabular = [option for option in wanted if option in ("--forecast", "--predicted")]
     if tabular and isinstance(out, Path) and out.suffix.lower() == ".mcap":
         raise fail(tabular[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
-    _check_output_places(measurements, out, report)
+    _check_packages_and_files(measurements, out, report)
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Return a line on what was written where, and one on the errors of each filter."""
     written = WrittenRowCounts()
     written.add(record)
-    places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [written.describe(*places), *_describe_estimation_errors(record)]
+    destinations = [path for path in (out, report and report / "report.html") if path is not None]
+    return [written.describe(*destinations), *_describe_estimation_errors(record)]
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
@@ -200,7 +203,7 @@ def _describe_estimation_errors(record: "Record") -> list[str]:
     return lines
 
 
-def _check_output_places(
+def _check_packages_and_files(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None
 ) -> None:
     """Check before the work starts that packages for these files are installed, and that they can be written.
@@ -239,18 +242,20 @@ def _check_output_places(
 def _refuse_losing_files(
     network: str,
     measurements: Path | StoreAddress,
-    places: "Sequence[Path | StoreAddress | None]",
+    destinations: "Sequence[Path | StoreAddress | None]",
     lag: float | None,
     report: Path | None,
 ) -> None:
     """Raise ValueError if a file that is read or written would be overwritten.
 
-    `places` says where estimates go. With a `lag`, lagged estimates are written beside them.
+    `destinations` says where estimates go. With a `lag`, lagged estimates are written beside them.
     """
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 
-    later = [choose_lagged_output(place) for place in places if place is not None and lag is not None]
-    refuse_replacing([measurements, find_network_file(network)], [*places, *later], report)
+    later = [
+        choose_lagged_output(destination) for destination in destinations if destination is not None and lag is not None
+    ]
+    refuse_replacing([measurements, find_network_file(network)], [*destinations, *later], report)
 
 
 def _refuse_replacing_inputs(

@@ -191,7 +191,7 @@ class EventsByArrival(NamedTuple):
     time: np.ndarray
     arrival: np.ndarray
     sequence: np.ndarray
-    place: np.ndarray
+    event_index: np.ndarray
 
     def select(self, which: np.ndarray) -> "EventsByArrival":
         """Return some of the events, by number or by mask."""
@@ -233,11 +233,13 @@ def judge_events(
     newest_final = _find_newest_final_row(some, row, window)
     is_late = row <= newest_final if joint else row < newest_final
     verdicts[candidates[is_late]] = LATE
-    # Events that may take each other's place: of one node in one row. Most are alone there, and stay used.
-    place = _rank_rows(some.time, some.node) if joint else identity
-    has_rivals: Bool[np.ndarray, " places"] = np.bincount(place, minlength=1) > 1
-    contenders = np.flatnonzero(has_rivals[place] & (row >= newest_final))
-    _judge_repeated_events(verdicts, candidates[contenders], identity[contenders], place[contenders], values, joint)
+    # Rival events are of one node in one row. Most are alone there, and stay used.
+    row_and_node = _rank_rows(some.time, some.node) if joint else identity
+    has_rivals: Bool[np.ndarray, " rows_and_nodes"] = np.bincount(row_and_node, minlength=1) > 1
+    contenders = np.flatnonzero(has_rivals[row_and_node] & (row >= newest_final))
+    _judge_repeated_events(
+        verdicts, candidates[contenders], identity[contenders], row_and_node[contenders], values, joint
+    )
     return verdicts
 
 
@@ -245,7 +247,7 @@ def _judge_repeated_events(
     verdicts: Int[np.ndarray, " events"],
     numbers: np.ndarray,
     identities: np.ndarray,
-    places: np.ndarray,
+    rows_and_nodes: np.ndarray,
     values: Callable[[int], np.ndarray],
     joint: bool,
 ) -> None:
@@ -255,24 +257,26 @@ def _judge_repeated_events(
         verdicts: verdicts on all events, such as USED, changed here to DUPLICATE (same values) or CONFLICT (others).
         numbers: numbers of the events to judge, in order of arrival.
         identities: for each, a number for its node, time and count; later events of one identity are repetitions.
-        places: for each, a number that stands for its row and node if rows are joint, else its identity.
+        rows_and_nodes: for each, a number that stands for its row and node if rows are joint, else its identity.
         values: the values of the event with a number.
         joint: whether all events of one time are one row.
     """
     first_of_identity = dict[int, int]()  # the number of the first event of each identity, which stays
-    filled = dict[int, np.ndarray]()  # by place the mask of the components that have a value
-    for event, identity, place in zip(numbers.tolist(), identities.tolist(), places.tolist(), strict=True):
+    filled = dict[int, np.ndarray]()  # by row and node the mask of the components that have a value
+    for event, identity, row_and_node in zip(
+        numbers.tolist(), identities.tolist(), rows_and_nodes.tolist(), strict=True
+    ):
         if identity in first_of_identity:
             is_same = np.array_equal(values(event), values(first_of_identity[identity]), equal_nan=True)
             verdicts[event] = DUPLICATE if is_same else CONFLICT
         elif verdicts[event] == USED:
             present = ~np.isnan(values(event))
-            filled_before = filled.get(place, np.zeros_like(present))
+            filled_before = filled.get(row_and_node, np.zeros_like(present))
             if joint and np.any(present & filled_before):  # a second value of a component in its row
                 verdicts[event] = CONFLICT
             else:
                 first_of_identity[identity] = event
-                filled[place] = present | filled_before
+                filled[row_and_node] = present | filled_before
 
 
 def count_verdicts(
@@ -304,7 +308,7 @@ def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return for each row how many equal rows come before it; row i consists of entry i of each column."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
-    first_of_equals = np.searchsorted(ranks[order], ranks[order])  # place of the first equal row in this order
+    first_of_equals = np.searchsorted(ranks[order], ranks[order])  # index of the first equal row in this order
     counts = np.empty(len(order), dtype=np.int64)
     counts[order] = np.arange(len(order)) - first_of_equals
     return counts
@@ -362,7 +366,7 @@ def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndar
     return np.cumsum(begins_row) - 1, time[begins_row]
 
 
-def place_values_in_rows(
+def put_values_in_rows(
     values: Float[np.ndarray, "events size"], row: Int[np.ndarray, " events"], count: int
 ) -> Float[np.ndarray, "rows size"]:
     """Return a table (count, size) with the values of events in their rows, and NaN where no value arrived.
@@ -384,7 +388,7 @@ def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "
 
 
 def make_inputs_leading_to_rows(
-    held: Float[np.ndarray, "rows given"], times: np.ndarray, unit: int, place: int
+    held: Float[np.ndarray, "rows given"], times: np.ndarray, unit: int, time_index: int
 ) -> Float[np.ndarray, "rows inputs"]:
     """Return the inputs that lead to each row in continuous time: the previous row's inputs, and the time since it.
 
@@ -392,8 +396,8 @@ def make_inputs_leading_to_rows(
         held: inputs that were set last, at each row; before the first row they are 0.
         times: times of the rows, in whole parts of the unit of time, such as nanoseconds.
         unit: how many of these parts are one unit of time.
-        place: index among the inputs of dt, the time since the previous row.
+        time_index: index among the inputs of dt, the time since the previous row.
     """
     inputs_of_row_before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
     dt = np.diff(times, prepend=times[:1]) / unit
-    return np.insert(inputs_of_row_before, place, dt, axis=1)
+    return np.insert(inputs_of_row_before, time_index, dt, axis=1)

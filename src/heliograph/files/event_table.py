@@ -16,7 +16,7 @@ from heliograph.files.event_columns import (
     make_inputs_leading_to_rows,
     node_counts_losses,
     number_rows,
-    place_values_in_rows,
+    put_values_in_rows,
 )
 from heliograph.files.recordings.recording import Recording
 from heliograph.files.sources.message_reading import Reading, Unread
@@ -234,9 +234,10 @@ class EventTable:
         """Yield events in order of arrival; times are seconds from the origin, steps, or numbers as they are."""
         events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
-        # `place` is the index among the node's events. The times are integers, so that their differences are exact.
-        for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
-            values = matrices[node][place]
+        # `event_index` is the index among the node's events. The times are integers, so that their differences are
+        # exact.
+        for node, time, arrival, sequence, event_index in zip(*(column.tolist() for column in events), strict=True):
+            values = matrices[node][event_index]
             yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
@@ -294,7 +295,7 @@ class EventTable:
         events, verdicts = self._judge_events(window, ahead)
         counts = {}
         for node, name, matrix in self._number_value_matrices():
-            used = events.place[(events.node == node) & (verdicts == USED)]
+            used = events.event_index[(events.node == node) & (verdicts == USED)]
             counts[name] = int(np.sum(np.isnan(matrix[used]).all(axis=1)))
         return counts
 
@@ -350,7 +351,7 @@ class EventTable:
         tables = {}
         for node, name, matrix in self._number_value_matrices():
             of_node = events.node == node
-            table = tables[name] = place_values_in_rows(matrix[events.place[of_node]], row[of_node], count)
+            table = tables[name] = put_values_in_rows(matrix[events.event_index[of_node]], row[of_node], count)
             if node >= 0 and node_counts_losses(self.network, name):
                 self.columns[name].write_losses_before_events(table, row[of_node], events.sequence[of_node])
         return tables
@@ -378,7 +379,7 @@ class EventTable:
         events = EventsByArrival(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         if not len(events.time):
             raise fail("events", "at least one", "none")
-        events = events.select(np.lexsort((events.place, events.arrival)))
+        events = events.select(np.lexsort((events.event_index, events.arrival)))
         uncounted = events.sequence < 0
         events.sequence[uncounted] = count_equal_rows_before(events.node[uncounted], events.time[uncounted])
         # Moments to the nearest step from the first.
@@ -394,7 +395,7 @@ class EventTable:
 
         def values(i: int) -> np.ndarray:
             """Return the values of the event with number i."""
-            return np.asarray(matrices[events.node[i]][events.place[i]])
+            return np.asarray(matrices[events.node[i]][events.event_index[i]])
 
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
         return events, judge_events(events, values, self._are_rows_joint, *limits)

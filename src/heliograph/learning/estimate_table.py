@@ -182,10 +182,10 @@ class Solution:
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
         """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
-        places = np.flatnonzero(self.active & self.surface.domains.free)
+        free = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
-        if len(places) and not self.rank.flat.size:
-            few[places] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, places))
+        if len(free) and not self.rank.flat.size:
+            few[free] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, free))
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:

@@ -32,11 +32,11 @@ COPY = 10 * SECOND  # a message that comes again so soon, with its count and val
 
 
 class MappedSource(NamedTuple):
-    """A source, the pattern of its topics, and by node (that its messages may be of) the places of its values."""
+    """A source, the pattern of its topics, and which numbers of a node's measurement its values are, by node."""
 
     source: Source
     pattern: str
-    places: dict[str, np.ndarray]
+    indices_by_node: dict[str, np.ndarray]
 
 
 class TopicReader:
@@ -110,15 +110,15 @@ class TopicReader:
     def periods(self) -> dict[str, int]:
         """Return {node: after how many messages its running count begins again at 0}; other nodes are absent."""
         mapped = [single for several in self._table.values() for single in several]
-        counts = [(node, single.source.sequence) for single in mapped for node in single.places]
+        counts = [(node, single.source.sequence) for single in mapped for node in single.indices_by_node]
         return {node: count.period for node, count in counts if count is not None and count.period}
 
     @property
     def nodes_without_count(self) -> set[str]:
         """Return the nodes whose messages carry no running count, so that lost messages are not known."""
         mapped = [single for several in self._table.values() for single in several]
-        counted = {node for single in mapped for node in single.places if single.source.sequence is not None}
-        return {node for single in mapped for node in single.places} - counted
+        counted = {node for single in mapped for node in single.indices_by_node if single.source.sequence is not None}
+        return {node for single in mapped for node in single.indices_by_node} - counted
 
     @property
     def columns(self) -> set[str]:
@@ -208,7 +208,8 @@ class TopicReader:
     def _read_by_source(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
-        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices (`places`).
+        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices
+        (`indices_by_node`).
 
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
@@ -219,18 +220,22 @@ class TopicReader:
         plant, node = _read_names(mapped, topic, message, where)
         if node in self.others:
             return None
-        if node not in mapped.places:
-            raise fail(f"{where}, node", f"one of {', '.join(mapped.places)}", _suggest_name(node, mapped.places))
+        if node not in mapped.indices_by_node:
+            raise fail(
+                f"{where}, node",
+                f"one of {', '.join(mapped.indices_by_node)}",
+                _suggest_name(node, mapped.indices_by_node),
+            )
         source.check_valid(message, where)
         sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
         # A message with a count may lack values: it measured nothing.
         has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
         # Each value in the output's unit: scale value + offset.
-        parts = zip(mapped.places[node], source.paths, source.scale, source.offset, strict=True)
-        for place, path, scale, offset in parts:
+        parts = zip(mapped.indices_by_node[node], source.paths, source.scale, source.offset, strict=True)
+        for index, path, scale, offset in parts:
             try:
-                values[place] = scale * _read_value(message, path, where, source.quoted) + offset
+                values[index] = scale * _read_value(message, path, where, source.quoted) + offset
                 if sequence is not None:
                     self.found.add((pattern, str(path)))
             except MissingFieldError as error:
@@ -270,7 +275,7 @@ class TopicReader:
             return None
         if is_count_absent:
             sequence = None
-        if node not in mapped.places or (sequence is None and not isinstance(error, RefusedError)):
+        if node not in mapped.indices_by_node or (sequence is None and not isinstance(error, RefusedError)):
             return None
         try:
             time = _read_time(mapped.source, message, where)
@@ -294,15 +299,15 @@ class TopicReader:
         return source.sequence.check(convert_count(value, name, source.quoted), name), False
 
     def _map_sources(self, topic: object, items: object) -> list[MappedSource]:
-        """Return the sources of a topic, checked, with the places of their values in each node's measurement."""
+        """Return the sources of a topic, checked, with the indices of their values in each node's measurement."""
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", show_value(topic))
         sources = [items] if isinstance(items, Source) else items
         if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", show_value(items))
-        return [MappedSource(source, topic, self._find_output_places(topic, source)) for source in sources]
+        return [MappedSource(source, topic, self._find_output_indices(topic, source)) for source in sources]
 
-    def _find_output_places(self, topic: str, source: Source) -> dict[str, np.ndarray]:
+    def _find_output_indices(self, topic: str, source: Source) -> dict[str, np.ndarray]:
         """Return {node: which of its numbers each value of a source (the form of a topic's messages) is, (values,)}.
 
         Raises:
@@ -317,17 +322,17 @@ class TopicReader:
         if isinstance(node, str):
             if node not in self.names:
                 raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _suggest_name(node, self.names))
-            places = {node: self._index_outputs(name, source, node)}
+            indices_by_node = {node: self._index_outputs(name, source, node)}
         else:  # messages name their node, which may be any that has these outputs
             fitting = [each for each in self.names if each != INPUTS and self._has_outputs(each, source)]
-            places = {each: self._index_outputs(name, source, each) for each in fitting}
-            if not places:
+            indices_by_node = {each: self._index_outputs(name, source, each) for each in fitting}
+            if not indices_by_node:
                 raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
         # `of` raises where the topic has not the level that a condition asks for; "#" may be of any levels.
         for condition in source.available if "#" not in topic else ():
             condition.of(topic)
         self._check_kind_of_time(name, source)
-        return places
+        return indices_by_node
 
     def _has_outputs(self, node: str, source: Source) -> bool:
         """Return whether a node has the outputs of a source: those that it names, or as many as it has values."""
