@@ -11,7 +11,7 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     import numpy as np
 
-    from heliograph.files.event_table import EventTable
+    from heliograph.files.events.event_table import EventTable
     from heliograph.files.recordings.recording import Recording
     from heliograph.files.stores.store_address import StoreAddress
     from heliograph.files.stores.store_tables import StoreTable

@@ -14,7 +14,7 @@ from .sources.derived_values import (
 from .estimates.estimates_table import (
     write_estimates as write_estimates,
 )
-from .event_table import (
+from .events.event_table import (
     EventTable as EventTable,
 )
 from .fitted import (

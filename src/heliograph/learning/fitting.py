@@ -12,11 +12,11 @@ from heliograph.learning.estimate_table import Row, Solution
 from heliograph.learning.fit_sentences import describe_boundaries, describe_form_conflict, describe_unfinished_climbs
 from heliograph.learning.hypothesis_tests import FitTest, Values, compare_likelihoods, compute_criteria, wald_test
 from heliograph.learning.identifiability import Identifiability, identify_by_recording
+from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearch
 from heliograph.learning.likelihood.objective import Form, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import ClimbEnds
 from heliograph.learning.long_run_covariance import LEVEL, METHODS, Method
 from heliograph.learning.packet_losses.delay_law import Delays, DelaysByNode, learn_delays
 from heliograph.learning.parametric_network import Build, Description, describe

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from heliograph.files.bags.no_value_marks import blank_columns, list_flags
-from heliograph.files.event_table import NONE, EventTable
+from heliograph.files.events.event_table import NONE, EventTable
 from heliograph.files.sources.derived_values import Computed
 from heliograph.files.sources.source_description import Source
 from heliograph.files.sources.topic_reader import SECOND, TopicReader

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.event_columns import node_counts_losses
-from heliograph.files.event_table import EventTable
+from heliograph.files.events.event_columns import node_counts_losses
+from heliograph.files.events.event_table import EventTable
 from heliograph.files.messages.message_files import FileMessage, read_parquet_names
 from heliograph.files.sources.message_fields import convert_name
 from heliograph.files.sources.message_reading import Reading, Unread

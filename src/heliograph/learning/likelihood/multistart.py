@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, ClimbEnds, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, maximise_from_starts
 from heliograph.numerics.types import Bool, Float
 
 HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain

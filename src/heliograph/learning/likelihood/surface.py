@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.learning.free_parameters import Parameter
+from heliograph.learning.likelihood.climbs import Evaluated, OpenEnds
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
-from heliograph.learning.likelihood.trust_region import Evaluated, OpenEnds, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import maximise_from_starts
 from heliograph.learning.likelihood.trust_region_step import FLAT
 from heliograph.numerics.types import Bool, Float
 
