@@ -141,9 +141,7 @@ class _JaxEvaluation:
         computed in a turn hold in that turn alone: after the loop `self.values` is the outer dictionary again.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
-        carried = [
-            k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()
-        ]  # their indices in loop.parameters
+        carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # indices in loop.parameters
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:

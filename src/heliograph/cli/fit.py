@@ -235,7 +235,7 @@ def _fit_with_progress(
         stop: holds signals such as Ctrl-C; the first ends the search with the best result so far.
     """
     from heliograph.files.recordings.recording import Recording
-    from heliograph.learning.fitting import Fit
+    from heliograph.learning.fit_result import Fit
     from heliograph.learning.fitting import fit as learn_from
 
     first_rows = Recording(

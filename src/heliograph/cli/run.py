@@ -88,23 +88,21 @@ def run(
         measured = list[MeasuredPlant]()
         if not said_of_blocks:
             measured = read_measured_plants(measurements, network, loaded, module, options, advance, lag)
-        # Each plant by itself, with where its estimates are written.
-        destinations = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
-        _refuse_losing_files(network, measurements, destinations, lag, report)
+        targets = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
+        _refuse_losing_files(network, measurements, targets, lag, report)
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
-        for data, destination in zip(measured, destinations, strict=True):
+        for data, target in zip(measured, targets, strict=True):
             advance(f"filtering {len(data.recording.time)} rows")
             plant = filter_plant(loaded, data, smoother, horizons, predicted)
-            if destination is not None:
-                advance(f"writing {destination}")
-                plant.said.extend(write_plant_estimates(plant, destination, loaded, module, lag, options))
-            done.append((plant, destination))
+            if target is not None:
+                advance(f"writing {target}")
+                plant.said.extend(write_plant_estimates(plant, target, loaded, module, lag, options))
+            done.append((plant, target))
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, [plant for plant, _ in done], report)
     lines = [
-        (plant.doubted, [*_describe_results(plant.written, destination, report), *plant.said])
-        for plant, destination in done
+        (plant.doubted, [*_describe_results(plant.written, target, report), *plant.said]) for plant, target in done
     ]
     for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
         _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
@@ -186,8 +184,8 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
     """Return a line on what was written where, and one on the errors of each filter."""
     written = WrittenRowCounts()
     written.add(record)
-    destinations = [path for path in (out, report and report / "report.html") if path is not None]
-    return [written.describe(*destinations), *_describe_estimation_errors(record)]
+    targets = [path for path in (out, report and report / "report.html") if path is not None]
+    return [written.describe(*targets), *_describe_estimation_errors(record)]
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
@@ -242,20 +240,18 @@ def _check_packages_and_files(
 def _refuse_losing_files(
     network: str,
     measurements: Path | StoreAddress,
-    destinations: "Sequence[Path | StoreAddress | None]",
+    targets: "Sequence[Path | StoreAddress | None]",
     lag: float | None,
     report: Path | None,
 ) -> None:
     """Raise ValueError if a file that is read or written would be overwritten.
 
-    `destinations` says where estimates go. With a `lag`, lagged estimates are written beside them.
+    `targets` says where estimates go. With a `lag`, lagged estimates are written beside them.
     """
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 
-    later = [
-        choose_lagged_output(destination) for destination in destinations if destination is not None and lag is not None
-    ]
-    refuse_replacing([measurements, find_network_file(network)], [*destinations, *later], report)
+    later = [choose_lagged_output(target) for target in targets if target is not None and lag is not None]
+    refuse_replacing([measurements, find_network_file(network)], [*targets, *later], report)
 
 
 def _refuse_replacing_inputs(
@@ -284,7 +280,8 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     """
     from dataclasses import replace
 
-    from heliograph.report.diagnosis.recording_diagnosis import Health, examine
+    from heliograph.report.diagnosis.health import Health
+    from heliograph.report.diagnosis.recording_diagnosis import examine
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:

@@ -203,7 +203,7 @@ class WrittenRowCounts:
                 if estimate.claim != "none":
                     self._rows_without[f"{node}/{name}"] += int((estimate.claims == "none").sum())
 
-    def describe(self, *destinations: object) -> str:
+    def describe(self, *targets: object) -> str:
         """Return a line on what was written where: "out.csv: 3 rows of a/kf (exact, none of 2 rows)".
 
         In the example the claim is "exact", but in 2 rows nothing is claimed.
@@ -212,7 +212,7 @@ class WrittenRowCounts:
         for name, claim in self._claims.items():
             without = f", none of {self._rows_without[name]} rows" if self._rows_without[name] else ""
             filters.append(f"{name} ({claim}{without})")
-        return f"{' and '.join(map(str, destinations))}: {self.rows} rows of {', '.join(filters)}"
+        return f"{' and '.join(map(str, targets))}: {self.rows} rows of {', '.join(filters)}"
 
 
 class MergedBlockWarnings:

@@ -221,3 +221,18 @@ def format_sum(names: list[str], weights: Float[np.ndarray, " numbers"]) -> str:
 def _format_power(name: str, exponent: float) -> str:
     """Return the text of a power, such as "a", "a^2", "a^0.5"."""
     return name if exponent == 1 else f"{name}^{exponent:g}"
+
+
+def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
+    """Return the rank of the information `late` (p, p) of the second half of the rows, with `ridges` flat directions.
+
+    The initial state's law informs weakly on ridges, where no data do. The second half has hardly any of that.
+    """
+    rank = find_information_rank(late)
+    if rank.flat.shape[1] == ridges:
+        return rank
+    # Take the directions of the least eigenvalues as flat, in units of each coordinate's standard error.
+    diagonal = np.diag(late)
+    unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    _, vectors = np.linalg.eigh(late * unit[:, None] * unit)
+    return rank._replace(flat=vectors[:, :ridges], rest=vectors[:, ridges:], unit=unit)
