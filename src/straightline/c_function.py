@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
 from straightline.c_lowering import lower_for_c
-from straightline.c_source import CSource, Place, Real, c_type
+from straightline.c_source import CSource, EntryText, Real, c_type
 from straightline.lowering import code_line, list_nodes, trace_function, type_of
 from straightline.nodes import Buffer, Node, Type, Unsupported
 
@@ -163,7 +163,7 @@ def _name_stored_type(type: Type, real: Real) -> str:
     return "unsigned char" if type == "bool" else c_type(type, real)
 
 
-def _make_entry_expression(array: CArray) -> Place:
+def _make_entry_expression(array: CArray) -> EntryText:
     """Return the function from an index to the C expression of an argument's number there."""
     return (lambda index: f"{array.name}[{index}]") if array.is_array else (lambda index: array.name)
 

@@ -194,24 +194,25 @@ def _write_bitcast(source: Type, target: Type, name: str, real: Real) -> str:
 
 
 WIDTH = 100  # characters of a line of a table
-Place = Callable[[str], str]  # from an index to what stands there
+EntryText = Callable[[str], str]  # from an index to what stands there
 
 
 class CSource:
     """Writer of statements that compute some nodes, and of the tables that they read.
 
-    `places`: for each input a function from an index to the expression of the number there. `prefix`: of the names of
-    tables. `needed`: what the statements compute; `names`: the variable of each node; `arrays`: the array of each
+    `entry_texts`: for each input a function from an index to the expression of the number there. `prefix`: of the names
+    of tables. `needed`: what the statements compute; `names`: the variable of each node; `arrays`: the array of each
     buffer; `tables`: (name, definition) by the numbers in them; `operations`: how many of each were written.
     """
 
-    def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
+    def __init__(self, roots: Iterable[Node], entry_texts: Mapping[Buffer, EntryText], real: Real, prefix: str):
         """Begin a source without statements.
 
-        `roots` are the nodes to compute. `places` maps each argument's or result's buffer to a function that returns
-        the C text of its entry at an index. `real` is the C type of reals, and `prefix` begins the tables' names.
+        `roots` are the nodes to compute. `entry_texts` maps each argument's or result's buffer to a function that
+        returns the C text of its entry at an index. `real` is the C type of reals, and `prefix` begins the tables'
+        names.
         """
-        self.places, self.real, self.prefix = places, real, prefix
+        self.entry_texts, self.real, self.prefix = entry_texts, real, prefix
         self.needed = list_needed_items(roots)
         self.names: dict[Node, str] = {}  # variable of each node that is computed
         self.arrays: dict[Buffer, str] = {}  # local array of each buffer that is filled
@@ -291,14 +292,14 @@ class CSource:
         """Return the expression of buffer[offset + sum strides * indices] in C.
 
         `buffer.owner` is (whole, start): the buffer is the part of a larger one, `whole`, that begins at `start`.
-        `whole` is a table of constants, an argument or result (`places` writes its entries), or a local array.
+        `whole` is a table of constants, an argument or result (`entry_texts` writes its entries), or a local array.
         """
         whole, start = buffer.owner
         index = self._write_index(start + offset, strides, indices)
         if whole.table is not None:
             return f"{self._name_table(whole)}[{index}]"
-        if whole in self.places:
-            return self.places[whole](index)
+        if whole in self.entry_texts:
+            return self.entry_texts[whole](index)
         return f"{self.arrays.setdefault(whole, f'a{len(self.arrays)}')}[{index}]"
 
     def _write_index(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:

@@ -183,8 +183,8 @@ class CompiledFunction:
 
     def _copy_shared_outputs(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         """Copy the outputs that all runs share (`code.common`) from their bytes in shared memory to every run's row."""
-        places = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
-        for array, is_common, offset, buffer in places:
+        results = zip(outputs, self.code.common, self.code.offsets, self.code.outputs, strict=True)
+        for array, is_common, offset, buffer in results:
             if is_common:
                 size = buffer.size * array.itemsize
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)

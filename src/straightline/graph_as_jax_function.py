@@ -75,9 +75,9 @@ class _JaxEvaluation:
             return jnp.stack(numbers).reshape(value.shape) if numbers else jnp.zeros(value.shape)
         owner, start = value.buffer.owner
         indices = np.indices(value.shape).reshape(value.ndim, -1)
-        known_places = np.array(value.strides, int) @ indices + start + value.offset
-        places = sum((stride * self.value(node) for stride, node in value.moves), jnp.asarray(known_places))
-        return self.memory[owner][places].reshape(value.shape)
+        known_offsets = np.array(value.strides, int) @ indices + start + value.offset
+        offsets = sum((stride * self.value(node) for stride, node in value.moves), jnp.asarray(known_offsets))
+        return self.memory[owner][offsets].reshape(value.shape)
 
     def value(self, node: Node) -> jax.Array:
         """Return the value of a node."""
@@ -122,7 +122,7 @@ class _JaxEvaluation:
         return computed
 
     def _locate_entry(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
-        """Return the place offset + sum strides * indices in the memory that a buffer uses."""
+        """Return the index offset + sum strides * indices in the memory that a buffer uses."""
         pairs = zip(strides, indices, strict=True)
         return sum((s * self.value(i) for s, i in pairs), buffer.owner[1] + offset)
 
@@ -141,7 +141,7 @@ class _JaxEvaluation:
         computed in a turn hold in that turn alone: after the loop `self.values` is the outer dictionary again.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
-        carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # their places in loop.parameters
+        carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # indices in loop.parameters
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
@@ -187,7 +187,7 @@ class _JaxEvaluation:
         def evaluate_body() -> PyTree:
             """Return the guarded block's values that are used outside it, and the arrays of the buffers that it fills.
 
-            `used` holds places in `guard.values`, and `filled` the buffers. `self.values` and `self.memory` begin as
+            `used` holds indices into `guard.values`, and `filled` the buffers. `self.values` and `self.memory` begin as
             they are outside the block.
             """
             self.values, self.memory = dict(outer_values), dict(outer_memory)

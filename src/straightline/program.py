@@ -118,7 +118,7 @@ def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarr
         return view
     graph, kind = lowering.graph, view.type
     entries = zip(mask.ravel().tolist(), numbers.ravel().tolist(), range(view.size), strict=True)
-    nodes = [graph.constant(x, kind) if is_known else graph.load(view.buffer, place) for is_known, x, place in entries]
+    nodes = [graph.constant(x, kind) if is_known else graph.load(view.buffer, index) for is_known, x, index in entries]
     return arrange_nodes(nodes, view.shape)
 
 

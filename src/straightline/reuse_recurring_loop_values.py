@@ -181,16 +181,16 @@ class RingBuffer:
         buffers = {type: Buffer("scratch", type, (rows, n), loop.block) for type, n in count_by_type.items()}
         self._graph = graph
         # For each number of a row: its buffer, and its column there, the count of earlier numbers of the same type.
-        self._places = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
+        self._columns = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
         """Store these numbers, in the order of the types, as a row of the ring."""
-        for n, (buffer, place) in zip(nodes, self._places, strict=True):
-            self._graph.store(buffer, n, place, buffer.shape[1:], (row,))
+        for n, (buffer, column) in zip(nodes, self._columns, strict=True):
+            self._graph.store(buffer, n, column, buffer.shape[1:], (row,))
 
     def load(self, row: Node) -> list[Node]:
         """Return the nodes that load a row, in the order of the types."""
-        return [self._graph.load(buffer, place, buffer.shape[1:], (row,)) for buffer, place in self._places]
+        return [self._graph.load(buffer, column, buffer.shape[1:], (row,)) for buffer, column in self._columns]
 
 
 class RingTurn(NamedTuple):
@@ -353,10 +353,10 @@ def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
 
     Return its parameter: the node that stands for the integer within an iteration.
     """
-    place = loop, len(loop.parameters)
+    key = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))
-    loop.parameters.append(graph.make_fresh_node("parameter", "i64", (), loop.body, place))
-    loop.results.append(graph.make_fresh_node("result", "i64", (), loop.block, place))
+    loop.parameters.append(graph.make_fresh_node("parameter", "i64", (), loop.body, key))
+    loop.results.append(graph.make_fresh_node("result", "i64", (), loop.block, key))
     return loop.parameters[-1]
 
 

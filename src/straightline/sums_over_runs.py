@@ -135,7 +135,7 @@ class SummingProgramWithArguments:
             machine = program.once.choose_machine(1)
             machine.run(pointers.ctypes.data, 0, 0, 1, 1)
         # The results that all runs share (`common`), from their bytes in `self.memory`.
-        for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
+        for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.offsets, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])
                 computed = self.memory[offset : offset + buffer.size * kind.itemsize]

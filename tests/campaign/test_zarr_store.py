@@ -283,7 +283,7 @@ def test_the_process_that_is_killed_while_it_writes_leaves_only_what_the_next_cl
     mine.write_text("half")
     import numpy as np
 
-    from heliograph.files.table import write_table
+    from heliograph.files.tables.table import write_table
 
     write_table({"x": np.zeros(1)}, tmp_path / "o.csv")
     assert not left.exists() and mine.exists()

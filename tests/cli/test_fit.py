@@ -9,7 +9,7 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.files.fitted import load_fitted
-from heliograph.files.recording import Recording, write_recording
+from heliograph.files.recordings.recording import Recording, write_recording
 
 SOURCE = """
 import numpy as np

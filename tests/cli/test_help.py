@@ -10,7 +10,7 @@ import pandas
 import pytest
 
 from heliograph import cli
-from heliograph.files.table import read_table
+from heliograph.files.tables.table import read_table
 
 
 @pytest.fixture(autouse=True)

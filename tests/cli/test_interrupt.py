@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from heliograph import cli
-from heliograph.files.table import read_table
+from heliograph.files.tables.table import read_table
 from tests.cli.example import NETWORK, contents, run_arguments, stub_study
 
 START = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'heliograph'; "

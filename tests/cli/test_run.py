@@ -9,8 +9,8 @@ import pytest
 import heliograph as h
 from heliograph import cli
 from heliograph.files.network_file import load_network
-from heliograph.files.recording import read_recording
-from heliograph.files.table import read_table
+from heliograph.files.recordings.recording import read_recording
+from heliograph.files.tables.table import read_table
 from tests.cli.example import LOSING, NETWORK, contents, refused, run_arguments
 
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import heliograph.files.table
+import heliograph.files.tables.table
 from heliograph import cli
 from heliograph.files import read_table
 from heliograph.files.network_file import load_network
@@ -25,7 +25,7 @@ plant = hg.LinearPlant([[1.0, 1.0], [0.0, 0.9]], [[0.0, 0.0], [0.0, 0.1]], [0.0,
 sensor = hg.LinearSensor([[1.0, 0.0]], 0.1, outputs=["pos"])
 network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(1), {"kf": hg.kalman_filter(plant, sensor)})})
 """
-BlockSize = heliograph.files.table.BlockSize
+BlockSize = heliograph.files.tables.table.BlockSize
 SMALL = BlockSize(rows=8, bytes=60)  # eight rows a block, of text some four lines at a time
 ALL = BlockSize()  # more than any of these tables has
 random = np.random.default_rng(5)

@@ -3,7 +3,7 @@
 import pytest
 
 from heliograph import cli
-from heliograph.files.table import read_table
+from heliograph.files.tables.table import read_table
 from tests.cli.example import refused, run_arguments
 from tests.files.stores.answering import Answering
 from tests.postgres import Postgres

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.files.table import read_table, write_table
+from heliograph.files.tables.table import read_table, write_table
 from heliograph.numerics import format_dates, parse_dates
 from heliograph.serving import Message
 

@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.h_infinity import certify_level, check_growth
 from heliograph.h_infinity.interval_arithmetic import ARITHMETIC, Interval, bound_program
-from heliograph.h_infinity.lipschitz_check import prove_slope_bound
+from heliograph.h_infinity.slope_bounds import prove_slope_bound
 
 REFUTED = {
     "a slope above it": (lambda x: 0.5 * x + jnp.array([1e-5 * jnp.sin(1e5 * x[0])]), 0.7, "slope 1.5"),

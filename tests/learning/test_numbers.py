@@ -111,7 +111,7 @@ def groups_of(known, *kinds):
 
 def test_a_product_is_found_and_put_in_words():
     (group,) = groups_of(lambda v: np.array([v[0] * v[1], v[2]]), "real", "positive", "positive")
-    assert group.places == (0, 1) and group.fix == 1
+    assert group.coordinates == (0, 1) and group.fix == 1
     assert format_product(["a", "b"], group.exponents[0]) == "a * b"
 
 
@@ -125,12 +125,12 @@ def test_a_power_and_a_sum():
 
 def test_two_ridges_apart_one_that_is_neither_and_nothing_at_all():
     first, second = groups_of(lambda v: np.array([v[0] * v[1], v[2] / v[3]]), *("positive",) * 4)
-    assert (first.places, second.places) == ((0, 1), (2, 3))
+    assert (first.coordinates, second.coordinates) == ((0, 1), (2, 3))
     assert format_product(["c", "d"], second.exponents[0]) == "c / d"
     (group,) = groups_of(lambda v: np.array([v[0] * v[1] + v[2]]), *("positive",) * 3)
     assert group.fix == 2 and not len(group.exponents) and not len(group.weights)
     (group,) = groups_of(lambda v: np.array([v[0], 0 * v[1]]), *("positive",) * 2)
-    assert group.places == (1,) and group.fix == 1
+    assert group.coordinates == (1,) and group.fix == 1
     assert groups_of(lambda v: v, *("positive",) * 3) == []
 
 

@@ -172,8 +172,8 @@ def two_tops(counts):
 
 
 @pytest.mark.parametrize("joining", [False, True])
-def test_lanes_before_one_top_are_climbed_by_one(joining):
-    """Three lanes end at one top and one at the other; those that are left to another one are asked no more."""
+def test_climbs_before_one_top_are_climbed_by_one(joining):
+    """Three climbs end at one top and one at the other; those that are left to another one are asked no more."""
     counts, starts = [], np.array([[2.0, 2.0], [0.6, 0.7], [1.1, 0.9], [-2.0, -1.0]])
     found = maximise_from_starts(two_tops(counts), starts, joining=joining)
     assert found.converged.all() and found.total == pytest.approx(0.0, abs=1e-12)
@@ -182,7 +182,7 @@ def test_lanes_before_one_top_are_climbed_by_one(joining):
     assert (sum(counts) < 30) == joining  # 27, and 33 of all on their own
 
 
-def test_lanes_on_both_sides_of_a_saddle_stay_apart():
+def test_climbs_on_both_sides_of_a_saddle_stay_apart():
     """They are a hundredth of a standard error from each other, as high and flat, and end at different tops."""
     found = maximise_from_starts(two_tops([]), np.array([[1e-4, 1e-4], [-1e-4, -1e-4]]), joining=True)
     np.testing.assert_allclose(found.x[:, 0], [1, -1], atol=1e-6)
@@ -202,9 +202,9 @@ def test_a_model_of_which_two_directions_are_one_to_the_last_digit_has_a_step():
     """B = 1e6 [1 1; 1 1] and g = (1, 1): of all p with B p = g the shortest is g / 2e6."""
     one, model = np.eye(2)[None], 1e6 * np.ones((1, 2, 2))
     everything = np.ones((1, 2), dtype=bool)
-    step, length, foretold = trust_region_step(np.ones((1, 2)), one, model, np.ones(1), everything, everything[0])
+    step, length, predicted = trust_region_step(np.ones((1, 2)), one, model, np.ones(1), everything, everything[0])
     np.testing.assert_allclose(step, 5e-7, rtol=1e-6)
-    assert length[0] == pytest.approx(5e-7 * np.sqrt(2)) and foretold[0] == pytest.approx(5e-7)
+    assert length[0] == pytest.approx(5e-7 * np.sqrt(2)) and predicted[0] == pytest.approx(5e-7)
 
 
 @pytest.mark.slow

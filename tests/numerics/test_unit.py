@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.recording import read_recording
+from heliograph.files.recordings.recording import read_recording
 
 
 def unit_of(name):

@@ -13,7 +13,7 @@ from heliograph.files.stores.store_address import StoreAddress
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from heliograph.files.recording import Recording
+    from heliograph.files.recordings.recording import Recording
     from heliograph.report.progress import Advance
     from heliograph.report.results_folder import ResultsContent
     from heliograph.simulation.network import Network

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from heliograph.files.estimates.forecasts_table import ByFilter
-    from heliograph.files.recording import Recording
+    from heliograph.files.recordings.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
@@ -86,7 +86,7 @@ def filter_plant(
 
 def write_plant_estimates(
     plant: FilteredPlant,
-    place: Path | StoreAddress,
+    target: Path | StoreAddress,
     network: "Network",
     module: "Mapping[str, object]",
     lag: float | None,
@@ -98,8 +98,8 @@ def write_plant_estimates(
     """
     write = _make_estimates_writer(plant.data, module)
     predicted = _select_times_of_predictions(plant.predicted, plant.data.rows)
-    _write_estimates(write, plant.written, plant.forecasts, predicted, place, plant.data)
-    return _write_lagged_estimates(network, plant.data, lag, options, place, write)
+    _write_estimates(write, plant.written, plant.forecasts, predicted, target, plant.data)
+    return _write_lagged_estimates(network, plant.data, lag, options, target, write)
 
 
 def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
@@ -109,11 +109,11 @@ def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) 
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}")
 
 
-def choose_lagged_output(place: Path | StoreAddress) -> Path | StoreAddress:
-    """Return where lagged estimates go: a file or table of their own beside `place`."""
-    if isinstance(place, Path):
-        return place.with_suffix(f".lagged{place.suffix}")
-    return place.with_table(f"{place.table_for_estimates}_lagged")
+def choose_lagged_output(target: Path | StoreAddress) -> Path | StoreAddress:
+    """Return where lagged estimates go: a file or table of their own beside `target`."""
+    if isinstance(target, Path):
+        return target.with_suffix(f".lagged{target.suffix}")
+    return target.with_table(f"{target.table_for_estimates}_lagged")
 
 
 def filter_rows(
@@ -216,23 +216,23 @@ def _write_estimates(
     record: "Record",
     forecasts: "ByFilter",
     predicted: "ByFilter",
-    place: Path | StoreAddress,
+    target: Path | StoreAddress,
     data: "MeasuredPlant",
 ) -> None:
     """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
     if not forecasts and not predicted:
-        write(record, place)
+        write(record, target)
         return
     from heliograph.files.estimates.estimates_table import estimate_columns
     from heliograph.files.estimates.forecasts_table import make_forecast_columns
     from heliograph.files.stores.store_tables import write_columns_to_store
-    from heliograph.files.table import write_table
+    from heliograph.files.tables.table import write_table
 
     columns = make_forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
-    if isinstance(place, Path):
-        write_table(columns, place)
+    if isinstance(target, Path):
+        write_table(columns, target)
     else:
-        write_columns_to_store(place, columns, data.plant, _find_date_of_time_zero(data))
+        write_columns_to_store(target, columns, data.plant, _find_date_of_time_zero(data))
 
 
 def _write_lagged_estimates(
@@ -240,14 +240,14 @@ def _write_lagged_estimates(
     data: "MeasuredPlant",
     lag: float | None,
     options: ReadingOptions,
-    place: Path | StoreAddress,
+    target: Path | StoreAddress,
     write: "Write",
 ) -> list[str]:
     """Write the estimates of each row given all that came up to a lag after it, in a file or table of their own.
 
     Such estimates use messages that come late, but wait no longer than the lag. They are found by replaying the
     messages as they came. Returned is a line for the user; none without a lag, and none for rows of time, which have no
-    order of arrival. `place`: where the estimates are written; `write` writes a table there.
+    order of arrival. `target`: where the estimates are written; `write` writes a table there.
     """
     if lag is None or data.events is None:
         return []
@@ -261,7 +261,7 @@ def _write_lagged_estimates(
     lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if lagged is None:
         return []
-    beside = choose_lagged_output(place)
+    beside = choose_lagged_output(target)
     write(lagged, beside)
     return [f"{beside}: {len(lagged.time)} rows, each given what came {lag:g} later"]
 

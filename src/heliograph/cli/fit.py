@@ -18,7 +18,7 @@ from heliograph.files.stores.store_address import StoreAddress
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from heliograph.files.recording import Recording
+    from heliograph.files.recordings.recording import Recording
     from heliograph.learning import Fit, Share
     from heliograph.learning.held_out_comparison import HeldOutTransforms, PredictionBeforeAndAfter
     from heliograph.learning.packet_losses.learn_losses import Losses
@@ -234,8 +234,8 @@ def _fit_with_progress(
         advance: shows a text and how many of how many iterations are done.
         stop: holds signals such as Ctrl-C; the first ends the search with the best result so far.
     """
-    from heliograph.files.recording import Recording
-    from heliograph.learning.fitting import Fit
+    from heliograph.files.recordings.recording import Recording
+    from heliograph.learning.fit_result import Fit
     from heliograph.learning.fitting import fit as learn_from
 
     first_rows = Recording(

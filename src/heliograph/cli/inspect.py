@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from heliograph.files.topic_inspection import TopicStatistics
+    from heliograph.files.topic_statistics import TopicStatistics
 
 
 def inspect(

@@ -11,8 +11,8 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     import numpy as np
 
-    from heliograph.files.event_table import EventTable
-    from heliograph.files.recording import Recording
+    from heliograph.files.events.event_table import EventTable
+    from heliograph.files.recordings.recording import Recording
     from heliograph.files.stores.store_address import StoreAddress
     from heliograph.files.stores.store_tables import StoreTable
     from heliograph.report.progress import Advance
@@ -184,7 +184,7 @@ def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOpt
 
     A warning names at most REASONS reasons.
     """
-    from heliograph.files.recording import read_recording_rows
+    from heliograph.files.recordings.recording import read_recording_rows
 
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)

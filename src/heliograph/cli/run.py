@@ -88,21 +88,22 @@ def run(
         measured = list[MeasuredPlant]()
         if not said_of_blocks:
             measured = read_measured_plants(measurements, network, loaded, module, options, advance, lag)
-        # Each plant by itself, with the place where its estimates are written.
-        places = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
-        _refuse_losing_files(network, measurements, places, lag, report)
+        targets = [out and choose_output_of_plant(out, data.plant, several=len(measured) > 1) for data in measured]
+        _refuse_losing_files(network, measurements, targets, lag, report)
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
-        for data, place in zip(measured, places, strict=True):
+        for data, target in zip(measured, targets, strict=True):
             advance(f"filtering {len(data.recording.time)} rows")
             plant = filter_plant(loaded, data, smoother, horizons, predicted)
-            if place is not None:
-                advance(f"writing {place}")
-                plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
-            done.append((plant, place))
+            if target is not None:
+                advance(f"writing {target}")
+                plant.said.extend(write_plant_estimates(plant, target, loaded, module, lag, options))
+            done.append((plant, target))
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, [plant for plant, _ in done], report)
-    lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
+    lines = [
+        (plant.doubted, [*_describe_results(plant.written, target, report), *plant.said]) for plant, target in done
+    ]
     for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
         _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
 
@@ -176,15 +177,15 @@ def _check_options(
     tabular = [option for option in wanted if option in ("--forecast", "--predicted")]
     if tabular and isinstance(out, Path) and out.suffix.lower() == ".mcap":
         raise fail(tabular[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
-    _check_output_places(measurements, out, report)
+    _check_packages_and_files(measurements, out, report)
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Return a line on what was written where, and one on the errors of each filter."""
     written = WrittenRowCounts()
     written.add(record)
-    places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [written.describe(*places), *_describe_estimation_errors(record)]
+    targets = [path for path in (out, report and report / "report.html") if path is not None]
+    return [written.describe(*targets), *_describe_estimation_errors(record)]
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
@@ -200,7 +201,7 @@ def _describe_estimation_errors(record: "Record") -> list[str]:
     return lines
 
 
-def _check_output_places(
+def _check_packages_and_files(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None
 ) -> None:
     """Check before the work starts that packages for these files are installed, and that they can be written.
@@ -239,18 +240,18 @@ def _check_output_places(
 def _refuse_losing_files(
     network: str,
     measurements: Path | StoreAddress,
-    places: "Sequence[Path | StoreAddress | None]",
+    targets: "Sequence[Path | StoreAddress | None]",
     lag: float | None,
     report: Path | None,
 ) -> None:
     """Raise ValueError if a file that is read or written would be overwritten.
 
-    `places` says where estimates go. With a `lag`, lagged estimates are written beside them.
+    `targets` says where estimates go. With a `lag`, lagged estimates are written beside them.
     """
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 
-    later = [choose_lagged_output(place) for place in places if place is not None and lag is not None]
-    refuse_replacing([measurements, find_network_file(network)], [*places, *later], report)
+    later = [choose_lagged_output(target) for target in targets if target is not None and lag is not None]
+    refuse_replacing([measurements, find_network_file(network)], [*targets, *later], report)
 
 
 def _refuse_replacing_inputs(
@@ -279,7 +280,8 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     """
     from dataclasses import replace
 
-    from heliograph.report.diagnosis.recording_diagnosis import Health, examine
+    from heliograph.report.diagnosis.health import Health
+    from heliograph.report.diagnosis.recording_diagnosis import examine
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from heliograph.cli.filter_plant import filter_rows
 from heliograph.cli.measured_data import ReadingOptions, describe_refusals
-from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.stores.store_address import StoreAddress
+from heliograph.files.tables.block_size import USUAL_BLOCK, BlockSize
 
 if TYPE_CHECKING:
     from heliograph.report.progress import Advance
@@ -143,9 +143,9 @@ def filter_in_blocks(
         ValueError: what cannot be read; more than `most` rows that are out of order.
     """
     from heliograph.files.estimates.estimates_table import estimate_columns
-    from heliograph.files.recording_blocks import RecordingBlocks
-    from heliograph.files.row_order_across_blocks import RowsNotInBlocksError
-    from heliograph.files.table_writer import open_table
+    from heliograph.files.recordings.recording_blocks import RecordingBlocks
+    from heliograph.files.recordings.row_order_across_blocks import RowsNotInBlocksError
+    from heliograph.files.tables.table_writer import open_table
     from heliograph.numerics.check import InputError
 
     def progress(done: int, total: int) -> None:
@@ -203,7 +203,7 @@ class WrittenRowCounts:
                 if estimate.claim != "none":
                     self._rows_without[f"{node}/{name}"] += int((estimate.claims == "none").sum())
 
-    def describe(self, *places: object) -> str:
+    def describe(self, *targets: object) -> str:
         """Return a line on what was written where: "out.csv: 3 rows of a/kf (exact, none of 2 rows)".
 
         In the example the claim is "exact", but in 2 rows nothing is claimed.
@@ -212,7 +212,7 @@ class WrittenRowCounts:
         for name, claim in self._claims.items():
             without = f", none of {self._rows_without[name]} rows" if self._rows_without[name] else ""
             filters.append(f"{name} ({claim}{without})")
-        return f"{' and '.join(map(str, places))}: {self.rows} rows of {', '.join(filters)}"
+        return f"{' and '.join(map(str, targets))}: {self.rows} rows of {', '.join(filters)}"
 
 
 class MergedBlockWarnings:

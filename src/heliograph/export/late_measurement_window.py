@@ -27,7 +27,7 @@ class LateMeasurementWindow(NamedTuple):
 
     Args:
         steps: how many rows before the newest one a measurement may be late.
-        time: place of the time step among the inputs; None where time counts steps.
+        time: index of the time step among the inputs; None where time counts steps.
         received: numbers of a measurement.
         inputs: numbers of an input.
     """
@@ -100,8 +100,8 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
     """
     filter = program.filter
     inputs, received = filter.inputs, filter.received
-    place_of_time = inputs.index(TIME_STEP) if TIME_STEP in inputs else None
-    window = LateMeasurementWindow(steps=steps, time=place_of_time, received=received, inputs=len(inputs))
+    index_of_time = inputs.index(TIME_STEP) if TIME_STEP in inputs else None
+    window = LateMeasurementWindow(steps=steps, time=index_of_time, received=received, inputs=len(inputs))
     # The struct: the present state, rows of a state with the measurement and the inputs after it, and the four counters
     # of `_declare_window`. C has no arrays of length 0.
     data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
@@ -153,8 +153,8 @@ def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int)
     """Return lines for the header on the window: what a late measurement is, what it costs, what is refused.
 
     The window is memory of the exported C code: the last steps of the filter, with their states, data and inputs, one
-    row each. A late measurement is put into its row, and all rows from there on are run again, at most all `places`. If
-    one of them is refused they are run once more without it, hence twice the time.
+    row each. A late measurement is put into its row, and all rows from there on are run again, at most all that there
+    is memory for. If one of them is refused they are run once more without it, hence twice the time.
 
     Args:
         window: how many rows it holds, and whether time counts steps or is an input.

@@ -14,7 +14,7 @@ from .sources.derived_values import (
 from .estimates.estimates_table import (
     write_estimates as write_estimates,
 )
-from .event_table import (
+from .events.event_table import (
     EventTable as EventTable,
 )
 from .fitted import (
@@ -44,7 +44,7 @@ from .messages.messages_to_events import (
 from .network_file import (
     load_network as load_network,
 )
-from .recording import (
+from .recordings.recording import (
     Recording as Recording,
     read_recording as read_recording,
     write_recording as write_recording,
@@ -56,7 +56,7 @@ from .stores.store_tables import (
     read_store as read_store,
     store_estimates as store_estimates,
 )
-from .table import (
+from .tables.table import (
     read_table as read_table,
     write_table as write_table,
 )

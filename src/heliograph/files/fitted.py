@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.network_file import load_network
-from heliograph.learning.fitting import Fit
+from heliograph.learning.fit_result import Fit
 from heliograph.learning.packet_losses.delay_law import Delays
 from heliograph.learning.parametric_network import describe
 from heliograph.numerics.check import fail, file_path

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from heliograph.files.topic_inspection import TopicStatistics
+from heliograph.files.topic_statistics import TopicStatistics
 
 DEGREES = ("deg", "degs", "degree", "degrees", "°")  # of an angle
 FEW = 6  # fields that a suggestion lists

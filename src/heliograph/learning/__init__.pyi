@@ -31,7 +31,7 @@ from .packet_losses.packet_fates import (
 from .hypothesis_tests import (
     FitTest as FitTest,
 )
-from .fitting import (
+from .fit_result import (
     Fit as Fit,
 )
 from .identifiability import (
@@ -45,7 +45,7 @@ from .parametric_network import (
     Description as Description,
     describe as describe,
 )
-from .estimate_table import (
+from .estimate_row import (
     Row as Row,
 )
 from .samples_to_decide import (

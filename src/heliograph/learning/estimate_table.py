@@ -6,10 +6,10 @@ active if its number is not at such an end. A ridge is a direction in which the 
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.estimate_row import Row, make_unidentified_row
 from heliograph.learning.free_parameters import Parameters, TableEntry
 from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
 from heliograph.learning.likelihood.objective import Form
@@ -28,65 +28,13 @@ from heliograph.learning.long_run_covariance import (
     remove_predicted_scores,
     student_quantile,
 )
-from heliograph.learning.unidentified_directions import InformationRank, find_information_rank
-from heliograph.numerics.module import readable
+from heliograph.learning.unidentified_directions import InformationRank, find_rank_of_late_rows
 from heliograph.numerics.types import Bool, Float
 
 WIDE = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
 END = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
 REAL_END = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
 ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
-
-
-@readable
-class Row(NamedTuple):
-    """Row of the table of a fit: a free number by one form of the likelihood.
-
-    Args:
-        name: the number's name.
-        estimate: the estimate.
-        low: lower end of the interval (95 % unless another level is given); NaN if not identified.
-        high: upper end.
-        standard_error: standard error of the estimate; NaN at a boundary or if not identified.
-        form: "linear" or "conditional".
-        boundary: true if the estimate is the end of the number's domain; the interval is from there to the other end.
-        identified: true if the data identify this number without knowledge of the others.
-    """
-
-    name: str
-    estimate: float
-    low: float
-    high: float
-    standard_error: float
-    form: Form
-    boundary: bool
-    identified: bool
-
-    @property
-    def interval(self) -> str:
-        """The interval in words, to two digits of its width: "0.12 to 0.31", "below 0.3" or "not identified"."""
-        if not self.identified:
-            return "not identified"
-        low, high = (round_to_width(end, self.high - self.low) for end in (self.low, self.high))
-        if self.boundary:
-            return f"below {high}" if self.high > self.estimate else f"above {low}"
-        return f"{low} to {high}"
-
-    @property
-    def value(self) -> str:
-        """Estimate in words, with two digits of the interval's width."""
-        return round_to_width(self.estimate, self.high - self.low)
-
-
-def round_to_width(value: float, width: float) -> str:
-    """Return a number rounded to two digits of its interval's width, at least 2 and at most 8 digits of its own.
-
-    If there is no width, it is rounded to four of its own digits.
-    """
-    if not np.isfinite(value) or value == 0 or not np.isfinite(width) or width <= 0:
-        return f"{value:.4g}"
-    digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(width))) + 2
-    return f"{value:.{min(max(digits, 2), 8)}g}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -182,10 +130,10 @@ class Solution:
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
         """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
-        places = np.flatnonzero(self.active & self.surface.domains.free)
+        free = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
-        if len(places) and not self.rank.flat.size:
-            few[places] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, places))
+        if len(free) and not self.rank.flat.size:
+            few[free] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, free))
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
@@ -257,7 +205,7 @@ class Solution:
             if entry.coordinate is not None and not self.active[entry.coordinate]:
                 rows.append(self._make_boundary_row(entry, float(value), level))
             elif not self.identifies(slope):
-                rows.append(_make_unidentified_row(entry, float(value), self.form))
+                rows.append(make_unidentified_row(entry, float(value), self.form))
             else:
                 ends = self._compute_interval(entry, float(value), slope, error, freedom, method, level)
                 rows.append(self._make_row(entry, float(value), error, ends))
@@ -369,32 +317,3 @@ class Solution:
         return self.surface.find_profile_crossings(
             self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
         )
-
-
-def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
-    """Return the row of a number that the data do not identify: where the search ended, without an interval."""
-    return Row(
-        name=entry.name,
-        estimate=value,
-        low=np.nan,
-        high=np.nan,
-        standard_error=np.nan,
-        form=form,
-        boundary=False,
-        identified=False,
-    )
-
-
-def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
-    """Return the rank of the information `late` (p, p) of the second half of the rows, with `ridges` flat directions.
-
-    The initial state's law informs weakly on ridges, where no data do. The second half has hardly any of that.
-    """
-    rank = find_information_rank(late)
-    if rank.flat.shape[1] == ridges:
-        return rank
-    # Take the directions of the least eigenvalues as flat, in units of each coordinate's standard error.
-    diagonal = np.diag(late)
-    unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
-    _, vectors = np.linalg.eigh(late * unit[:, None] * unit)
-    return rank._replace(flat=vectors[:, :ridges], rest=vectors[:, ridges:], unit=unit)

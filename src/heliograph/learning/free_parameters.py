@@ -15,7 +15,7 @@ from heliograph.learning.likelihood.parameter_transforms import (
     slope_from_line,
     slope_to_line,
 )
-from heliograph.numerics.check import POSITIVE, PROBABILITY, REAL, Domain
+from heliograph.numerics.domains import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float
 

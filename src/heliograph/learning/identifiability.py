@@ -64,7 +64,7 @@ class Identifiability:
     @property
     def identified(self) -> tuple[str, ...]:
         """Coordinates that the data identify without knowledge of the others."""
-        lost = {index for group in self.groups for index in group.places}
+        lost = {index for group in self.groups for index in group.coordinates}
         return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
 
     def or_sharper(self, other: "Identifiability") -> "Identifiability":
@@ -170,9 +170,9 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     lines = [
         _describe_confounded_group(identifiability.parameters, group, solution) for group in identifiability.groups
     ]
-    # A group of len(places) numbers becomes known once `fix` of them are; the data identify the other dimensions. If
+    # A group of numbers becomes known once `fix` of them are; the data identify the other dimensions. If
     # there are fewer identified products than these, mean gains and covariances of the links say the rest.
-    has_others = any(group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups)
+    has_others = any(group.fix + len(group.exponents) < len(group.coordinates) for group in identifiability.groups)
     if solution is not None and has_others:
         lines += describe_identified_links(solution)
     if identifiability.weakest < WEAK:
@@ -191,7 +191,7 @@ def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers,
     `group` has the numbers' indices, how many must be fixed (`fix`), and the combinations that are identified:
     `exponents` of products, `weights` of sums (combinations, numbers).
     """
-    names = [parameters.coordinates[i] for i in group.places]
+    names = [parameters.coordinates[i] for i in group.coordinates]
     if group.fix == len(names):  # no combination of them is identified
         return f"Nothing in the data tells {_join_names(names)}."
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
@@ -230,19 +230,19 @@ def _format_interval(
 
     Args:
         parameters: the free numbers v_i.
-        group: the confounded numbers; `places` are their coordinates.
+        group: the confounded numbers; `coordinates` are theirs.
         row: exponents a_i of a product, or weights of a sum, by place in the group.
         solution: the maximum of the likelihood; None where there is none yet.
         log: whether it is a product, whose logarithm sum_i a_i log |v_i| is a sum.
     """
-    if solution is None or not all(solution.active[i] for i in group.places):
+    if solution is None or not all(solution.active[i] for i in group.coordinates):
         return ""
     # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unbounded coordinates.
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
     for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
-        if entry.coordinate in group.places:
-            weight = row[group.places.index(entry.coordinate)]
+        if entry.coordinate in group.coordinates:
+            weight = row[group.coordinates.index(entry.coordinate)]
             slopes += weight * (slope / number if log else slope)
             value += weight * (np.log(abs(number)) if log else number)
     # Half the width of the interval: the quantile of Student's t times sqrt(g' C g).

@@ -14,22 +14,8 @@ from typing_extensions import TypeAliasType
 
 from heliograph.learning.free_parameters import Parameter, Parameters, to_plain_number
 from heliograph.learning.likelihood.parameter_transforms import map_to_line
-from heliograph.numerics.check import (
-    COVARIANCE,
-    POSITIVE,
-    PROBABILITY,
-    REAL,
-    SIMPLEX,
-    Domain,
-    array,
-    error_text,
-    fail,
-    function,
-    instance,
-    mark_checked,
-    rank,
-    show_value,
-)
+from heliograph.numerics.check import array, error_text, fail, function, instance, rank, show_value
+from heliograph.numerics.domains import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, mark_checked
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
-from heliograph.learning.estimate_table import Row
+from heliograph.learning.estimate_row import Row
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.long_run_covariance import LEVEL, find_profile_drop
 from heliograph.learning.packet_losses.delay_law import DelaysByNode

@@ -18,16 +18,16 @@ LARGEST = 4  # exponent that is put in words
 class ConfoundedNumbers(NamedTuple):
     """Free numbers of which the data identify fewer combinations than there are numbers.
 
-    places: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
+    coordinates: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
     identified sums sum_i w_i v_i where no product is; what is identified besides is neither. fix: how many numbers have
     to be known from elsewhere.
 
-    Shapes: exponents, weights (combinations, places).
+    Shapes: exponents, weights (combinations, numbers).
     """
 
-    places: tuple[int, ...]
-    exponents: Float[np.ndarray, "combinations places"]
-    weights: Float[np.ndarray, "combinations places"]
+    coordinates: tuple[int, ...]
+    exponents: Float[np.ndarray, "combinations numbers"]
+    weights: Float[np.ndarray, "combinations numbers"]
     fix: int
 
 
@@ -139,11 +139,11 @@ def _make_confounded_numbers(
         of_numbers: the same of the numbers themselves.
     """
     # As many numbers have to be known as there are flat directions within the group.
-    places = list(group)
-    unknown = int(max(np.linalg.matrix_rank(basis[places], tol=SAME) for basis in of_logs))
+    coordinates = list(group)
+    unknown = int(max(np.linalg.matrix_rank(basis[coordinates], tol=SAME) for basis in of_logs))
     no_rows = np.zeros((0, len(group)))
     # Products: a sum of logarithms e' log v that no flat direction changes; used if its exponents are small and whole.
-    powers = _find_identified_combinations([basis[places] for basis in of_logs])
+    powers = _find_identified_combinations([basis[coordinates] for basis in of_logs])
     if len(powers):
         # In each row the least exponent becomes 1.
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
@@ -151,7 +151,7 @@ def _make_confounded_numbers(
         if are_whole and np.max(np.abs(powers)) <= LARGEST + WHOLE:
             return ConfoundedNumbers(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
     # Otherwise sums w' v.
-    sums = _find_identified_combinations([basis[places] for basis in of_numbers])
+    sums = _find_identified_combinations([basis[coordinates] for basis in of_numbers])
     return ConfoundedNumbers(group, exponents=no_rows, weights=sums, fix=unknown)
 
 
@@ -193,7 +193,7 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
     return reduced
 
 
-def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
+def format_product(names: list[str], exponents: Float[np.ndarray, " numbers"]) -> str:
     """Return the text of a product of powers, such as "a * b^2 / c"."""
     powers = list(zip(names, exponents, strict=True))
     factors = [_format_power(name, exponent) for name, exponent in powers if exponent > 0]
@@ -201,7 +201,7 @@ def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) ->
     return " / ".join([" * ".join(factors) or "1", *divisors])
 
 
-def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
+def format_sum(names: list[str], weights: Float[np.ndarray, " numbers"]) -> str:
     """Return the text of a weighted sum, such as "a + 0.64 b".
 
     A weight within SAME of 1 or -1 is not written, and a term of weight 0 is left out.
@@ -221,3 +221,18 @@ def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
 def _format_power(name: str, exponent: float) -> str:
     """Return the text of a power, such as "a", "a^2", "a^0.5"."""
     return name if exponent == 1 else f"{name}^{exponent:g}"
+
+
+def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
+    """Return the rank of the information `late` (p, p) of the second half of the rows, with `ridges` flat directions.
+
+    The initial state's law informs weakly on ridges, where no data do. The second half has hardly any of that.
+    """
+    rank = find_information_rank(late)
+    if rank.flat.shape[1] == ridges:
+        return rank
+    # Take the directions of the least eigenvalues as flat, in units of each coordinate's standard error.
+    diagonal = np.diag(late)
+    unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    _, vectors = np.linalg.eigh(late * unit[:, None] * unit)
+    return rank._replace(flat=vectors[:, :ridges], rest=vectors[:, ridges:], unit=unit)

@@ -7,18 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import (
-    POSITIVE,
-    TINY,
-    array,
-    check_count,
-    covariance,
-    fail,
-    rank,
-    report_domain,
-    scalar,
-    show_value,
-)
+from heliograph.numerics.check import TINY, array, check_count, covariance, fail, rank, scalar, show_value
+from heliograph.numerics.domains import POSITIVE, report_domain
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int

@@ -1,65 +1,19 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeGuard, TypeVar, cast
+from typing import Any, TypeGuard, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.domains import PROBABILITY, REAL, SIMPLEX, Domain, report_covariance, report_domain
 from heliograph.numerics.masked_arrays import fill_masked, find_packing, holds_texts_or_dates
 from heliograph.numerics.numpy_or_jax import is_traced, warn_of_single
 from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
-
-
-class Domain(NamedTuple):
-    """Numbers between two limits, positive ones that sum to one along the last axis, or a covariance matrix."""
-
-    kind: Literal["interval", "simplex", "covariance"] = "interval"
-    low: float = -np.inf
-    high: float = np.inf
-
-
-REAL, POSITIVE, PROBABILITY = Domain(), Domain(low=0.0), Domain(low=0.0, high=1.0)
-SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
-
-
-class DomainReportingArray(np.ndarray):
-    """Array that reports the domain that a check requires of it; arrays computed from it report nothing."""
-
-    report: Callable[[str, Domain], None] | None = None
-
-
-def mark_checked(value: object, report: Callable[[str, Domain], None]) -> DomainReportingArray:
-    """Return a copy of an array that calls `report(name, domain)` when it is checked, with the numbers it may hold."""
-    copy = np.array(value, dtype=np.float64).view(DomainReportingArray)
-    copy.report = report
-    return copy
-
-
-def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
-    """Tell an array marked by `mark_checked` what numbers it may hold: `whole`, or `entry` if it is in a list."""
-    if isinstance(value, DomainReportingArray):
-        if value.report is not None:
-            value.report(name, whole)
-    elif isinstance(value, list | tuple):
-        for element in value:
-            if isinstance(element, DomainReportingArray | list | tuple):
-                report_domain(name, element, whole if entry is None else entry, entry)
-
-
-def report_covariance(name: str, value: object) -> None:
-    """Tell an array marked by `mark_checked` that it is a covariance or variance (in rows, on the diagonal)."""
-    if isinstance(value, DomainReportingArray):
-        report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
-    elif isinstance(value, list | tuple):
-        for i, row in enumerate(value):
-            for j, element in enumerate(row if isinstance(row, list | tuple) else []):
-                report_domain(name, element, POSITIVE if i == j else REAL)
-
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units

@@ -172,15 +172,15 @@ def is_zero(value: Any) -> bool:
     return not is_traced(value) and not np.any(value)
 
 
-def scatter(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
-    """Return an array of zeros of shape `size` with `values` added at `places`, an index of its leading axes.
+def scatter(size: tuple[int, ...], indices: Any, values: Any) -> jax.Array | np.ndarray:
+    """Return an array of zeros of shape `size` with `values` added at `indices`, an index of its leading axes.
 
-    Values at repeated places are added up.
+    Values at repeated indices are added up.
     """
     if is_traced(values):
-        return jnp.zeros(size).at[places].add(values)
+        return jnp.zeros(size).at[indices].add(values)
     table = np.zeros(size)
-    np.add.at(table, places, values)
+    np.add.at(table, indices, values)
     return table
 
 

@@ -16,18 +16,8 @@ import numpy as np
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
 from heliograph.numerics.caching import cache_arrays
-from heliograph.numerics.check import (
-    PROBABILITY,
-    PROBABILITY_TOLERANCE,
-    SIMPLEX,
-    array,
-    check_count,
-    fail,
-    probabilities,
-    radii,
-    report_domain,
-    scalar,
-)
+from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
+from heliograph.numerics.domains import PROBABILITY, SIMPLEX, report_domain
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, library, within
 from heliograph.numerics.types import ArrayLike, Float

@@ -1,7 +1,9 @@
 """Public names of the room, which needs the extra `report`; the package loads them when first used."""
 
-from .diagnosis.recording_diagnosis import (
+from .diagnosis.health import (
     FilterHealth as FilterHealth,
+)
+from .diagnosis.recording_diagnosis import (
     examine as examine,
 )
 from .diagnosis.arrivals import (

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoted_text import quote_for_figure, visible
-from heliograph.report.diagnosis.recording_diagnosis import FilterHealth, Health
+from heliograph.report.diagnosis.health import FilterHealth, Health
 from heliograph.report.diagnosis.sensor_output_health import OutputHealth, round_to
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, make_stacked_panels
 from heliograph.report.pages.page import Picture, PictureChoice, Section, Table, Text

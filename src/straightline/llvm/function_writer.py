@@ -109,7 +109,7 @@ class FunctionWriter:
         node has a slot.
         """
         self.scopes[-1][node] = name
-        if self.single and node in self.slots.places:
+        if self.single and node in self.slots.offsets:
             self.slots.store(self, node, name)
 
     def _write_node(self, node: Node) -> str:
@@ -289,13 +289,13 @@ class FunctionWriter:
         """
         self.count += 1
         name, label_before = f"loop{self.count}", self.label
-        # Only the carried numbers that this function computes or reads, by their place in the carry.
+        # Only the carried numbers that this function computes or reads, by their index in the carry.
         pairs = zip(loop.parameters, loop.results, strict=True)
         carried = [k for k, pair in enumerate(pairs) if any(n in self.items for n in pair)]
         starts = [self.write_operand(loop.initial[k]) for k in carried]
         self.line(f"br label %{name}")
         self.start_basic_block(name)
-        place_of_phis = len(self.lines)
+        index_of_phis = len(self.lines)
         self.scopes.append({})  # names that hold within a turn
         counter = f"%{name}.counter"
         self._name_parameters(loop, name, counter, carried)
@@ -315,7 +315,7 @@ class FunctionWriter:
         for k, start, after in zip(carried, starts, following, strict=True):
             kind = vector_type(loop.parameters[k].type)
             phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{label_before}], [{after}, %{self.label}]")
-        self.lines[place_of_phis:place_of_phis] = phis
+        self.lines[index_of_phis:index_of_phis] = phis
         self.start_basic_block(f"{name}.end")
         self.scopes.pop()
         for k, final in zip(carried, finals, strict=True):

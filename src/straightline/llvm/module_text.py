@@ -94,7 +94,7 @@ class ModuleText(NamedTuple):
     tables: list[np.ndarray]
     outputs: list[OutputShape]
     common: list[bool]
-    places: list[int]  # of common outputs in the shared memory
+    offsets: list[int]  # of common outputs in the shared memory
     shared: int
     scratch: int
     operations: int
@@ -137,7 +137,7 @@ def write_module(
     # The items of the block function, which computes what differs between runs, and where the numbers lie.
     block_items = find_crossing_items(items, parts.per_run)
     layout = lay_out_memory(parts, block_items)
-    # The block function loads all else from slots, places in memory that are assigned as it is written.
+    # The block function loads all else from slots, parts of memory that are assigned as it is written.
     slots = SharedSlots(layout.shared)
     products = find_fusable_products(items) if fuse else set()
     writer = FunctionWriter(single=alone, items=block_items, products=products, per_run=parts.per_run, slots=slots)
@@ -153,7 +153,7 @@ def write_module(
         tables=tables,
         outputs=[OutputShape(b.type, b.shape) for b in outputs],
         common=parts.common,
-        places=[layout.in_shared.get(b, 0) for b in outputs],
+        offsets=[layout.in_shared.get(b, 0) for b in outputs],
         shared=slots.size,
         scratch=layout.scratch + LINE,
         operations=counts.total(),
@@ -327,7 +327,7 @@ def _add_to_sums(
     """Make the writer's stores to these outputs add to sums over runs.
 
     Run r belongs to batch r mod batches, and a row has batches + width - 1 sums. Runs are taken in groups of `width`:
-    the first run of a group adds to the sum of its batch, and the others to the places behind it, also beyond the last
+    the first run of a group adds to the sum of its batch, and the others to those behind it, also beyond the last
     batch. So numbers are added in the same order, and sums have the same bits, however many runs a vector has.
 
     Args:
@@ -344,14 +344,14 @@ def _add_to_sums(
     address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {first_of_width}")
     run = writer.add(f"load i32, ptr {address}, align 4")
     batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
-    # The place in the row of this vector's first lane: batch + (first run of the block - first of the `width` runs).
+    # The index in the row of this vector's first lane: batch + (first run of the block - first of the `width` runs).
     behind = writer.add(f"sub i64 %first, {first_of_width}")
-    place = writer.add(f"add i64 {batch}, {behind}")
+    start = writer.add(f"add i64 {batch}, {behind}")
     # Lanes beyond the last run do not count: those whose number is not below the runs that are left.
     runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
     writer.lanes_with_run = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:
-        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {place}")
+        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {start}")
         writer.sums[buffer] = row_length_of_sums(width, summed.batches)
 
 
@@ -366,7 +366,7 @@ def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: 
         layout: where shared buffers lie.
     """
     shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
-    roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
+    roots: list[Any] = [*blocks.slots.offsets, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
     if not roots:
         return None
     needed = list_needed_items(roots)

@@ -31,15 +31,15 @@ class SharedSlots:
     def __init__(self, size: int):
         """Begin the layout at byte `size` of the shared memory: the bytes before it are taken already."""
         self.size = size  # bytes that are taken so far
-        self.places: dict[Node, int] = {}  # the first byte of each number
+        self.offsets: dict[Node, int] = {}  # the first byte of each number
         self.base = ""  # name of the pointer to the memory, in LLVM's text
 
     def offset_of(self, node: Node) -> int:
         """Return the offset in bytes of a shared number, assigned at its first use, with 8 for each iteration."""
-        if node not in self.places:
-            self.places[node] = self.size
+        if node not in self.offsets:
+            self.offsets[node] = self.size
             self.size += 8 * node.block.count_turns()
-        return self.places[node]
+        return self.offsets[node]
 
     def load(self, writer: InstructionWriter, node: Node) -> str:
         """Write the load of a shared number, and return the name of the scalar; a flag is stored as a byte."""

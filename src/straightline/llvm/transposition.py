@@ -153,17 +153,17 @@ def _write_address(bits: int, start: str, number: int) -> str:
     return f"getelementptr i{bits}, ptr {start}, i64 {number}"
 
 
-def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
+def _write_choice(text: TextLines, registers: list[str], sources: list[tuple[int, int]], vector: str) -> str:
     """Write the choice of a number for each lane out of several registers; return the name of the chosen vector.
 
-    `places` holds for each lane the pair (register, lane there) of its number. One shuffle is written for each
+    `sources` holds for each lane the pair (register, lane there) of its number. One shuffle is written for each
     register: a lane takes its number from that register, or keeps what was chosen before. A shuffle's mask numbers the
     lanes of its second vector from `side` on.
     """
-    chosen, side = "poison", len(places)  # a register of which no number is set
-    for second in sorted({register for register, _ in places}):
-        order = [side + place if register == second else lane for lane, (register, place) in enumerate(places)]
-        mask = ", ".join(f"i32 {place}" for place in order)
+    chosen, side = "poison", len(sources)  # a register of which no number is set
+    for second in sorted({register for register, _ in sources}):
+        order = [side + source if register == second else lane for lane, (register, source) in enumerate(sources)]
+        mask = ", ".join(f"i32 {number}" for number in order)
         pair = f"{vector} {chosen}, {vector} {registers[second]}"
         chosen = text.add(f"shufflevector {pair}, <{side} x i32> <{mask}>")
     return chosen

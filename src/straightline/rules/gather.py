@@ -1,4 +1,4 @@
-"""Rule of gather at known places, or at places that data select."""
+"""Rule of gather at known indices, or at indices that data select."""
 
 from functools import lru_cache
 from typing import Any
@@ -11,10 +11,10 @@ from straightline.lowering import RULES, Lowering, known_integers
 from straightline.nodes import Unsupported
 from straightline.rules.elementwise import select
 from straightline.rules.index_bounds import (
-    clamp_place,
+    clamp_start,
     convert_to_32_bits,
     fills_outside,
-    find_window_places,
+    find_window_indices,
     is_inside,
     make_fill_value,
 )
@@ -61,33 +61,33 @@ def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indic
     """Return the windows of x at `indices`, which are clipped so that each window lies inside x.
 
     If all indices are known, the result consists of nodes of x. Else an index that depends on data is compared with
-    all places.
+    all indices.
     """
     known = known_integers(indices)
     if known is None:
         return _gather_by_cases(lowering, equation, x, indices)
     sizes, numbers = tuple(equation.params["slice_sizes"]), equation.params["dimension_numbers"]
-    places = _find_gathered_places(x.shape, sizes, known.tobytes(), known.shape, numbers)
-    gathered: np.ndarray = x.ravel()[places.ravel()].reshape(places.shape)
+    flat_indices = _find_gathered_indices(x.shape, sizes, known.tobytes(), known.shape, numbers)
+    gathered: np.ndarray = x.ravel()[flat_indices.ravel()].reshape(flat_indices.shape)
     return gathered
 
 
 @lru_cache(1000)
-def _find_gathered_places(
+def _find_gathered_indices(
     shape: tuple[int, ...], sizes: tuple[int, ...], indices: bytes, of: tuple[int, ...], numbers: GatherDimensionNumbers
 ) -> np.ndarray:
-    """Return the places in the flat array of this `shape` that a gather takes at known indices.
+    """Return the indices in the flat array of this `shape` that a gather takes at known indices.
 
-    `indices` are the bytes of an int64 array of shape `of`. The places have the axes of the result: those of the
+    `indices` are the bytes of an int64 array of shape `of`. They have the axes of the result: those of the
     indices without the last, with the window's axes (`offset_dims`) among them. The answer is cached, since a filter
     makes each gather a dozen times.
     """
     known = np.frombuffer(indices, dtype=np.int64).reshape(of)
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
     removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    places = find_window_places(shape, sizes, known, numbers.start_index_map, batching, removed, clips=True)
+    flat_indices = find_window_indices(shape, sizes, known, numbers.start_index_map, batching, removed, clips=True)
     first = known.ndim - 1
-    return np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
+    return np.moveaxis(flat_indices, range(first, flat_indices.ndim), numbers.offset_dims)
 
 
 def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
     last = x.shape[axis] - sizes[axis]
     if last >= FEW:
         return _gather_from_memory(lowering, equation, x, indices, column)
-    known_cases = [_replace_indices(lowering, indices, column, place) for place in range(last + 1)]
+    known_cases = [_replace_indices(lowering, indices, column, index) for index in range(last + 1)]
     cases = [_gather_clipped(equation, lowering, x, known) for known in known_cases]
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
@@ -115,10 +115,10 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
 def _gather_from_memory(
     lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int
 ) -> np.ndarray:
-    """Gather from an array put in memory, where one index of each window depends on data and has many places.
+    """Gather from an array put in memory, where one index of each window depends on data and has many values.
 
     JAX's gather copies windows of an array, each from its own start. The compiler works with single numbers (nodes). If
-    an index depends on data, comparing it with all possible places would be long; a load from memory is short.
+    an index depends on data, comparing it with all possible values would be long; a load from memory is short.
 
     Args:
         lowering: the program that is being compiled.
@@ -135,22 +135,22 @@ def _gather_from_memory(
     axis = numbers.start_index_map[column]
     last_start = x.shape[axis] - sizes[axis]
     # Where each gathered number would lie in the flat array if the index that depends on data were 0: take the same
-    # gather from an array of the places 0, 1, 2, ...
+    # gather from an array of the indices 0, 1, 2, ...
     with_zero = _replace_indices(lowering, indices, column, 0)
     if known_integers(with_zero) is None:
         raise Unsupported("gather at two places that data decide")
-    places = np.arange(x.size, dtype=object).reshape(x.shape)
-    offsets = _gather_clipped(equation, lowering, places, with_zero)
-    # The number lies behind that place by index times stride of the axis; the index is clamped so that the window stays
+    flat_indices = np.arange(x.size, dtype=object).reshape(x.shape)
+    offsets = _gather_clipped(equation, lowering, flat_indices, with_zero)
+    # The number lies behind that one by index times stride of the axis; the index is clamped so that the window stays
     # inside.
     buffer, stride = put_in_memory(lowering, x).buffer, contiguous_strides(x.shape)[axis]
     loaded = np.empty(offsets.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):
         index = indices[(*_find_index_row(entry, numbers), column)]
-        if index.op == "constant":  # its place is right already, since `_replace_indices` keeps what is known
+        if index.op == "constant":  # its offset is right already, since `_replace_indices` keeps what is known
             loaded[entry] = x.ravel()[offsets[entry]]
         else:
-            clamped: Any = clamp_place(lowering, index, last_start)
+            clamped: Any = clamp_start(lowering, index, last_start)
             loaded[entry] = lowering.graph.load(buffer, int(offsets[entry]), (stride,), (clamped,))
     return loaded
 

@@ -110,12 +110,12 @@ def _store_row(
     nodes = _list_nodes_of_numbers(value)
     type: Type = nodes[0].type if nodes else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
-    # The first place of each node in a row. Places are noted from the last to the first, so that the first one stays.
-    size, first_places = len(nodes), {node: place for place, node in reversed(list(enumerate(nodes)))}
-    buffer.first = [first_places[node] for node in nodes] if len(first_places) < size else []
+    # The first index of each node in a row. Indices are noted from the last to the first, so that the first one stays.
+    size, first_indices = len(nodes), {node: index for index, node in reversed(list(enumerate(nodes)))}
+    buffer.first = [first_indices[node] for node in nodes] if len(first_indices) < size else []
     first_row, stride = ((length - 1) * size, -size) if backwards else (0, size)
-    for place, node in enumerate(nodes):
-        lowering.graph.store(buffer, node, offset=first_row + place, strides=(stride,), indices=(counter,))
+    for index, node in enumerate(nodes):
+        lowering.graph.store(buffer, node, offset=first_row + index, strides=(stride,), indices=(counter,))
     return StridedArray.of_whole_buffer(buffer)
 
 
@@ -151,10 +151,10 @@ def _restore_arrays(
 
 def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
-    # The place of each entry in the flat triangle. Below the diagonal it is 0; the maximum takes the mirror image's.
-    places = np.zeros((n, n), dtype=int)
-    places[np.triu_indices(n)] = np.arange(upper.shape[-1])
-    return upper[..., np.maximum(places, places.T)]
+    # The index of each entry in the flat triangle. Below the diagonal it is 0; the maximum takes the mirror image's.
+    index_in_triangle = np.zeros((n, n), dtype=int)
+    index_in_triangle[np.triu_indices(n)] = np.arange(upper.shape[-1])
+    return upper[..., np.maximum(index_in_triangle, index_in_triangle.T)]
 
 
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -205,7 +205,7 @@ class _ScanBody(NamedTuple):
         fixed: arguments that are the same in each turn.
         carry: all carried arrays as they begin; one that is in neither of the next two stays as it is.
         as_numbers: which of them are carried as nodes, one for each number.
-        in_memory: the memory of the others, by their place in the carry.
+        in_memory: the memory of the others, by their index in the carry.
         rows: arrays in memory, of which a turn has one row.
     """
 

@@ -114,7 +114,7 @@ def _find_first_extreme(graph: Graph, op: str, type: Type, row: list[Node]) -> N
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Write out `dot_general` entry by entry: a product A B' for each place on the batch axes.
+    """Write out `dot_general` entry by entry: a product A B' for each index of the batch axes.
 
     A and B are (free, contracted). The contracted axes are summed over, and the free axes are those of the result.
     """
@@ -158,11 +158,11 @@ def _sum_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np
     product, sum_ = ("and", "or") if type == "bool" else ("mul", "add")
     sums: list[Node | None] = [None] * len(pairs)
     for k in range(len(pairs[0][0]) if pairs else 0):
-        for place, (a, b) in enumerate(pairs):
+        for entry, (a, b) in enumerate(pairs):
             if _is_zero_term(a[k], b[k]) or _is_zero_term(b[k], a[k]):
                 continue
-            term, before = graph.node(product, type, a[k], b[k]), sums[place]
-            sums[place] = term if before is None else graph.node(sum_, type, before, term)
+            term, before = graph.node(product, type, a[k], b[k]), sums[entry]
+            sums[entry] = term if before is None else graph.node(sum_, type, before, term)
     return [graph.constant(0.0 if type in REAL else 0, type) if s is None else s for s in sums]
 
 

@@ -1,4 +1,4 @@
-"""Rules of scatter: updates of an array at known places, or at places that data select."""
+"""Rules of scatter: updates of an array at known indices, or at indices that data select."""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
-from straightline.rules.index_bounds import convert_to_32_bits, fills_outside, find_window_places
+from straightline.rules.index_bounds import convert_to_32_bits, fills_outside, find_window_indices
 from straightline.size_limits import WRITTEN_OUT
 
 
@@ -25,9 +25,9 @@ def _make_scatter_rule(op: str | None) -> Rule:
     """
 
     def scatter_updates(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array after all updates, in order; places beyond it are dropped or clipped.
+        """Return the array after all updates, in order; indices beyond it are dropped or clipped.
 
-        The inputs are the array, the indices (..., k) of the windows' first places, and the updates, one window each.
+        The inputs are the array, the indices (..., k) of the windows' starts, and the updates, one window each.
         """
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
@@ -43,12 +43,14 @@ def _make_scatter_rule(op: str | None) -> Rule:
         # where the updates have them, so that both are in the same order.
         batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         index_map = numbers.scatter_dims_to_operand_dims
-        places = find_window_places(x.shape, sizes, known, index_map, batching, removed, _clips_indices(equation))
-        places = np.moveaxis(places, range(known.ndim - 1, places.ndim), numbers.update_window_dims)
+        flat_indices = find_window_indices(
+            x.shape, sizes, known, index_map, batching, removed, _clips_indices(equation)
+        )
+        flat_indices = np.moveaxis(flat_indices, range(known.ndim - 1, flat_indices.ndim), numbers.update_window_dims)
         updated = x.ravel().copy()
-        for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
-            if place >= 0:
-                updated[place] = _combine_entry(lowering.graph, op, updated[place], new)
+        for target, new in zip(flat_indices.ravel().tolist(), updates.ravel().tolist(), strict=True):
+            if target >= 0:
+                updated[target] = _combine_entry(lowering.graph, op, updated[target], new)
         return [updated.reshape(x.shape)]
 
     return scatter_updates
@@ -75,7 +77,7 @@ def _scatter_by_cases(
     """Scatter at indices that data decide: each entry that an update may change becomes a choice of new and old number.
 
     A scatter writes windows (blocks of numbers) of `updates` into an array. Native code has no address that depends on
-    data here, so every place at which a window may start is tried: an entry gets the new number if the window does
+    data here, so every index at which a window may start is tried: an entry gets the new number if the window does
     start where that puts it there.
 
     Args:
@@ -83,7 +85,7 @@ def _scatter_by_cases(
         equation: JAX's scatter, whose parameters say which axes are a window's.
         op: combines an old and a new number; None where the new one replaces the old.
         inputs: the array, the indices as JAX has them (not used), and the updates.
-        indices: nodes (..., k) of the windows' first places.
+        indices: nodes (..., k) of the windows' starts.
         sizes: size of a window along each axis of the array.
 
     Returns:
@@ -102,29 +104,29 @@ def _scatter_by_cases(
             if count > WRITTEN_OUT:
                 raise Unsupported(f"{equation.primitive.name} at one of many places that data decide")
             for entry in np.ndindex(*windows.shape[len(row) :]):
-                place = list(start)
+                target = list(start)
                 for axis, offset in zip(window_axes, entry, strict=True):
-                    place[axis] += offset
-                old = updated[tuple(place)]
+                    target[axis] += offset
+                old = updated[tuple(target)]
                 new = _combine_entry(graph, op, old, windows[row + entry])
-                updated[tuple(place)] = select(graph, is_here, new, old)
+                updated[tuple(target)] = select(graph, is_here, new, old)
     return updated
 
 
 def _yield_starts(
     graph: Graph, equation: JaxprEqn, shape: tuple[int, ...], sizes: list[int], row: tuple[int, ...], index: np.ndarray
 ) -> Iterator[tuple[tuple[int, ...], Node]]:
-    """Yield each place where the window of an index may start, and the node of whether it starts there.
+    """Yield each index where the window of an index may start, and the node of whether it starts there.
 
     A scatter writes windows of updates into an array, each at an index that is known only when the program runs. So for
-    every place where the window fits, a node (a number of the program) says whether the index means that place.
+    every start where the window fits, a node (a number of the program) says whether the index means that start.
 
     Args:
         graph: the program.
         equation: the scatter, an operation of JAX.
         shape: shape of the array.
         sizes: length of a window along each axis of the array.
-        row: place of the index among all indices, along their leading axes.
+        row: number of the index among all indices, along their leading axes.
         index: nodes of the index, one for each axis of the array that an index selects.
     """
     numbers, clips = equation.params["dimension_numbers"], _clips_indices(equation)
@@ -141,9 +143,9 @@ def _yield_starts(
         is_here = graph.constant(True, "bool")
         for axis, node in nodes.items():
             last = shape[axis] - sizes[axis]
-            if clips and last == 0:  # clipped to the one place there is, so that it starts here in any case
+            if clips and last == 0:  # clipped to the one start there is, so that it starts here in any case
                 continue
-            # Clipped indices: all up to the first place mean the first, and all from the last place on mean the last.
+            # Clipped indices: all up to the first start mean the first, and all from the last one on mean the last.
             comparison = "eq"
             if clips and start[axis] == 0:
                 comparison = "le"

@@ -67,14 +67,14 @@ def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]
-    # Find for each axis which entries stay, and where they go. There are `low` places before the first entry, and
+    # Find for each axis which entries stay, and where they go. There are `low` positions before the first entry, and
     # `inner` between neighbours.
     sources, targets = [], []
     for size, length, (low, _high, inner) in zip(x.shape, padded.shape, equation.params["padding_config"], strict=True):
-        places = low + np.arange(size) * (1 + inner)
-        stays = (places >= 0) & (places < length)
+        positions = low + np.arange(size) * (1 + inner)
+        stays = (positions >= 0) & (positions < length)
         sources.append(np.flatnonzero(stays))
-        targets.append(places[stays])
+        targets.append(positions[stays])
     padded[np.ix_(*targets)] = x[np.ix_(*sources)]
     return [padded]
 
@@ -109,12 +109,12 @@ def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarr
 def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Lower `dynamic_update_slice`: return x with `update` written at its starts, one for each axis.
 
-    A start that depends on data may have at most FEW places: the result is selected among those of all places.
+    A start that depends on data may have at most FEW values: the result is selected among those of all.
     """
     x, update, starts = inputs[0], inputs[1], [lowering.get_only_node(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
         last_start = x.shape[axis] - update.shape[axis]
-        if last_start and start.op != "constant":  # several places, of which data decide
+        if last_start and start.op != "constant":  # several starts, of which data decide
             if last_start >= FEW:
                 raise Unsupported(f"one of {last_start + 1} places that data decide")
             other_starts = [s if a != axis else None for a, s in enumerate(starts)]
@@ -128,14 +128,14 @@ def _update_at(
 ) -> np.ndarray:
     """Return x with `update` put at these starts, one for each axis; along the one whose start is None, at `here`.
 
-    Along any other axis a start must be known, or the update as long as x, so that there is one place.
+    Along any other axis a start must be known, or the update as long as x, so that there is one start.
     """
     ranges = []
     for size, length, start in zip(update.shape, x.shape, starts, strict=True):
-        has_one_place = length == size
-        if start is not None and start.op != "constant" and not has_one_place:
+        has_one_start = length == size
+        if start is not None and start.op != "constant" and not has_one_start:
             raise Unsupported("two places that data decide")
-        first = here if start is None else 0 if has_one_place else int(start.value)
+        first = here if start is None else 0 if has_one_start else int(start.value)
         first = min(max(first, 0), length - size)  # moved inside, as in JAX
         ranges.append(slice(first, first + size))
     updated = x.copy()

@@ -20,7 +20,8 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     for index in np.ndindex(*arrays[0].shape[:-1]):
         rows = [x[index] for x in arrays]  # views, which are sorted in place
         keys = rows[0]
-        # Odd-even transposition: neighbours at even places are exchanged if in the wrong order, then those at odd ones.
+        # Odd-even transposition: neighbours at even positions are exchanged if in the wrong order, then those at odd
+        # ones.
         for turn in range(count):
             for i in range(turn % 2, count - 1, 2):
                 is_wrong = _is_behind(graph, keys[i], keys[i + 1])

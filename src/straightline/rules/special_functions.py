@@ -51,15 +51,15 @@ def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array
     is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
     # Where neither series nor fraction is used, compute with 1 for a and x, so that no NaN comes into the loops.
     serves_none = is_large | ~is_valid
-    shape, place = jnp.where(serves_none, 1.0, a), jnp.where(serves_none, 1.0, x)
+    a_or_one, x_or_one = jnp.where(serves_none, 1.0, a), jnp.where(serves_none, 1.0, x)
     # x > a + 1: the fraction is used; else the series.
-    above = place > shape + 1
-    density = jnp.exp(shape * jnp.log(place) - place - jax.lax.lgamma(shape))
-    lower = density * _sum_lower_series(shape, place, skipped=above)
-    upper = density * _evaluate_upper_fraction(shape, place, serves=above)
+    above = x_or_one > a_or_one + 1
+    density = jnp.exp(a_or_one * jnp.log(x_or_one) - x_or_one - jax.lax.lgamma(a_or_one))
+    lower = density * _sum_lower_series(a_or_one, x_or_one, skipped=above)
+    upper = density * _evaluate_upper_fraction(a_or_one, x_or_one, serves=above)
     # The smaller mass as computed, to all its digits; the other one is 1 minus it.
-    p = jnp.where(place == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
-    q = jnp.where(above & (place < jnp.inf), upper, 1 - p)
+    p = jnp.where(x_or_one == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
+    q = jnp.where(above & (x_or_one < jnp.inf), upper, 1 - p)
     # Large a: take the expansion.
     expanded_p, expanded_q = regularised_incomplete_gammas_of_large_shape(a, x)
     use_expansion = is_large & (x < jnp.inf)

@@ -10,7 +10,7 @@ from jax.extend.core import JaxprEqn
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, arrange_nodes, result_shape
 from straightline.nodes import Buffer, Node, RandomKey
 from straightline.rules.elementwise import PASSED_ON, select
-from straightline.rules.index_bounds import clamp_place, convert_to_32_bits, fills_outside, is_inside, make_fill_value
+from straightline.rules.index_bounds import clamp_start, convert_to_32_bits, fills_outside, is_inside, make_fill_value
 from straightline.rules.loops import copy_in_memory, put_in_memory, repeat_turns
 from straightline.rules.shapes import select_array
 from straightline.size_limits import FEW, LOADED, TABLE
@@ -90,7 +90,7 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
         return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []
     for axis, start in enumerate(inputs[1:]):
-        first = clamp_place(lowering, lowering.get_only_node(start), x.shape[axis] - sizes[axis])
+        first = clamp_start(lowering, lowering.get_only_node(start), x.shape[axis] - sizes[axis])
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
@@ -101,7 +101,7 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
 def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Value]:
     """Return `dynamic_slice` of an array of nodes: slice one axis after another.
 
-    Each start is clamped so that the slice lies inside. If data decide among more than FEW places, the array is put
+    Each start is clamped so that the slice lies inside. If data decide among more than FEW starts, the array is put
     in memory and sliced there.
     """
     x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.get_only_node(x) for x in inputs[1:]]
@@ -109,7 +109,7 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
         last_start = x.shape[axis] - size
         if start.op != "constant" and last_start >= FEW:
             return _lower_dynamic_slice(lowering, equation, [put_in_memory(lowering, inputs[0]), *inputs[1:]])
-        x = _slice_window(lowering, x, axis, start, size) if last_start else x  # a slice of all the axis has one place
+        x = _slice_window(lowering, x, axis, start, size) if last_start else x  # a slice of all the axis has one start
     return [x]
 
 
@@ -127,15 +127,15 @@ def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, siz
     return select_array(lowering.graph, start, cases)
 
 
-def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
-    """Return x in memory if that serves to read it at `places`, else x as it is.
+def make_indexable(lowering: Lowering, x: Value, indices: list[Value]) -> Value:
+    """Return x in memory if that serves to read it at `indices`, else x as it is.
 
-    It is put in memory if data decide the places, and x is a table of constants or longer than FEW. Arrays of random
+    It is put in memory if data decide the indices, and x is a table of constants or longer than FEW. Arrays of random
     keys are never put in memory.
     """
-    nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
-    places_are_known = all(n.op == "constant" for n in nodes)
-    if isinstance(x, StridedArray) or places_are_known:
+    nodes = [n for p in indices for n in lowering.nodes(p).ravel().tolist()]
+    indices_are_known = all(n.op == "constant" for n in nodes)
+    if isinstance(x, StridedArray) or indices_are_known:
         return x
     flat = x.ravel().tolist()
     has_keys, is_table = any(isinstance(n, RandomKey) for n in flat), all(n.op == "constant" for n in flat)
@@ -147,7 +147,7 @@ def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower a gather of one window x[i, j, ...] of an array in memory as a view; other gathers use nodes.
 
-    The inputs are the array and the indices (..., k) of the windows' first places.
+    The inputs are the array and the indices (..., k) of the windows' starts.
     """
     numbers, indices = equation.params["dimension_numbers"], lowering.nodes(inputs[1])
     indices = convert_to_32_bits(lowering, indices) if fills_outside(equation) else indices
@@ -169,14 +169,14 @@ def _view_window(
 ) -> tuple[StridedArray, Node]:
     """Return the window of a gather as a view in the result's shape, and the node of whether it is inside the array.
 
-    starts: its first place along each axis of the operation's `start_index_map`; it is clamped to the array.
+    starts: its first index along each axis of the operation's `start_index_map`; it is clamped to the array.
     """
     graph, numbers, sizes = lowering.graph, equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    # Known places add to the offset; those that data decide move the view.
+    # Known starts add to the offset; those that data decide move the view.
     offset, moves, fits = 0, [], graph.constant(True, "bool")
     for axis, start in zip(numbers.start_index_map, starts, strict=True):
         last = x.shape[axis] - sizes[axis]
-        first = clamp_place(lowering, start, last)
+        first = clamp_start(lowering, start, last)
         fits = graph.node("and", "bool", fits, is_inside(graph, start, last))
         if isinstance(first, int):
             offset += x.strides[axis] * first
@@ -240,7 +240,7 @@ def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
 
 
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
-    """Store an array into a buffer, from place `start` on.
+    """Store an array into a buffer, from index `start` on.
 
     Up to TABLE entries, and arrays of nodes, are stored entry by entry. A longer array in memory is copied by a loop.
     """

@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as h
 from heliograph.files import read_table, write_estimates
-from tests.files.test_recording import NAN, network, record_of
+from tests.files.recordings.test_recording import NAN, network, record_of
 
 
 @pytest.fixture

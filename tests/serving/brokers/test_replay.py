@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.recording import Recording, write_recording
+from heliograph.files.recordings.recording import Recording, write_recording
 from heliograph.live.event import Event
 from heliograph.serving.brokers.replay import Link, delay_as_traced, encode_messages, recorded, simulate_link
 from heliograph.serving.service import Service

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.recording import read_recording
+from heliograph.files.recordings.recording import read_recording
 from heliograph.relays.design import local_error_design, relay_schedules
 from heliograph.simulation.runs import simulate_trajectories
 from tests.relays.relay_problems import example

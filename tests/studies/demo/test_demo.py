@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.recording import read_recording as read_measurements
+from heliograph.files.recordings.recording import read_recording as read_measurements
 from heliograph.learning import describe
 from heliograph.model.estimate import Estimate
 from heliograph_studies import demo

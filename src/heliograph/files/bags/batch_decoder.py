@@ -1,4 +1,4 @@
-"""Messages of a bag decoded many at once: fields whose places are fixed by the lengths of texts and lists."""
+"""Messages of a bag decoded many at once: fields whose positions are fixed by the lengths of texts and lists."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from heliograph.files.bags.no_value_marks import blank_columns, list_flags
-from heliograph.files.event_table import NONE, EventTable
+from heliograph.files.events.event_table import NONE, EventTable
 from heliograph.files.sources.derived_values import Computed
 from heliograph.files.sources.source_description import Source
 from heliograph.files.sources.topic_reader import SECOND, TopicReader
@@ -34,13 +34,13 @@ class RawMessage(NamedTuple):
 
 
 class LayoutNotFixedError(Exception):
-    """A message whose fields cannot be read by fixed places: it is decoded alone, which says why if it fails."""
+    """A message whose fields cannot be read at fixed positions: it is decoded alone, which says why if it fails."""
 
 
 class MessageLayout:
     """Places of the wanted fields in a message, and the lengths of texts and lists that put them there.
 
-    Messages of the same size with the same lengths at the same places have all fields at the same places.
+    Messages of the same size with the same lengths at the same positions have all fields at the same positions.
 
     Args:
         definitions: fields by type of message, as rosbags has them.
@@ -58,7 +58,7 @@ class MessageLayout:
         `definitions` holds the fields of each message type, and `kind` is this message's type. `self.lengths` maps the
         byte where a text's or list's length stands to that length; byte 0 holds the encoding's head, HEAD.
         `self.fields` maps the path of a wanted number to its byte and type. LayoutNotFixedError is raised if a wanted
-        field has no fixed place.
+        field has no fixed position.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
@@ -87,7 +87,7 @@ class MessageLayout:
         """Note where the wanted numbers of a message stand, which begins at byte `begin`; return the byte of its end.
 
         `prefix` is the path of a message inside another one, with a dot; it is "" for the outermost message.
-        LayoutNotFixedError means that fields have no fixed places, so that messages must be decoded one by one.
+        LayoutNotFixedError means that fields have no fixed positions, so that messages must be decoded one by one.
         """
         if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
             raise LayoutNotFixedError
@@ -229,9 +229,9 @@ class BatchDecoder:
                 # Fields by path (messages,), NaN where a flag says that there is no value.
                 columns, marked = blank_columns(connection.msgtype, fields, self._list_judged_paths(topic))
                 counts[topic] += int(np.count_nonzero(marked))
-                for source, _, places in self._sources.of(topic):
-                    # The node, and the places of its values: one, as `_list_paths_of_numbers` refuses others.
-                    ((node, outputs),) = places.items()
+                for source, _, indices in self._sources.of(topic):
+                    # The node, and the indices of its values: one, as `_list_paths_of_numbers` refuses others.
+                    ((node, outputs),) = indices.items()
                     size = len(self._sources.names[node])
                     results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
         return results, counts
@@ -299,7 +299,7 @@ def _list_component_paths(path: str | Computed) -> tuple[str, ...]:
 
 
 def _make_node_readings(
-    rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, size: int
+    rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, indices: np.ndarray, size: int
 ) -> NodeReadings:
     """Return the readings of one source from the fields of many messages.
 
@@ -310,7 +310,7 @@ def _make_node_readings(
         rows: numbers of the messages in the bag (messages,).
         columns: {path of a field: its values (messages,)}.
         source: paths, scales and offsets of the values, the time stamp, and the running count, if there is one.
-        places: for each of its values the index among the values that its node receives.
+        indices: for each of its values the index among the values that its node receives.
         size: how many values the node receives.
 
     Raises:
@@ -318,9 +318,9 @@ def _make_node_readings(
     """
     # Values (messages, size), NaN where a field is not finite or not in the message.
     values = np.full((len(rows), size), np.nan)
-    for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
+    for index, path, scale, offset in zip(indices, source.paths, source.scale, source.offset, strict=True):
         value = _compute_value_column(columns, path)
-        values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
+        values[:, index] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # A time stamp of seconds and nanoseconds. It has to be set, so not 0, and of 32 bits, so that the nanoseconds fit
     # into 64.
     time = np.full(len(rows), NONE)

@@ -226,11 +226,11 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     most ten bytes, and only its lowest 64 bits count.
     """
     number = shift = 0
-    for place in range(at, min(at + 10, len(data))):
-        byte = data[place]
+    for position in range(at, min(at + 10, len(data))):
+        byte = data[position]
         number |= (byte & 127) << shift
         if byte < 128:
-            return number & (1 << 64) - 1, place + 1
+            return number & (1 << 64) - 1, position + 1
         shift += 7
     raise ValueError("no message of Protocol Buffers, or one that was cut off")
 

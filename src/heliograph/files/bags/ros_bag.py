@@ -14,7 +14,7 @@ import numpy as np
 from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.bags.no_value_marks import blank_message
-from heliograph.files.event_table import EventTable
+from heliograph.files.events.event_table import EventTable
 from heliograph.files.sources.message_reading import Unread
 from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.numerics.check import InputError, error_text, fail

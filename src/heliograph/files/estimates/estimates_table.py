@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.table import TIME, write_table
+from heliograph.files.tables.table import TIME, write_table
 from heliograph.model.estimate import Estimate, mask_sound_estimates
 from heliograph.model.over_time import first
 from heliograph.numerics.angles.angle import Angles, wrap_angles

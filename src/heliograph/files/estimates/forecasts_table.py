@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heliograph.files.estimates.estimates_table import estimate_columns, make_column_header
-from heliograph.files.table import write_table
+from heliograph.files.tables.table import write_table
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.types import unit_of

@@ -93,9 +93,9 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
     """
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
-    place = str(path) if given.dbc is None else f"{path} by {given.dbc}"
+    where = str(path) if given.dbc is None else f"{path} by {given.dbc}"
     # The units of the signals that are used, for the notes; it raises if a signal is missing.
-    used = _find_signal_units(place, path, log, sources)
+    used = _find_signal_units(where, path, log, sources)
     yield from log.messages
     notes += log.notes
     if path.is_dir():
@@ -103,17 +103,17 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
         other_files = [file.name for file in sorted(path.iterdir()) if file not in used_files]
         notes += [f"{path}: not read beside logs: {', '.join(other_files[:LISTED])}"] if other_files else []
     if used:
-        notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
+        notes.append(f"{where}: in the file's units, before scale= and offset=: {', '.join(used)}")
 
 
-def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -> list[str]:
+def _find_signal_units(where: str, path: Path, log: Log, sources: TopicReader) -> list[str]:
     """Return the units of the log's signals that are read, as lines "topic.signal in unit", to be shown to the user.
 
     A log holds messages, each with signals. A source says which signal of which message is a measurement; a topic is
     the name of a message. A topic of the sources with a wildcard (+ or #) need not be in the log.
 
     Args:
-        place: what is read, to begin the text of errors.
+        where: what is read, to begin the text of errors.
         path: the log, or a folder of several.
         log: the units of its signals, by message.
         sources: the sources, by topic.
@@ -126,7 +126,7 @@ def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -
         # Each topic that is named without a wildcard has to be a message of the log.
         if topic not in log.units and not set("+#") & set(topic):
             hint = "; dbc= of LogSources names their database" if not log.units else f"; {remedy}"
-            raise fail(place, f"a message {topic!r} of the sources", f"{_suggest_names(topic, log.units)}{hint}")
+            raise fail(where, f"a message {topic!r} of the sources", f"{_suggest_names(topic, log.units)}{hint}")
     used = dict[str, None]()  # the lines, as keys: each once, in order
     # Each field that a source reads has to be a signal of its message, or the time stamp that every message has.
     for topic, signals in log.units.items():
@@ -136,9 +136,9 @@ def _find_signal_units(place: str, path: Path, log: Log, sources: TopicReader) -
                 name = path_in_message if path_in_message in signals else path_in_message.split(".")[0]
                 if name not in signals and name != STAMP:
                     got = f"{_suggest_names(path_in_message, signals)}; {remedy}"
-                    raise fail(f"{place}, {topic}", f"a signal {path_in_message!r} of the sources", got)
+                    raise fail(f"{where}, {topic}", f"a signal {path_in_message!r} of the sources", got)
                 if OR in signals.get(name, "") and len(list_logs(path)) > 1:
-                    raise fail(f"{place}, {topic}", f"one unit of {name!r} in all logs", signals[name])
+                    raise fail(f"{where}, {topic}", f"one unit of {name!r} in all logs", signals[name])
                 if signals.get(name):
                     used[f"{topic}.{name} in {signals[name]}"] = None
     return list(used)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from heliograph.files.bags.mcap_json_and_protobuf import holds_messages, read_mcap_messages
 from heliograph.files.bags.ros_bag import Progress, is_bag, parts_of, read_bag
-from heliograph.files.event_table import EventTable
+from heliograph.files.events.event_table import EventTable
 from heliograph.files.logs.log_reading import read_log
 from heliograph.files.logs.vehicle_log import is_log
 from heliograph.files.messages.folder_of_message_files import (

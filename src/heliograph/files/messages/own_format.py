@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.event_columns import node_counts_losses
-from heliograph.files.event_table import EventTable
+from heliograph.files.events.event_columns import node_counts_losses
+from heliograph.files.events.event_table import EventTable
 from heliograph.files.messages.message_files import FileMessage, read_parquet_names
 from heliograph.files.sources.message_fields import convert_name
 from heliograph.files.sources.message_reading import Reading, Unread
@@ -209,16 +209,16 @@ class HeliographMessageReader:
         if row.keys() == self._columns:
             return
         # The columns of a table are those of its header: an error of all of it.
-        place = f"{self.source}, header" if self._table else where
+        position = f"{self.source}, header" if self._table else where
         error_type = HeaderError if self._table else InputError
         known = [*OWN, *(name for names in self.components.values() for name in names)]
         for name in () if self._ignore else row:
             if name not in known:
                 listed = ", ".join(dict.fromkeys(known))
-                raise error_type(str(fail(place, f"only the columns {listed}", repr(name))))
+                raise error_type(str(fail(position, f"only the columns {listed}", repr(name))))
         for name in (NODE, SEQUENCE, TIME):
             if name not in row:
-                raise error_type(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
+                raise error_type(str(fail(position, f"a column {name!r}", f"only {', '.join(row)}")))
         self._columns = row.keys()
 
     def _read_time(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:

@@ -187,10 +187,10 @@ class Geodetic:
         Raises:
             ValueError: the row or the column is not 0, 1 or 2.
         """
-        places = row, row if column is None else column
-        if any(place not in (0, 1, 2) for place in places):
-            raise fail("Geodetic, covariance", "a row and a column from 0 to 2", show_value(places))
-        return PlaneCovariance(self, places, partial(Covariance, path, kind=kind))
+        row_and_column = row, row if column is None else column
+        if any(index not in (0, 1, 2) for index in row_and_column):
+            raise fail("Geodetic, covariance", "a row and a column from 0 to 2", show_value(row_and_column))
+        return PlaneCovariance(self, row_and_column, partial(Covariance, path, kind=kind))
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -230,7 +230,7 @@ class PlaneCovariance:
     """
 
     position: Geodetic
-    places: tuple[int, int]
+    row_and_column: tuple[int, int]
     entry: "partial[Covariance]"
 
     @property
@@ -257,7 +257,7 @@ class PlaneCovariance:
             entries.append(entry.of(*numbers[begin : begin + count]))
             begin += count
         matrix = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(*np.shape(entries[0]), 3, 3)
-        return self.position.plane.turn_covariance(latitude, longitude, matrix)[..., self.places[0], self.places[1]]
+        return self.position.plane.turn_covariance(latitude, longitude, matrix)[(..., *self.row_and_column)]
 
 
 Computed = Yaw | Covariance | ZeroIfAbsent | PlaneCoordinate | PlaneCovariance

@@ -60,7 +60,7 @@ class TopicClocks:
         clock.count += 1
         clock.far_from_1970 += abs(time) >= YEAR
 
-    def find_topics_without_dates(self, place: str) -> list[str]:
+    def find_topics_without_dates(self, where: str) -> list[str]:
         """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
         Raises:
@@ -73,7 +73,7 @@ class TopicClocks:
             date = f"{np.datetime_as_string(np.datetime64(self._by_topic[dated].first, 'ns'), unit='s')}Z"
             remedy = f"such as time=hg.files.Stamp({clock.path!r}, start={date!r}), with the date of its 0"
             expected = f"dates as in {dated}, from {date} on ({remedy})"
-            raise fail(f"{place}, {topic}, field {clock.path!r}", expected, f"numbers from {clock.first / 1e9:g} s")
+            raise fail(f"{where}, {topic}, field {clock.path!r}", expected, f"numbers from {clock.first / 1e9:g} s")
         return from_zero
 
 

@@ -1,14 +1,13 @@
 """Messages of topics, read by the sources of a network: measurements of nodes, and inputs of the plant."""
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from difflib import get_close_matches
-from typing import NamedTuple
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from heliograph.files.device_availability import DeviceStatuses
 from heliograph.files.sources.derived_values import Computed, ZeroIfAbsent
+from heliograph.files.sources.mapped_source import MappedSource, map_sources, suggest_name
 from heliograph.files.sources.message_fields import (
     MissingFieldError,
     convert_count,
@@ -29,14 +28,6 @@ from heliograph.simulation.network import Network
 SECOND = 10**9  # nanoseconds
 LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
-
-
-class MappedSource(NamedTuple):
-    """A source, the pattern of its topics, and by node (that its messages may be of) the places of its values."""
-
-    source: Source
-    pattern: str
-    places: dict[str, np.ndarray]
 
 
 class TopicReader:
@@ -71,7 +62,9 @@ class TopicReader:
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
-        self._table = {topic: self._map_sources(topic, items) for topic, items in table.items()}
+        self._table = {
+            topic: map_sources(topic, items, self.names, self.time_counts_steps) for topic, items in table.items()
+        }
         # By topic that came, found when first asked for: its sources, and the fields that they use.
         self._sources_of_topic = dict[str, list[MappedSource]]()
         self._fields_of_topic = dict[str, set[str]]()
@@ -110,15 +103,15 @@ class TopicReader:
     def periods(self) -> dict[str, int]:
         """Return {node: after how many messages its running count begins again at 0}; other nodes are absent."""
         mapped = [single for several in self._table.values() for single in several]
-        counts = [(node, single.source.sequence) for single in mapped for node in single.places]
+        counts = [(node, single.source.sequence) for single in mapped for node in single.indices_by_node]
         return {node: count.period for node, count in counts if count is not None and count.period}
 
     @property
     def nodes_without_count(self) -> set[str]:
         """Return the nodes whose messages carry no running count, so that lost messages are not known."""
         mapped = [single for several in self._table.values() for single in several]
-        counted = {node for single in mapped for node in single.places if single.source.sequence is not None}
-        return {node for single in mapped for node in single.places} - counted
+        counted = {node for single in mapped for node in single.indices_by_node if single.source.sequence is not None}
+        return {node for single in mapped for node in single.indices_by_node} - counted
 
     @property
     def columns(self) -> set[str]:
@@ -208,7 +201,8 @@ class TopicReader:
     def _read_by_source(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
-        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices (`places`).
+        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices
+        (`indices_by_node`).
 
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
@@ -219,18 +213,22 @@ class TopicReader:
         plant, node = _read_names(mapped, topic, message, where)
         if node in self.others:
             return None
-        if node not in mapped.places:
-            raise fail(f"{where}, node", f"one of {', '.join(mapped.places)}", _suggest_name(node, mapped.places))
+        if node not in mapped.indices_by_node:
+            raise fail(
+                f"{where}, node",
+                f"one of {', '.join(mapped.indices_by_node)}",
+                suggest_name(node, mapped.indices_by_node),
+            )
         source.check_valid(message, where)
         sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
         # A message with a count may lack values: it measured nothing.
         has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
         # Each value in the output's unit: scale value + offset.
-        parts = zip(mapped.places[node], source.paths, source.scale, source.offset, strict=True)
-        for place, path, scale, offset in parts:
+        parts = zip(mapped.indices_by_node[node], source.paths, source.scale, source.offset, strict=True)
+        for index, path, scale, offset in parts:
             try:
-                values[place] = scale * _read_value(message, path, where, source.quoted) + offset
+                values[index] = scale * _read_value(message, path, where, source.quoted) + offset
                 if sequence is not None:
                     self.found.add((pattern, str(path)))
             except MissingFieldError as error:
@@ -270,7 +268,7 @@ class TopicReader:
             return None
         if is_count_absent:
             sequence = None
-        if node not in mapped.places or (sequence is None and not isinstance(error, RefusedError)):
+        if node not in mapped.indices_by_node or (sequence is None and not isinstance(error, RefusedError)):
             return None
         try:
             time = _read_time(mapped.source, message, where)
@@ -292,75 +290,6 @@ class TopicReader:
         self.found.add((pattern, path))
         name = f"{where}, field {path!r}"
         return source.sequence.check(convert_count(value, name, source.quoted), name), False
-
-    def _map_sources(self, topic: object, items: object) -> list[MappedSource]:
-        """Return the sources of a topic, checked, with the places of their values in each node's measurement."""
-        if not isinstance(topic, str) or not topic:
-            raise fail("sources", "topics that are text", show_value(topic))
-        sources = [items] if isinstance(items, Source) else items
-        if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
-            raise fail(f"sources, {topic!r}", "json_field, or a list of them", show_value(items))
-        return [MappedSource(source, topic, self._find_output_places(topic, source)) for source in sources]
-
-    def _find_output_places(self, topic: str, source: Source) -> dict[str, np.ndarray]:
-        """Return {node: which of its numbers each value of a source (the form of a topic's messages) is, (values,)}.
-
-        Raises:
-            ValueError: a source that does not fit the network; one line that names the topic.
-        """
-        name, node = f"sources, {topic!r}", source.node
-        wildcards = [i for i, word in enumerate(topic.split("/")) if word in ("+", "#")]
-        if wildcards and source.plant is None and isinstance(node, str):
-            level = f"hg.files.Level({wildcards[0]})"
-            remedy = f"plant={level}, node={level} or a field that names either"
-            raise fail(f"{name}, plant", f"{remedy}, since a wildcard stands for several sensors", "neither")
-        if isinstance(node, str):
-            if node not in self.names:
-                raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _suggest_name(node, self.names))
-            places = {node: self._index_outputs(name, source, node)}
-        else:  # messages name their node, which may be any that has these outputs
-            fitting = [each for each in self.names if each != INPUTS and self._has_outputs(each, source)]
-            places = {each: self._index_outputs(name, source, each) for each in fitting}
-            if not places:
-                raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
-        # `of` raises where the topic has not the level that a condition asks for; "#" may be of any levels.
-        for condition in source.available if "#" not in topic else ():
-            condition.of(topic)
-        self._check_kind_of_time(name, source)
-        return places
-
-    def _has_outputs(self, node: str, source: Source) -> bool:
-        """Return whether a node has the outputs of a source: those that it names, or as many as it has values."""
-        names = self.names[node]
-        return set(source.outputs) <= set(names) if source.outputs else len(names) == len(source.paths)
-
-    def _check_kind_of_time(self, name: str, source: Source) -> None:
-        """Raise ValueError, which begins with `name`, unless a source's times are of the network's kind, steps or not.
-
-        Times are steps if the source counts steps, or if it says how many seconds a step has.
-        """
-        are_steps = source.step is not None or (source.time is not None and source.time_unit == "step")
-        if self.time_counts_steps == are_steps:
-            return
-        expected = (
-            "the seconds of a step (step=0.1), or a time field in steps (time=..., time_unit='step'), "
-            "since the network counts steps: no input 'dt'"
-            if self.time_counts_steps
-            else "a time that is no step, since the network's time is continuous"
-        )
-        got = f"{show_value(source.time and source.time.path)} in {source.time_unit}"
-        raise fail(f"{name}, time", expected, got)
-
-    def _index_outputs(self, name: str, source: Source, node: str) -> np.ndarray:
-        """Return the index among the node's outputs for each path of a source; `name` is for errors."""
-        known = self.names[node]
-        outputs = source.outputs or known
-        if len(outputs) != len(source.paths):
-            raise fail(f"{name}, path", f"{len(known)} paths, for {', '.join(known)}, or output=", len(source.paths))
-        for output in outputs:
-            if output not in known:
-                raise fail(f"{name}, output", f"one of {', '.join(known)}", _suggest_name(output, known))
-        return np.array([known.index(output) for output in outputs])
 
 
 def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -> tuple[str, str]:
@@ -392,9 +321,3 @@ def _read_value(message: object, path: str | Computed, where: str, quoted: bool)
     if type(value) is float:  # the common case, without making the place's name for errors
         return value if np.isfinite(value) else np.nan
     return convert_number(value, f"{where}, field {path!r}", quoted)
-
-
-def _suggest_name(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
-    """Return an unknown name with the closest known one in brackets, if any is close."""
-    close = get_close_matches(name, list(names), 1)
-    return f"{name!r}{f' (closest: {close[0]!r})' if close else ''}"

@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.files.estimates.estimates_table import estimate_columns
 from heliograph.files.messages.message_files import FileMessage, make_message_of_row
 from heliograph.files.stores.store_address import INFLUX, StoreAddress, parse_store
-from heliograph.files.table import TIME, convert_to_columns
-from heliograph.files.table_rows import TableRows
+from heliograph.files.tables.table import TIME, convert_to_columns
+from heliograph.files.tables.table_rows import TableRows
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.process.optional_packages import check_installed
 from heliograph.simulation.results.record import Record

@@ -1,5 +1,6 @@
 """Names that other folders take; the package loads them when first used."""
 
+from .climbs import ClimbEnds as ClimbEnds
 from .data import LikelihoodData as LikelihoodData
 from .data import gather_data as gather_data
 from .multistart import AWAY as AWAY
@@ -25,4 +26,3 @@ from .predictive_density import evaluate_predictive as evaluate_predictive
 from .predictive_density import make_signal_filter as make_signal_filter
 from .predictive_density import predictive as predictive
 from .surface import LikelihoodSurface as LikelihoodSurface
-from .trust_region import ClimbEnds as ClimbEnds

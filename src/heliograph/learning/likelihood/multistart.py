@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, ClimbEnds, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, maximise_from_starts
 from heliograph.numerics.types import Bool, Float
 
 HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain
@@ -163,16 +164,16 @@ class MaximumSearch:
             short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True
         )
         x[others] = short_ends.x
-        # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `lanes` are the
-        # starts that climb, and `lane_of_start` which of these stands for each.
+        # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `climbing` are the
+        # starts that climb, and `climb_of_start` which of these stands for each.
         error = short.standard_errors(short_ends.x[short_ends.order[0]])
         reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
-        lanes, lane_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
+        climbing, climb_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
         # Climb by all rows. A point where the likelihood is not finite is first moved towards the start `own`.
-        climbed = self._climb(self.surface.move_to_finite_likelihood(x[lanes], starts[own]), ends)
+        climbed = self._climb(self.surface.move_to_finite_likelihood(x[climbing], starts[own]), ends)
         # Copy each climb's results to all starts that it stands for; `steps` is one number for all.
-        by_start = {name: leaf if name == "steps" else leaf[lane_of_start] for name, leaf in climbed._asdict().items()}
+        by_start = {name: leaf if name == "steps" else leaf[climb_of_start] for name, leaf in climbed._asdict().items()}
         return ClimbEnds(**by_start)
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> ClimbEnds:

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import expit
 
-from heliograph.numerics.check import Domain, fail
+from heliograph.numerics.check import fail
+from heliograph.numerics.domains import Domain
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, PyTree
 

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.learning.free_parameters import Parameter
+from heliograph.learning.likelihood.climbs import Evaluated, OpenEnds
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
-from heliograph.learning.likelihood.trust_region import Evaluated, OpenEnds, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import maximise_from_starts
 from heliograph.learning.likelihood.trust_region_step import FLAT
 from heliograph.numerics.types import Bool, Float
 
@@ -121,21 +122,23 @@ class LikelihoodSurface:
         hessian[np.ix_(moving, moving)] = (block + block.T) / 2
         return hessian
 
-    def information_by_row(self, x: Float[np.ndarray, " p"], places: np.ndarray) -> list[Float[np.ndarray, "steps k"]]:
+    def information_by_row(
+        self, x: Float[np.ndarray, " p"], coordinates: np.ndarray
+    ) -> list[Float[np.ndarray, "steps k"]]:
         """Return for each recording each row's observed information on k coordinates, -d(score_k)/dx_k, (steps, k).
 
-        By central differences at the point x (p,), over DIFFERENCE standard errors; `places`: indices of coordinates.
+        By central differences at the point x (p,), over DIFFERENCE standard errors; `coordinates`: their indices.
         """
-        deviation = self.standard_errors(x)[places]
+        deviation = self.standard_errors(x)[coordinates]
         # A number without a finite standard error is not moved, and has information 0.
         width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
-        shifts = np.zeros((len(places), len(x)))
-        shifts[np.arange(len(places)), places] = width
+        shifts = np.zeros((len(coordinates), len(x)))
+        shifts[np.arange(len(coordinates)), coordinates] = width
         score = self.evaluate_rows(np.concatenate([x + shifts, x - shifts])).score
         # From the points moved along coordinate k only the scores in k are taken: (recordings, steps, k).
         forward, backward = (
-            np.stack([scores[..., k] for scores, k in zip(half, places, strict=True)], axis=-1)
-            for half in (score[: len(places)], score[len(places) :])
+            np.stack([scores[..., k] for scores, k in zip(half, coordinates, strict=True)], axis=-1)
+            for half in (score[: len(coordinates)], score[len(coordinates) :])
         )
         information = (backward - forward) / np.where(width > 0, 2 * width, 1.0)
         return [rows[:steps] for rows, steps in zip(information, self.data.lengths, strict=True)]
@@ -167,9 +170,9 @@ class LikelihoodSurface:
         saddle, from which the search goes on along the direction. Only coordinates with `active` (p,) true count, along
         directions that the data identify, and lengths are in standard errors.
         """
-        evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
-        information = evaluation.information[0][np.ix_(places, places)]
-        gradient = evaluation.gradient[0][places]
+        evaluation, coordinates = self.evaluations(x[None]), np.flatnonzero(active)
+        information = evaluation.information[0][np.ix_(coordinates, coordinates)]
+        gradient = evaluation.gradient[0][coordinates]
         # `unit`: standard error of each coordinate alone, 1 / sqrt(I_ii) of the information I. In these units,
         # eigenvectors of the information with eigenvalues above FLAT are the identified directions; `basis` has them as
         # columns.
@@ -179,13 +182,13 @@ class LikelihoodSurface:
         if not basis.size:
             return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
         # The Hessian of -l along these directions. If it is not finite, the gain is unknown, and said to be infinite.
-        observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
+        observed = basis.T @ self.hessian(x, active)[np.ix_(coordinates, coordinates)] @ basis
         if not np.isfinite(observed).all():
             return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
         # Its least eigenvalue, with the direction in coordinates x.
         curvatures, vectors = np.linalg.eigh(observed)
         direction = np.zeros(len(x))
-        direction[places] = basis @ vectors[:, 0]
+        direction[coordinates] = basis @ vectors[:, 0]
         # Gain of a Newton step for the gradient g and the Hessian H, g' |H|^-1 g / 2, in eigenvectors of H.
         slopes = vectors.T @ basis.T @ gradient
         gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
@@ -196,11 +199,11 @@ class LikelihoodSurface:
         x: Float[np.ndarray, " p"],
         top: float,
         coordinate: int,
-        first: Float[np.ndarray, " lanes"],
+        first: Float[np.ndarray, " ends"],
         furthest: float,
         drop: float,
         active: Bool[np.ndarray, " p"],
-    ) -> Float[np.ndarray, " lanes"]:
+    ) -> Float[np.ndarray, " ends"]:
         """Return the values of a coordinate at which the profile of the log-likelihood l has fallen by `drop`.
 
         The profile at a value is l with all other active coordinates at their best. Its fall is f = sqrt(2 (top - l)),
@@ -211,13 +214,13 @@ class LikelihoodSurface:
             x: the maximum (p,).
             top: l there.
             coordinate: index of the coordinate whose profile is followed.
-            first: signed distances at which to begin, one for each end that is sought (lanes,).
+            first: signed distances at which to begin, one for each end that is sought (ends,).
             furthest: distance of an end that is taken for infinite: the profile has not fallen enough up to it.
             drop: fall of l at the ends, in nats.
             active: coordinates that are inside their domains (p,).
 
         Returns:
-            The ends, one for each of `first` (lanes,).
+            The ends, one for each of `first` (ends,).
         """
         moving = np.repeat((active & (np.arange(len(x)) != coordinate))[None], len(first), axis=0)
         points = np.repeat(x[None], len(first), axis=0)  # where climbs of the other coordinates begin
@@ -251,7 +254,7 @@ class LikelihoodSurface:
 def _choose_next_distances(
     newton: np.ndarray, distance: np.ndarray, inside: np.ndarray, outside: np.ndarray, furthest: float
 ) -> np.ndarray:
-    """Return the distances to look at next (lanes,): Newton's if it lies inside the bracket, else the bracket's middle.
+    """Return the distances to look at next (ends,): Newton's if it lies inside the bracket, else the bracket's middle.
 
     If `outside` is not known yet (infinite), the bracket ends at three times the last `distance`, and this end replaces
     the middle. No distance is above `furthest`.

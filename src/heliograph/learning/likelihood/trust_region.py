@@ -1,165 +1,86 @@
 """Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side.
 
-A lane is one of these searches. Coordinates are those of the line, where each free number is unbounded: logarithms and
+A climb is one of these searches. Coordinates are those of the line, where each free number is unbounded: logarithms and
 logits, or plain real numbers, which are called free of a scale. A point is a vector of them (p,).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.likelihood.climbs import NOISE, ClimbEnds, Climbs, Evaluate, Evaluated, OpenEnds, join_climbs
 from heliograph.learning.likelihood.trust_region_step import (
     expected_gain,
     find_errors_and_flat_directions,
-    multiply_lanes,
+    multiply_each,
     trust_region_step,
 )
 from heliograph.numerics.types import Bool, Float
 
 MOST_STEPS = 200
 FIRST_RADIUS = 10.0  # of the trust region, in standard errors
-WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model foretold well, and badly
+WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model predicted well, and badly
 CLOSE = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
 NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
-NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
-TAKEN = 1e-4  # share of the foretold gain that a step has to bring to be taken
+TAKEN = 1e-4  # share of the predicted gain that a step has to bring to be taken
 DEFINED = 1e-8  # r' p / |r| |p| below which it is rounding
 AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
 SMALLEST_RADIUS = 1e-12
-JOINED = 0.1  # standard errors between two lanes that climb to one top, and of either from it
-BENT = 0.5  # of the information between two such lanes, that the likelihood bends by at least
-ALIKE = 0.1  # of the gain between two such lanes, that their slopes may leave unexplained
-NEIGHBOURS = 1.0  # between logarithms or logits of two such lanes, whatever the information says
 INVISIBLE = 1e-6  # information of a logarithm or a logit of which the likelihood sees next to nothing
-
-Evaluated = tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes p"], Float[np.ndarray, "lanes p p"]]
-Evaluate = Callable[[Float[np.ndarray, "lanes p"]], Evaluated]
-
-
-class OpenEnds(NamedTuple):
-    """Coordinates by which an end of a domain is at infinity.
-
-    A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
-    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
-    """
-
-    low: Bool[np.ndarray, " p"]
-    high: Bool[np.ndarray, " p"]
-    single: Bool[np.ndarray, " p"]
-
-    @staticmethod
-    def unbounded(count: int) -> "OpenEnds":
-        """Return the domains of so many real numbers, without ends."""
-        none = np.zeros(count, dtype=bool)
-        return OpenEnds(none, none, none)
-
-    @property
-    def free(self) -> Bool[np.ndarray, " p"]:
-        """Coordinates that are real numbers (no logarithm or logit): they end nowhere, and their scale is unknown."""
-        return np.asarray(~(self.low | self.high))
-
-
-class ClimbEnds(NamedTuple):
-    """Ends of the searches, one a lane.
-
-    x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
-    steps: number of steps that were taken. Shapes: x, gradient (lanes, p), total, converged, remaining (lanes,).
-    """
-
-    x: Float[np.ndarray, "lanes p"]
-    total: Float[np.ndarray, " lanes"]
-    gradient: Float[np.ndarray, "lanes p"]
-    converged: Bool[np.ndarray, " lanes"]
-    remaining: Float[np.ndarray, " lanes"]
-    steps: int
-
-    @property
-    def order(self) -> np.ndarray:
-        """Lanes from the highest likelihood to the lowest."""
-        return np.argsort(-np.nan_to_num(self.total, nan=-np.inf), kind="stable")
-
-
-class _Lanes(NamedTuple):
-    """Lanes (searches side by side) between two steps.
-
-    x: points (lanes, p). total: log-likelihood l there (lanes,), gradient (lanes, p), information I (lanes, p, p).
-    model: B, a model of minus the Hessian of l (lanes, p, p). radius: of the trust region (lanes,). remaining: what a
-    full step would gain, g' I^-1 g / 2. done: lanes that go no further. joined: the lane that each joined, or itself.
-    """
-
-    x: np.ndarray
-    total: np.ndarray
-    gradient: np.ndarray
-    information: np.ndarray
-    model: np.ndarray
-    radius: np.ndarray
-    remaining: np.ndarray
-    done: np.ndarray
-    converged: np.ndarray
-    joined: np.ndarray
-
-    def ends(self, steps: int) -> ClimbEnds:
-        """Return where the lanes (searches side by side) are after `steps` steps; `joined`: the lane each joined."""
-        lane = self.joined
-        for _ in range(len(lane)):  # a lane may join one that joins a third
-            lane = lane[lane]
-        x, total, gradient = self.x[lane], self.total[lane], self.gradient[lane]
-        return ClimbEnds(x, total, gradient, self.converged[lane], self.remaining[lane], steps)
 
 
 def maximise_from_starts(
     evaluate: Evaluate,
-    start: Float[np.ndarray, "lanes p"],
-    active: Bool[np.ndarray, "lanes p"] | None = None,
+    start: Float[np.ndarray, "climbs p"],
+    active: Bool[np.ndarray, "climbs p"] | None = None,
     watch: Callable[[ClimbEnds], None] | None = None,
     domains: OpenEnds | None = None,
     close: float = CLOSE,
     joining: bool = False,
 ) -> ClimbEnds:
-    """Return where climbs of the log-likelihood l end, one climb (a lane) from each start, all side by side.
+    """Return where climbs of the log-likelihood l end, one from each start, all side by side.
 
-    Each step p of a lane maximises the model g' p - p' B p / 2 of the gain over |D p| <= radius: g is the gradient of
+    Each step p maximises the model g' p - p' B p / 2 of the gain over |D p| <= radius: g is the gradient of
     l, and D scales p to standard errors. B is the Gauss-Newton information I, or I corrected by what steps taught of
-    its error (SR1), whichever foretold the last gain better. A step is taken where l rises by a share of what was
-    foretold; else the radius falls. So l never falls, and the units of the numbers do not matter.
+    its error (SR1), whichever predicted the last gain better. A step is taken where l rises by a share of what was
+    predicted; else the radius falls. So l never falls, and the units of the numbers do not matter.
 
-    A lane has converged when g' I^-1 g, twice the gain of the step without bounds, is less than rounding sees. This
+    A climb has converged when g' I^-1 g, twice the gain of the step without bounds, is less than rounding sees. This
     leaves out coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all.
 
     Args:
-        evaluate: l (lanes,), its gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
-        start: points at which to begin (lanes, p).
-        active: coordinates that move, the others stay (lanes, p); all unless given.
+        evaluate: l (climbs,), its gradient (climbs, p) and information (climbs, p, p) at points (climbs, p).
+        start: points at which to begin (climbs, p).
+        active: coordinates that move, the others stay (climbs, p); all unless given.
         watch: called with the best so far before each step.
         domains: coordinates whose domains end at infinity (logarithms, logits); plain real numbers unless given.
-        close: g' I^-1 g at which a lane has arrived.
-        joining: whether a lane ends where another, higher one climbs to the same top.
+        close: g' I^-1 g at which a climb has arrived.
+        joining: whether a climb ends where a higher one goes to the same top.
     Source: Moré and Sorensen (1983) for the step; Dennis, Gay and Welsch (1981) for the choice of the model; Conn,
     Gould and Toint, Trust-Region Methods (2000).
     """
     moving = np.ones(start.shape, dtype=bool) if active is None else active
     domains = OpenEnds.unbounded(start.shape[1]) if domains is None else domains
     with np.errstate(all="ignore"):
-        state = _init_lanes(evaluate, start, moving, domains, close)
+        state = _start_climbs(evaluate, start, moving, domains, close)
         for count in range(MOST_STEPS):
             best = state.ends(count)
             if watch is not None:
                 watch(best)
             if state.done.all():
                 return best
-            state = _step_lanes(evaluate, state, moving, domains, close)
-            state = _join_lanes(state, moving, domains) if joining else state
+            state = _step_climbs(evaluate, state, moving, domains, close)
+            state = join_climbs(state, moving, domains) if joining else state
     return state.ends(MOST_STEPS)
 
 
-def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
-    """Return the state of all lanes before the first step, at the points `start` (lanes, p).
+def _start_climbs(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
+    """Return the state of all climbs before the first step, at the points `start` (climbs, p).
 
-    A lane is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite.
+    A climb is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite.
     """
     total, gradient, information = evaluate(start)
-    state = _Lanes(
+    state = Climbs(
         x=start.copy(),
         total=total,
         gradient=gradient,
@@ -175,20 +96,20 @@ def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domai
 
 
 def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Return for each lane whether log-likelihood, gradient and information are finite in moving coordinates.
+    """Return for each climb whether log-likelihood, gradient and information are finite in moving coordinates.
 
-    Shapes: `total` (lanes,), `gradient` and `moving` (lanes, p), `information` (lanes, p, p).
+    Shapes: `total` (climbs,), `gradient` and `moving` (climbs, p), `information` (climbs, p, p).
     """
     finite_gradient = np.all(np.isfinite(gradient) | ~moving, axis=1)
     finite_information = np.isfinite(information) | ~(moving[:, :, None] & moving[:, None, :])
     return np.asarray(np.isfinite(total) & finite_gradient & np.all(finite_information, axis=(1, 2)))
 
 
-def _mark_arrived(state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
-    """Return the state with lanes marked as done that have arrived, or whose radius is below SMALLEST_RADIUS.
+def _mark_arrived(state: Climbs, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
+    """Return the state with climbs marked as done that have arrived, or whose radius is below SMALLEST_RADIUS.
 
-    A lane has arrived if g' I^-1 g, twice what is left to gain, is below `close`. At so small a radius rounding hides
-    the gain; the lane then counts as converged if the gain is below NEAR.
+    A climb has arrived if g' I^-1 g, twice what is left to gain, is below `close`. At so small a radius rounding hides
+    the gain; the climb then counts as converged if the gain is below NEAR.
     """
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
@@ -199,15 +120,15 @@ def _mark_arrived(state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: f
     )
 
 
-def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "lanes p"]:
-    """Return which coordinates count as at an end of their domain (lanes, p), as l gains less than AT_LIMIT to it.
+def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "climbs p"]:
+    """Return which coordinates count as at an end of their domain (climbs, p), as l gains less than AT_LIMIT to it.
 
     A number v = exp(x) has its end v = 0 at x = -inf (`domains.low`). A logit also has one at x = inf (`domains.high`).
     To first order, the log-likelihood l gains l(0) - l(v) = -v l'(v) = -dl/dx up to the end.
 
     Args:
-        x: points (lanes, p).
-        gradient: gradient of l there (lanes, p).
+        x: points (climbs, p).
+        gradient: gradient of l there (climbs, p).
         domains: coordinates whose domains end at infinity.
     """
     outward = np.where(domains.high & (x > 0), 1.0, np.where(domains.low, -1.0, 0.0))
@@ -215,30 +136,30 @@ def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Ope
     return np.asarray((outward != 0) & (rise >= 0) & (rise < AT_LIMIT))
 
 
-def _step_lanes(evaluate: Evaluate, state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
-    """Return the state after one step in each lane that is not done: propose, evaluate, accept or reject, adapt.
+def _step_climbs(evaluate: Evaluate, state: Climbs, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
+    """Return the state after one step of each climb that is not done: propose, evaluate, accept or reject, adapt.
 
     Args:
-        evaluate: log-likelihood (lanes,), gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
-        state: lanes (searches side by side) before the step.
-        moving: coordinates that move (lanes, p).
+        evaluate: log-likelihood (climbs,), gradient (climbs, p) and information (climbs, p, p) at points (climbs, p).
+        state: climbs (searches side by side) before the step.
+        moving: coordinates that move (climbs, p).
         domains: coordinates whose domains end at infinity.
-        close: a lane has arrived where g' I^-1 g of gradient g and information I is below this.
+        close: a climb has arrived where g' I^-1 g of gradient g and information I is below this.
     """
     going = ~state.done
     # The step p of greatest g' p - p' B p / 2 within the radius; coordinates at an end of their domain stay.
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
-    step, length, foretold = trust_region_step(
+    step, length, predicted = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free
     )
-    tried = np.where(going[:, None], state.x + step, state.x)  # lanes that are done stay
-    total, gradient, information = _evaluate_lanes(evaluate, tried, going, state)
-    # Accept it or not, and adapt the radius, by how well the gain was foretold.
+    tried = np.where(going[:, None], state.x + step, state.x)  # climbs that are done stay
+    total, gradient, information = _evaluate_at(evaluate, tried, going, state)
+    # Accept it or not, and adapt the radius, by how well the gain was predicted.
     is_finite = going & _is_finite(total, gradient, information, moving)
     gradient_fell = expected_gain(gradient, information, counting) < expected_gain(
         state.gradient, state.information, counting
     )
-    accepted, radius = _accept_or_reject_steps(state, total, length, foretold, is_finite, gradient_fell)
+    accepted, radius = _accept_or_reject_steps(state, total, length, predicted, is_finite, gradient_fell)
     model = _update_hessian(state, step, total - state.total, gradient, information, is_finite, accepted, domains.free)
     after = state._replace(
         x=np.where(accepted[:, None], tried, state.x),
@@ -252,72 +173,42 @@ def _step_lanes(evaluate: Evaluate, state: _Lanes, moving: np.ndarray, domains: 
 
 
 def _accept_or_reject_steps(
-    state: _Lanes,
+    state: Climbs,
     total: np.ndarray,
     length: np.ndarray,
-    foretold: np.ndarray,
+    predicted: np.ndarray,
     is_finite: np.ndarray,
     gradient_fell: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which lanes accept their step, and the radius for the next one, (lanes,) each.
+    """Return which climbs accept their step, and the radius for the next one, (climbs,) each.
 
     Lanes are searches side by side. A step is accepted where the log-likelihood l rises by a share of the gain that the
-    model foretold. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
+    model predicted. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
     gradient fell, or if the step went to the edge of the region, as across a plateau; and l must not fall by more than
     rounding.
 
     Args:
-        state: the lanes before the step, with l (`total`), the radius, and `done` for lanes that go no further.
+        state: the climbs before the step, with l (`total`), the radius, and `done` for climbs that go no further.
         total: l at the end of the step.
         length: of the step in the units of the radius.
-        foretold: gain of l by the model.
-        is_finite: whether l and its derivatives are finite at the end of the step; false of lanes that are done.
+        predicted: gain of l by the model.
+        is_finite: whether l and its derivatives are finite at the end of the step; false of climbs that are done.
         gradient_fell: whether g' I^-1 g is less there than before.
     """
     gain = total - state.total
     at_edge = length > 0.9 * state.radius
-    is_hidden = foretold < NOISE * np.abs(state.total)
+    is_hidden = predicted < NOISE * np.abs(state.total)
     accepted_if_hidden = (gradient_fell | at_edge) & (gain >= -NOISE * np.abs(total))
-    accepted = is_finite & np.where(is_hidden, accepted_if_hidden, gain > TAKEN * foretold)
-    # Wider after a step to the edge that gained three quarters of what was foretold; narrower below one quarter.
-    foretold_well = accepted & ((gain > 0.75 * foretold) | is_hidden)
-    foretold_badly = ~state.done & ~(is_finite & ((gain > 0.25 * foretold) | (is_hidden & accepted)))
-    widened = np.where(foretold_well & at_edge, WIDER * state.radius, state.radius)
-    return accepted, np.where(foretold_badly, NARROWER * np.minimum(length, state.radius), widened)
+    accepted = is_finite & np.where(is_hidden, accepted_if_hidden, gain > TAKEN * predicted)
+    # Wider after a step to the edge that gained three quarters of what was predicted; narrower below one quarter.
+    predicted_well = accepted & ((gain > 0.75 * predicted) | is_hidden)
+    predicted_badly = ~state.done & ~(is_finite & ((gain > 0.25 * predicted) | (is_hidden & accepted)))
+    widened = np.where(predicted_well & at_edge, WIDER * state.radius, state.radius)
+    return accepted, np.where(predicted_badly, NARROWER * np.minimum(length, state.radius), widened)
 
 
-def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
-    """Return the state in which each lane (climb) a is ended that goes to the same top as a higher lane b.
-
-    Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
-    information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
-    x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
-    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (lanes, p). `domains`: which are plain real numbers.
-    """
-    lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
-    d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)
-    # d' I d: the greater of the two values by the information of a and of b; `squared` [c, a, b] uses I of lane c.
-    squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
-    distance = np.maximum(squared[lanes, lanes, :], squared[lanes, :, lanes].T)
-    # [a, b]: l_b - l_a; the same if l were quadratic; and the fall of the slope, (g_a - g_b)' d.
-    gain = state.total[None] - state.total[:, None]
-    gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
-    slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
-    near_top = (2 * state.remaining < JOINED**2) & (state.joined == lanes)  # 2 * remaining: distance squared
-    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
-    neighbours &= np.all(moving[:, None] == moving[None], axis=2)
-    is_quadratic = np.abs(gain - gain_of_quadratic) <= ALIKE * gain + NOISE * np.abs(state.total)
-    no_saddle = is_quadratic & (slope_fall >= BENT * distance)
-    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
-    # [a, b] is true where b goes on: the higher one, of two that are as high the first.
-    is_higher = same_top & ((gain > 0) | ((gain == 0) & (lanes[None] < lanes[:, None])))
-    joins = ~state.done & np.any(is_higher, axis=1)
-    best = np.argmax(np.where(is_higher, state.total[None], -np.inf), axis=1)
-    return state._replace(joined=np.where(joins, best, state.joined), done=state.done | joins)
-
-
-def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _Lanes) -> Evaluated:
-    """Return log-likelihood, gradient and information at x (lanes, p) in lanes `going` on, the last ones elsewhere."""
+def _evaluate_at(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: Climbs) -> Evaluated:
+    """Return log-likelihood, gradient and information at x (climbs, p) of climbs `going` on, else the last ones."""
     arrays = state.total.copy(), state.gradient.copy(), state.information.copy()
     for array, new_values in zip(arrays, evaluate(x[going]), strict=True):
         array[going] = new_values
@@ -325,7 +216,7 @@ def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state:
 
 
 def _update_hessian(
-    state: _Lanes,
+    state: Climbs,
     step: np.ndarray,
     gain: np.ndarray,
     gradient: np.ndarray,
@@ -334,31 +225,31 @@ def _update_hessian(
     accepted: np.ndarray,
     free: np.ndarray,
 ) -> np.ndarray:
-    """Return the model B of minus the Hessian of the log-likelihood l for the next step, (lanes, p, p).
+    """Return the model B of minus the Hessian of the log-likelihood l for the next step, (climbs, p, p).
 
-    In each lane (one of several searches side by side) B is the information at the lane's next point, or the last B
-    corrected by this step: whichever would have foretold the gain of the step p, g' p - p' B p / 2, better. The last B
+    In each climb (one of several searches side by side) B is the information at its next point, or the last B
+    corrected by this step: whichever would have predicted the gain of the step p, g' p - p' B p / 2, better. The last B
     stays where l is not finite at the end of the step.
 
     Args:
-        state: lanes before the step: gradient g (lanes, p), information and model B (lanes, p, p).
-        step: p (lanes, p).
-        gain: actual gain of l by the step (lanes,).
-        gradient: of l at the end of the step (lanes, p).
-        information: information at the end of the step (lanes, p, p).
-        is_finite: whether l and its derivatives are finite there (lanes,).
-        accepted: whether the lane moves to the end of the step (lanes,).
+        state: climbs before the step: gradient g (climbs, p), information and model B (climbs, p, p).
+        step: p (climbs, p).
+        gain: actual gain of l by the step (climbs,).
+        gradient: of l at the end of the step (climbs, p).
+        information: information at the end of the step (climbs, p, p).
+        is_finite: whether l and its derivatives are finite there (climbs,).
+        accepted: whether the climb moves to the end of the step (climbs,).
         free: coordinates that are plain real numbers, no logarithms or logits (p,).
     """
     last_model, last_information = np.nan_to_num(state.model), np.nan_to_num(state.information)
-    # The gain that each of the two models would have foretold, g' p - p' B p / 2.
+    # The gain that each of the two models would have predicted, g' p - p' B p / 2.
     slope = np.sum(state.gradient * step, axis=1)
-    by_model = slope - np.sum(step * multiply_lanes(last_model, step), axis=1) / 2
-    by_information = slope - np.sum(step * multiply_lanes(last_information, step), axis=1) / 2
+    by_model = slope - np.sum(step * multiply_each(last_model, step), axis=1) / 2
+    by_information = slope - np.sum(step * multiply_each(last_information, step), axis=1) / 2
     keeps_model = ~is_finite | (np.abs(gain - by_model) <= np.abs(gain - by_information))
     # B corrected so that B p is the change of the gradient (symmetric rank-one update).
     corrected = _correct_by_secant(last_model, step, state, gradient, is_finite, free)
-    # A rejected step leaves the lane where it was, with the information of that point.
+    # A rejected step leaves the climb where it was, with the information of that point.
     current_information = np.where(accepted[:, None, None], information, state.information)
     return np.where(keeps_model[:, None, None], corrected, current_information)
 
@@ -366,27 +257,27 @@ def _update_hessian(
 def _correct_by_secant(
     model: np.ndarray,
     step: np.ndarray,
-    state: _Lanes,
+    state: Climbs,
     gradient: np.ndarray,
     is_finite: np.ndarray,
     free: np.ndarray,
 ) -> np.ndarray:
-    """Return B + r r' / (r' p) with r = y - B p (the symmetric rank-one update, SR1), (lanes, p, p).
+    """Return B + r r' / (r' p) with r = y - B p (the symmetric rank-one update, SR1), (climbs, p, p).
 
-    Lanes are searches for a maximum side by side; B is each one's model of minus the Hessian. The new B maps the step p
-    to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays where the gradient
-    after the step is not finite, or r' p is rounding.
+    Climbs are searches for a maximum side by side; B is each one's model of minus the Hessian. The new B maps the step
+    p to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays where the
+    gradient after the step is not finite, or r' p is rounding.
 
     Args:
-        model: B (lanes, p, p).
-        step: p (lanes, p).
-        state: the lanes before the step, with gradient and information.
-        gradient: after the step (lanes, p).
-        is_finite: whether it is finite (lanes,).
+        model: B (climbs, p, p).
+        step: p (climbs, p).
+        state: the climbs before the step, with gradient and information.
+        gradient: after the step (climbs, p).
+        is_finite: whether it is finite (climbs,).
         free: coordinates that are plain real numbers, no logarithms or logits (p,).
     """
     y = np.where(is_finite[:, None], np.nan_to_num(state.gradient - gradient), 0.0)
-    r = y - multiply_lanes(model, step)
+    r = y - multiply_each(model, step)
     # The likelihood hardly depends on a logarithm or logit with so little information: y is but rounding there.
     diagonal = np.diagonal(state.information, axis1=1, axis2=2)
     r = np.where(free | (diagonal > INVISIBLE), r, 0.0)

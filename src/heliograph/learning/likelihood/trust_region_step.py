@@ -1,4 +1,4 @@
-"""One step of a trust-region search, of many lanes at once: the best point of a quadratic model within a radius."""
+"""One step of a trust-region search, of many climbs at once: the best point of a quadratic model within a radius."""
 
 from typing import NamedTuple
 
@@ -16,11 +16,11 @@ LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is 
 
 
 class TrustRegionStep(NamedTuple):
-    """Steps p of all lanes, their lengths |D p|, and the gains that the model foretells, g' p - p' B p / 2."""
+    """Steps p of all climbs, their lengths |D p|, and the gains that the model predicts, g' p - p' B p / 2."""
 
-    step: Float[np.ndarray, "lanes p"]
-    length: Float[np.ndarray, " lanes"]
-    foretold: Float[np.ndarray, " lanes"]
+    step: Float[np.ndarray, "climbs p"]
+    length: Float[np.ndarray, " climbs"]
+    predicted: Float[np.ndarray, " climbs"]
 
 
 def trust_region_step(
@@ -42,16 +42,16 @@ def trust_region_step(
     lead far.
 
     Args:
-        gradient: g (lanes, p).
-        information: its diagonal gives the standard errors (lanes, p, p).
-        model: B, minus the Hessian or near it; it may be indefinite (lanes, p, p). Where it is not finite, or huge, the
-            information takes its place.
-        radius: of the trust region (lanes,).
-        moving: which coordinates may move (lanes, p).
+        gradient: g (climbs, p).
+        information: its diagonal gives the standard errors (climbs, p, p).
+        model: B, minus the Hessian or near it; it may be indefinite (climbs, p, p). Where it is not finite, or huge,
+            the information takes its place.
+        radius: of the trust region (climbs,).
+        moving: which coordinates may move (climbs, p).
         free: which are no logarithms or logits, and so not limited by LONGEST (p,).
 
     Returns:
-        p (lanes, p), |D p| (lanes,) and g' p - p' B p / 2 (lanes,).
+        p (climbs, p), |D p| (climbs,) and g' p - p' B p / 2 (climbs,).
     """
     # g, D and B in standard errors. A coordinate that stays has a unit of 0 and 1 on the diagonals of D and B, so that
     # its step is 0. Columns of `flat` are the directions that are not identified, in these units.
@@ -67,15 +67,15 @@ def trust_region_step(
     factor = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
     step, length = step * factor[:, None], length * factor
     # What the model gains there: g' p - p' B p / 2.
-    foretold = np.sum(step * (g - multiply_lanes(b, step) / 2), axis=1)
-    return TrustRegionStep(step=step * unit, length=length, foretold=foretold)
+    predicted = np.sum(step * (g - multiply_each(b, step) / 2), axis=1)
+    return TrustRegionStep(step=step * unit, length=length, predicted=predicted)
 
 
 def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U B U (lanes, p, p) for each lane's model B, or for its information if B is huge or not finite.
+    """Return U B U (climbs, p, p) for each climb's model B, or for its information if B is huge or not finite.
 
-    U = diag(unit), with the standard errors `unit` (lanes, p). A lane is one of several searches side by side. LARGEST:
-    a curvature beyond it, in these units, is only rounding.
+    U = diag(unit), with the standard errors `unit` (climbs, p). A climb is one of several searches side by side.
+    LARGEST: a curvature beyond it, in these units, is only rounding.
     """
     scaled_model = _scale_both_sides(model, unit)
     is_usable = np.all(np.abs(scaled_model) < LARGEST, axis=(1, 2))  # neither huge nor NaN
@@ -83,9 +83,9 @@ def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -
 
 
 def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return p = (B + s D^2)^-1 g (lanes, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
+    """Return p = (B + s D^2)^-1 g (climbs, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
 
-    `radius` (lanes,), g (lanes, p), b: B (lanes, p, p), d: the diagonal of D (lanes, p). Newton's method for
+    `radius` (climbs,), g (climbs, p), b: B (climbs, p, p), d: the diagonal of D (climbs, p). Newton's method for
     1 / |D p| = 1 / radius, from the least s that makes the matrix positive.
     """
     # D^-1 B D^-1 + s I is positive for s above minus the least eigenvalue.
@@ -104,24 +104,24 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
 
 
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return (B + s D^2)^-1 r of each lane (lanes, p), or 0 along directions in which the matrix is singular.
+    """Return (B + s D^2)^-1 r of each climb (climbs, p), or 0 along directions in which the matrix is singular.
 
-    `b`: B (lanes, p, p). `shift`: s (lanes,). `d`: the diagonal of D (lanes, p). `right`: r (lanes, p). A lane is one
-    of several searches side by side. An eigenvalue below ROUNDING times the largest counts as 0.
+    `b`: B (climbs, p, p). `shift`: s (climbs,). `d`: the diagonal of D (climbs, p). `right`: r (climbs, p). A climb is
+    one of several searches side by side. An eigenvalue below ROUNDING times the largest counts as 0.
     """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
     except np.linalg.LinAlgError:  # a pivot that is exactly 0
-        return multiply_lanes(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
+        return multiply_each(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
 
 
 def expected_gain(
-    gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
-) -> Float[np.ndarray, " lanes"]:
-    """Return g' I^-1 g (lanes,), twice what a full step gains: gradient g (lanes, p), information I (lanes, p, p).
+    gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "climbs p"]
+) -> Float[np.ndarray, " climbs"]:
+    """Return g' I^-1 g (climbs,), twice what a full step gains: gradient g (climbs, p), information I (climbs, p, p).
 
-    Only coordinates marked in `counting` (lanes, p) and identified directions count. A direction with an eigenvalue of
+    Only coordinates marked in `counting` (climbs, p) and identified directions count. A direction with an eigenvalue of
     at most FLAT, in units of standard errors, is not identified.
     """
     unit, _ = find_errors_and_flat_directions(information, counting)
@@ -134,11 +134,12 @@ def expected_gain(
 
 
 def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each coordinate's standard error if all others were known (lanes, p), and the flat directions.
+    """Return each coordinate's standard error if all others were known (climbs, p), and the flat directions.
 
-    Each lane is a point with its `information` I (lanes, p, p); the errors are 1 / sqrt(I_ii), or 0 of coordinates that
-    are not `moving`. A flat direction is an eigenvector of I_ij / sqrt(I_ii I_jj) without information, eigenvalue <=
-    FLAT. It is a column of the result (lanes, p, p), in units of the errors; the columns of other eigenvectors are 0.
+    Each climb is a point with its `information` I (climbs, p, p); the errors are 1 / sqrt(I_ii), or 0 of coordinates
+    that are not `moving`. A flat direction is an eigenvector of I_ij / sqrt(I_ii I_jj) without information, eigenvalue
+    <= FLAT. It is a column of the result (climbs, p, p), in units of the errors; the columns of other eigenvectors are
+    0.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     # Information below LEAST counts as none, since its square would underflow.
@@ -151,11 +152,11 @@ def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray)
 
 
 def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U A U (lanes, p, p), U = diag(unit), `unit` (lanes, p); 0 in rows and columns whose unit is 0."""
+    """Return U A U (climbs, p, p), U = diag(unit), `unit` (climbs, p); 0 in rows and columns whose unit is 0."""
     stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
     return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
 
 
-def multiply_lanes(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return the product A x of each lane, (lanes, p), of matrices A (lanes, p, p) and vectors x (lanes, p)."""
+def multiply_each(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return the product A x of each climb, (climbs, p), of matrices A (climbs, p, p) and vectors x (climbs, p)."""
     return np.asarray(np.einsum("lij,lj->li", matrix, vector))

@@ -65,7 +65,7 @@ def continue_angles(
 
     f(x) is taken near f(center) + D (x - center). D is the Jacobian of resulting angles by given angles, rounded to
     whole turns. An angle that follows a given angle thus makes any number of turns with it, and every other angle is
-    taken within half a turn of its value at the center. `given`: places of angles in x. `angles`: places of angles in
+    taken within half a turn of its value at the center. `given`: indices of angles in x. `angles`: places of angles in
     f(x).
     """
     if not angles:

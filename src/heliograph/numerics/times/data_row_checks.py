@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from heliograph.numerics.check import REAL, check_columns, check_numbers, fail, report_domain, show_value
+from heliograph.numerics.check import check_columns, check_numbers, fail, show_value
+from heliograph.numerics.domains import REAL, report_domain
 from heliograph.numerics.masked_arrays import fill_masked, holds_texts_or_dates
 from heliograph.numerics.types import Array, ArrayLike, Float
 

@@ -182,8 +182,8 @@ class Arrivals:
 
         If it is not known when messages were due, each row counts as one.
         """
-        places = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
-        return places - places[:1]
+        numbers = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
+        return numbers - numbers[:1]
 
     @property
     def share(self) -> float:

@@ -52,19 +52,19 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
     law = BurstLossLaw.fit_to_intervals(intervals)
     least, found = np.log(CHANCE), None
     for length in range(2, min(LONGEST, len(arrived) // 2) + 1 if len(intervals) else 0):
-        places = np.bincount(arrivals % length, minlength=length) > 0
-        if places.all():
+        pattern = np.bincount(arrivals % length, minlength=length) > 0
+        if pattern.all():
             continue
-        # log of the number of patterns: any set of as many places, and any length, would have been taken. Weights
+        # log of the number of patterns: any set of as many rows, and any length, would have been taken. Weights
         # 1 / (length (length - 1)) of lengths add up to 1.
-        log_patterns = log(comb(length, int(places.sum()))) + log(length * (length - 1))
+        log_patterns = log(comb(length, int(pattern.sum()))) + log(length * (length - 1))
         # Independent losses leave all n arrivals in d of `length` rows with probability (d / length)^n: if that is no
         # less than the least, bursts need not be looked at.
-        if length > SHORT and len(arrivals) * log(length / places.sum()) < log_patterns - least:
+        if length > SHORT and len(arrivals) * log(length / pattern.sum()) < log_patterns - least:
             continue
-        chance = _bound_log_chance(places, law, len(intervals)) + log_patterns
+        chance = _bound_log_chance(pattern, law, len(intervals)) + log_patterns
         if chance < least:
-            least, found = chance, places
+            least, found = chance, pattern
     return found
 
 
@@ -127,18 +127,18 @@ class BurstLossLaw(NamedTuple):
         return log_scale + (log(stay) if stay > 0 else -np.inf) - count * log_z
 
 
-def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, count: int) -> float:
-    """Return an upper bound of the log probability that losses in bursts let nothing arrive outside these places.
+def _bound_log_chance(pattern: Bool[np.ndarray, " length"], law: BurstLossLaw, count: int) -> float:
+    """Return an upper bound of the log probability that losses in bursts let nothing arrive outside these rows.
 
     The row of an arrival, modulo the pattern's length, is a Markov chain. The probability that N moves all end in
-    `places` is at most the largest row sum of M^N, where M holds the probabilities of moves between these places.
+    `pattern` is at most the largest row sum of M^N, where M holds the probabilities of moves between these rows.
 
     Args:
-        places: which rows of the pattern are due.
+        pattern: which rows of the pattern are due.
         law: the distribution of the intervals between arrivals.
         count: N, how many intervals were seen.
     """
-    length = len(places)
+    length = len(pattern)
     # P(interval = 1) = follows, and P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ... The
     # intervals k, k + length, ... are the same move, whose probability is a geometric series of (1 - ends)^length.
     interval = np.arange(2, length + 2)
@@ -146,7 +146,7 @@ def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, co
     series = 1 / (1 - (1 - law.ends) ** length)
     move_probabilities[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) * series
     move_probabilities[1 % length] += law.follows
-    due_rows = np.flatnonzero(places)
+    due_rows = np.flatnonzero(pattern)
     moves = (due_rows[None, :] - due_rows[:, None]) % length  # from each due row to each
     return _compute_log_row_sum(move_probabilities[moves], count)
 

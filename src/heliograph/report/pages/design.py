@@ -133,11 +133,11 @@ def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figu
     names = [name for name in after if name in largest_names]
     figure = Figure(figsize=(WIDTH, 0.9 + 0.28 * len(names)), layout="constrained")
     axes = figure.subplots()
-    places = np.arange(len(names))[::-1]
-    axes.barh(places, [after[name] for name in names], height=0.55, color=BLUE, label="designed")
-    axes.plot([before.get(name, np.nan) for name in names], places, "|", color=VERMILION, markersize=13,
+    heights = np.arange(len(names))[::-1]
+    axes.barh(heights, [after[name] for name in names], height=0.55, color=BLUE, label="designed")
+    axes.plot([before.get(name, np.nan) for name in names], heights, "|", color=VERMILION, markersize=13,
               markeredgewidth=2.2, label="as it is")  # fmt: skip
-    axes.set_yticks(places, [quote_for_figure(name) for name in names])
+    axes.set_yticks(heights, [quote_for_figure(name) for name in names])
     largest = max(np.nanmax([values.get(name, np.nan) for name in names]) for values in (before, after))
     axes.set(xlabel="mean power", xlim=(0, 1.05 * (largest or 1.0)))
     axes.grid(visible=False, axis="y")

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoted_text import quote_for_figure, visible
-from heliograph.learning.estimate_table import Row
-from heliograph.learning.fitting import Fit
+from heliograph.learning.estimate_row import Row
+from heliograph.learning.fit_result import Fit
 from heliograph.learning.held_out_comparison import HeldOutTransforms, PredictionBeforeAndAfter
 from heliograph.learning.packet_losses.learn_losses import Losses
 from heliograph.report.figures import (

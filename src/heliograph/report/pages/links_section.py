@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.model.checks.refusal_reasons import WORDS
 from heliograph.report.diagnosis.arrivals import Arrivals
-from heliograph.report.diagnosis.recording_diagnosis import Health
+from heliograph.report.diagnosis.health import Health
 from heliograph.report.diagnosis.sensor_output_health import round_to
 from heliograph.report.figures import BLUE, VERMILION, WIDTH
 from heliograph.report.innovations_section import LOOK, MOST, label_time_axis, name_undrawn_figures

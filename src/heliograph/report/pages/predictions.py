@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 import heliograph
 from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.numerics.angles.angle import find_wraps, insert_gaps
-from heliograph.report.diagnosis.recording_diagnosis import Health
+from heliograph.report.diagnosis.health import Health
 from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
 from heliograph.report.innovations_section import (
     BAND,

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoted_text import visible
 from heliograph.numerics.check import instance
 from heliograph.numerics.times.dates import format_times
-from heliograph.report.diagnosis.recording_diagnosis import Health
+from heliograph.report.diagnosis.health import Health
 from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
 from heliograph.report.forecast_figures import draw_forecasts, make_forecast_tables

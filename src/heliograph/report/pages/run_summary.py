@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.numerics.check import instance
 from heliograph.report.diagnosis.arrivals import Arrivals
-from heliograph.report.diagnosis.recording_diagnosis import FilterHealth, Health
+from heliograph.report.diagnosis.health import FilterHealth, Health
 from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, summarise_output
 from heliograph.report.results_folder import Json
 from heliograph.simulation.results.record import Record

@@ -4,7 +4,7 @@ import asyncio
 import threading
 import time
 
-from heliograph.files.topic_inspection import TopicStatistics, note_payload
+from heliograph.files.topic_statistics import TopicStatistics, note_payload
 from heliograph.numerics.check import fail
 from heliograph.serving.brokers.broker_address import Address
 

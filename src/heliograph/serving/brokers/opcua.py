@@ -14,7 +14,7 @@ from asyncua import Client, Node, ua
 from asyncua.common.subscription import DataChangeNotif
 from asyncua.ua.uaerrors import UaError
 
-from heliograph.files.topic_inspection import TopicStatistics, note_payload
+from heliograph.files.topic_statistics import TopicStatistics, note_payload
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, show_value, text
 from heliograph.serving.brokers.broker_address import Address, parse_address

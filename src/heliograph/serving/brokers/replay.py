@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.recording import Recording, read_recording_rows
-from heliograph.files.table import convert_to_columns
+from heliograph.files.recordings.recording import Recording, read_recording_rows
+from heliograph.files.tables.table import convert_to_columns
 from heliograph.live.event import INPUTS, Event
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import check_seed, fail, file_path, instance, items, scalar

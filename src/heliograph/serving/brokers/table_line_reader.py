@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.csv_columns import CsvColumnReader
 from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, make_message_of_row
 from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, HeliographMessageReader
-from heliograph.files.recording import RowReader
-from heliograph.files.recording_rows import RecordingRows, join_recording_rows
+from heliograph.files.recordings.recording import RowReader
+from heliograph.files.recordings.recording_rows import RecordingRows, join_recording_rows
 from heliograph.files.sources.message_reading import Reading, Unread
+from heliograph.files.tables.csv_columns import CsvColumnReader
 from heliograph.files.text.csv_dialects import COMMENTS, guess_names_in_header
 from heliograph.files.text.csv_text import ANNOTATIONS, CsvReader, CsvRow
 from heliograph.model.plant import TIME_STEP

@@ -7,17 +7,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from heliograph.files.recording_cells import RowRefusals, list_received_columns, list_truth_columns, read_cells
-from heliograph.files.recording_rows import (
+from heliograph.files.recordings.recording_cells import (
+    RowRefusals,
+    list_received_columns,
+    list_truth_columns,
+    read_cells,
+)
+from heliograph.files.recordings.recording_rows import (
     RecordingRows,
     RowsWithMissing,
     insert_missing_rows,
     join_recording_rows,
     order_rows,
 )
-from heliograph.files.table import TIME, convert_to_columns, read_rows, write_table
-from heliograph.files.table_rows import TableRows
-from heliograph.files.table_writer import predict_name_read_back
+from heliograph.files.tables.table import TIME, convert_to_columns, read_rows, write_table
+from heliograph.files.tables.table_rows import TableRows
+from heliograph.files.tables.table_writer import predict_name_read_back
 from heliograph.model.checks.plant_inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance

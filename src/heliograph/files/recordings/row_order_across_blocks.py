@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.recording_rows import RecordingRows
-from heliograph.files.table import TIME
+from heliograph.files.recordings.recording_rows import RecordingRows
+from heliograph.files.tables.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.row_times import backwards_text, find_backwards_row

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.table_rows import EXACT, TableRows, find_missing
+from heliograph.files.tables.table_rows import EXACT, TableRows, find_missing
 from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import CsvReader, CsvRow, parse_cell
 from heliograph.files.text.numeric_csv_lines import parse_numeric_lines

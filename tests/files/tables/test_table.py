@@ -11,12 +11,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import heliograph.files.table
+import heliograph.files.tables.table
 from heliograph.disk import check_folder_writable, check_writable, name_path_in_errors
-from heliograph.files.table import read_table, write_table
+from heliograph.files.tables.table import read_table, write_table
 
 MISSING = np.iinfo(np.int64).min  # in a column of whole numbers
-convert_to_columns, read_rows = heliograph.files.table.convert_to_columns, heliograph.files.table.read_rows
+convert_to_columns, read_rows = (
+    heliograph.files.tables.table.convert_to_columns,
+    heliograph.files.tables.table.read_rows,
+)
 
 COLUMNS = {
     "time": np.array([0.0, 0.1, 1e-300]),
@@ -235,7 +238,7 @@ def test_interrupted_writing_leaves_what_was_there(tmp_path, monkeypatch, name, 
 
 
 def test_error_between_rows_leaves_nothing(tmp_path, monkeypatch):
-    format_cells = heliograph.files.table_writer._format_cells
+    format_cells = heliograph.files.tables.table_writer._format_cells
 
     def breaks_at_the_end(column):
         if column[-1] == 99_999:
@@ -243,7 +246,7 @@ def test_error_between_rows_leaves_nothing(tmp_path, monkeypatch):
             raise RuntimeError("between rows")
         return format_cells(column)
 
-    monkeypatch.setattr("heliograph.files.table_writer._format_cells", breaks_at_the_end)
+    monkeypatch.setattr("heliograph.files.tables.table_writer._format_cells", breaks_at_the_end)
     with pytest.raises(RuntimeError, match="between rows"):
         write_table({"time": np.arange(100_000.0)}, tmp_path / "out.csv")
     assert not list(tmp_path.iterdir())
@@ -295,7 +298,7 @@ def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("heliograph.files.table_writer._write_csv_rows", full)
+    monkeypatch.setattr("heliograph.files.tables.table_writer._write_csv_rows", full)
     with pytest.raises(OSError, match="No space left on device") as caught:
         write_table(COLUMNS, tmp_path / "out.csv")
     assert caught.value.filename == str(tmp_path / "out.csv") and not list(tmp_path.iterdir())

@@ -1,15 +1,13 @@
-"""Events of a recording as arrays, and the verdicts on them that a timeline gives to one event after another."""
+"""Events of one node in columns: times, arrivals, running counts and values, and what is doubtful about them."""
 
 from array import array
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from heliograph.files.sources.message_reading import Unread
-from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.health.link_counts import GAP
 from heliograph.model.checks.refusal_reasons import Reason, RefusedError
 from heliograph.numerics.check import fail
@@ -18,7 +16,6 @@ from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
 FEWEST_FALLS = 3  # of a count from one number, before that is taken for its largest
 
 
@@ -184,107 +181,6 @@ class NodeEvents:
         self.unread += zip(moments[unset].tolist(), sequence[unset].tolist(), strict=True)
 
 
-class EventsByArrival(NamedTuple):
-    """Events in order of arrival, (events,) each: node (-1: inputs), time, arrival, count, index among its node's."""
-
-    node: np.ndarray
-    time: np.ndarray
-    arrival: np.ndarray
-    sequence: np.ndarray
-    place: np.ndarray
-
-    def select(self, which: np.ndarray) -> "EventsByArrival":
-        """Return some of the events, by number or by mask."""
-        return EventsByArrival(*(column[which] for column in self))
-
-
-def judge_events(
-    events: EventsByArrival,
-    values: Callable[[int], np.ndarray],
-    joint: bool,
-    window: float,
-    ahead: float,
-) -> Int[np.ndarray, " events"]:
-    """Return the number of the verdict on each event, among `VERDICTS`: the first that holds.
-
-    An event is a node's message, with time, arrival and running count; all events of a time, or one alone, make a row.
-    It is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was final
-    before it came: at each arrival the rows older than that by more than the window become final. Of events of one
-    node, count and time the first is used; if rows are joint, so are the first values of a node at a time.
-
-    Args:
-        events: the events, in order of arrival.
-        values: a function that returns the values of an event from its number in that order.
-        joint: whether all events of one time are one row.
-        window: how late an event may be, in the unit of the times.
-        ahead: how much later than its arrival the time of an event may be.
-    """
-    verdicts = np.full(len(events.time), USED)
-    verdicts[events.time > events.arrival + ahead] = FUTURE
-    # The events that are not in the future, and a number for each node, time and count that occurs among them: its
-    # identity. Identities are in order of time; of one time inputs come first, as node -1, then nodes and counts.
-    candidates = np.flatnonzero(verdicts != FUTURE)
-    some = events.select(candidates)
-    identity = _rank_rows(some.time, some.node, some.sequence)
-    # The number of the row that each belongs to, in order of time: that of its time, or one of its own.
-    row = _rank_rows(some.time) if joint else identity
-    # Late: the row was final before the event came. If that is the newest final row and not joint, an event of the
-    # same identity made it: this one is a copy, and judged as such.
-    newest_final = _find_newest_final_row(some, row, window)
-    is_late = row <= newest_final if joint else row < newest_final
-    verdicts[candidates[is_late]] = LATE
-    # Events that may take each other's place: of one node in one row. Most are alone there, and stay used.
-    place = _rank_rows(some.time, some.node) if joint else identity
-    has_rivals: Bool[np.ndarray, " places"] = np.bincount(place, minlength=1) > 1
-    contenders = np.flatnonzero(has_rivals[place] & (row >= newest_final))
-    _judge_repeated_events(verdicts, candidates[contenders], identity[contenders], place[contenders], values, joint)
-    return verdicts
-
-
-def _judge_repeated_events(
-    verdicts: Int[np.ndarray, " events"],
-    numbers: np.ndarray,
-    identities: np.ndarray,
-    places: np.ndarray,
-    values: Callable[[int], np.ndarray],
-    joint: bool,
-) -> None:
-    """Write the verdicts on copies, and on second values of a node in a joint row: the first event stays.
-
-    Args:
-        verdicts: verdicts on all events, such as USED, changed here to DUPLICATE (same values) or CONFLICT (others).
-        numbers: numbers of the events to judge, in order of arrival.
-        identities: for each, a number for its node, time and count; later events of one identity are repetitions.
-        places: for each, a number that stands for its row and node if rows are joint, else its identity.
-        values: the values of the event with a number.
-        joint: whether all events of one time are one row.
-    """
-    first_of_identity = dict[int, int]()  # the number of the first event of each identity, which stays
-    filled = dict[int, np.ndarray]()  # by place the mask of the components that have a value
-    for event, identity, place in zip(numbers.tolist(), identities.tolist(), places.tolist(), strict=True):
-        if identity in first_of_identity:
-            is_same = np.array_equal(values(event), values(first_of_identity[identity]), equal_nan=True)
-            verdicts[event] = DUPLICATE if is_same else CONFLICT
-        elif verdicts[event] == USED:
-            present = ~np.isnan(values(event))
-            filled_before = filled.get(place, np.zeros_like(present))
-            if joint and np.any(present & filled_before):  # a second value of a component in its row
-                verdicts[event] = CONFLICT
-            else:
-                first_of_identity[identity] = event
-                filled[place] = present | filled_before
-
-
-def count_verdicts(
-    node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]
-) -> dict[int, dict[Verdict, int]]:
-    """Return {node: {verdict: count of its events}}; `verdicts` holds for each event an index into VERDICTS."""
-    return {
-        int(number): {verdict: int(np.sum(verdicts[node == number] == i)) for i, verdict in enumerate(VERDICTS)}
-        for number in np.unique(node)
-    }
-
-
 def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
     """Return how many running counts are missing between a node's messages, which are sorted by their times.
 
@@ -300,100 +196,9 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
     return int(np.sum(np.maximum(advances - 1, 0)))
 
 
-def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return for each row how many equal rows come before it; row i consists of entry i of each column."""
-    ranks = _rank_rows(*columns)
-    order = np.argsort(ranks, kind="stable")
-    first_of_equals = np.searchsorted(ranks[order], ranks[order])  # place of the first equal row in this order
-    counts = np.empty(len(order), dtype=np.int64)
-    counts[order] = np.arange(len(order)) - first_of_equals
-    return counts
-
-
-def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return the rank of each row, sorted by the first column and then by the others; equal rows share a rank."""
-    order = np.lexsort(columns[::-1])  # lexsort takes the most important column last
-    differs_from_row_before = np.zeros(len(order), dtype=bool)
-    for column in columns:
-        differs_from_row_before[1:] |= column[order][1:] != column[order][:-1]
-    ranks = np.empty(len(order), dtype=np.int64)
-    ranks[order] = np.cumsum(differs_from_row_before)
-    return ranks
-
-
-def _find_newest_final_row(
-    events: EventsByArrival, rank: Int[np.ndarray, " events"], window: float
-) -> Int[np.ndarray, " events"]:
-    """Return for each event the rank of the newest row that is final when it comes, -1 if there is none.
-
-    `rank`: number of each event's row. An event of time t is final once another one arrives later than t + window.
-    """
-    count = len(rank)
-    if not np.isfinite(window):
-        return np.full(count, -1)
-    # Each event is final from this event on: the first after it whose watermark, arrival - window, is past its time.
-    watermark = events.arrival - window
-    final_from = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
-    newest_final = np.full(count + 1, -1)  # of the events that become final at each one, and then of all so far
-    np.maximum.at(newest_final, final_from, rank)
-    return np.maximum.accumulate(newest_final[:count])
-
-
 def node_counts_losses(network: Network, name: str) -> bool:
     """Return whether a node also receives a number on losses: how many transmissions were lost before its values."""
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False
     return node.trigger.side_information(len(node.outputs)) == 1  # numbers on losses that come after the values
-
-
-def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndarray, " events"], np.ndarray]:
-    """Return the number of the row of each event, from 0, and the times of the rows.
-
-    Args:
-        time: times of the events, in order, at least one.
-        steps: whether times are numbers of steps; every step is then a row, even without an event.
-        joint: whether all events of one time are one row.
-    """
-    if steps:
-        return time.astype(np.int64), np.arange(int(time[-1]) + 1)
-    begins_row = np.ones(len(time), dtype=bool)
-    begins_row[1:] = time[1:] != time[:-1] if joint else True
-    return np.cumsum(begins_row) - 1, time[begins_row]
-
-
-def place_values_in_rows(
-    values: Float[np.ndarray, "events size"], row: Int[np.ndarray, " events"], count: int
-) -> Float[np.ndarray, "rows size"]:
-    """Return a table (count, size) with the values of events in their rows, and NaN where no value arrived.
-
-    If a row has several events, each component takes its last value that is not NaN.
-    """
-    table = np.full((count, values.shape[1]), np.nan)
-    for i in range(values.shape[1]):
-        present = ~np.isnan(values[:, i])
-        table[row[present], i] = values[present, i]
-    return table
-
-
-def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
-    """Return each column with every NaN replaced by the last value before it, or by 0 if there is none."""
-    own_row = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])  # -1: no value in this row
-    last_row = np.maximum.accumulate(own_row, axis=0) if len(values) else own_row
-    return np.asarray(np.where(last_row < 0, 0.0, np.take_along_axis(values, np.maximum(last_row, 0), axis=0)))
-
-
-def make_inputs_leading_to_rows(
-    held: Float[np.ndarray, "rows given"], times: np.ndarray, unit: int, place: int
-) -> Float[np.ndarray, "rows inputs"]:
-    """Return the inputs that lead to each row in continuous time: the previous row's inputs, and the time since it.
-
-    Args:
-        held: inputs that were set last, at each row; before the first row they are 0.
-        times: times of the rows, in whole parts of the unit of time, such as nanoseconds.
-        unit: how many of these parts are one unit of time.
-        place: index among the inputs of dt, the time since the previous row.
-    """
-    inputs_of_row_before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
-    dt = np.diff(times, prepend=times[:1]) / unit
-    return np.insert(inputs_of_row_before, place, dt, axis=1)

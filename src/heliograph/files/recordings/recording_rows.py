@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.table import TIME
+from heliograph.files.tables.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.row_times import find_backwards_row

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.event_columns import count_missing_messages
+from heliograph.files.events.event_columns import count_missing_messages
 from heliograph.files.sources.message_reading import Reading
 
 MOVING = hg.Plant(lambda x, u: x, lambda u: 0.1 * u[:1, None], [0.0], 1.0, states=["x"], inputs=["dt"])

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.block_size import USUAL_BLOCK, BlockSize
-from heliograph.files.recording import Recording, RowReader
-from heliograph.files.recording_rows import RecordingRows, join_recording_rows, lacks_second_row
-from heliograph.files.row_order_across_blocks import BlockOrderCheck
-from heliograph.files.table import read_row_blocks
-from heliograph.files.table_rows import TableRows
+from heliograph.files.recordings.recording import Recording, RowReader
+from heliograph.files.recordings.recording_rows import RecordingRows, join_recording_rows, lacks_second_row
+from heliograph.files.recordings.row_order_across_blocks import BlockOrderCheck
+from heliograph.files.tables.block_size import USUAL_BLOCK, BlockSize
+from heliograph.files.tables.table import read_row_blocks
+from heliograph.files.tables.table_rows import TableRows
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network

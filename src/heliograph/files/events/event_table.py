@@ -5,20 +5,21 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from heliograph.files.event_columns import (
+from heliograph.files.events.event_columns import NodeEvents, node_counts_losses
+from heliograph.files.events.event_rows import (
+    fill_forward,
+    make_inputs_leading_to_rows,
+    number_rows,
+    put_values_in_rows,
+)
+from heliograph.files.events.event_verdicts import (
     USED,
     EventsByArrival,
-    NodeEvents,
-    count_equal_rows_before,
     count_verdicts,
-    fill_forward,
     judge_events,
-    make_inputs_leading_to_rows,
-    node_counts_losses,
-    number_rows,
-    place_values_in_rows,
+    sort_by_arrival,
 )
-from heliograph.files.recording import Recording
+from heliograph.files.recordings.recording import Recording
 from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.learning.packet_losses.delay_law import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
@@ -234,9 +235,9 @@ class EventTable:
         """Yield events in order of arrival; times are seconds from the origin, steps, or numbers as they are."""
         events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
-        # `place` is the index among the node's events. The times are integers, so that their differences are exact.
-        for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
-            values = matrices[node][place]
+        # `event_index` counts the node's events. The times are integers, so that their differences are exact.
+        for node, time, arrival, sequence, event_index in zip(*(column.tolist() for column in events), strict=True):
+            values = matrices[node][event_index]
             yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
@@ -294,7 +295,7 @@ class EventTable:
         events, verdicts = self._judge_events(window, ahead)
         counts = {}
         for node, name, matrix in self._number_value_matrices():
-            used = events.place[(events.node == node) & (verdicts == USED)]
+            used = events.event_index[(events.node == node) & (verdicts == USED)]
             counts[name] = int(np.sum(np.isnan(matrix[used]).all(axis=1)))
         return counts
 
@@ -350,7 +351,7 @@ class EventTable:
         tables = {}
         for node, name, matrix in self._number_value_matrices():
             of_node = events.node == node
-            table = tables[name] = place_values_in_rows(matrix[events.place[of_node]], row[of_node], count)
+            table = tables[name] = put_values_in_rows(matrix[events.event_index[of_node]], row[of_node], count)
             if node >= 0 and node_counts_losses(self.network, name):
                 self.columns[name].write_losses_before_events(table, row[of_node], events.sequence[of_node])
         return tables
@@ -370,31 +371,12 @@ class EventTable:
         return zip((*range(len(names) - 1), -1), names, self._list_value_matrices(), strict=True)
 
     def _sort_by_arrival(self) -> EventsByArrival:
-        """Return the events in order of arrival; those without a count are told apart by their order at a time."""
-        parts = []
-        for node, name in enumerate((INPUTS, *self.network.names), -1):
-            time, arrival, sequence = self.columns[name].arrays()
-            parts.append(EventsByArrival(np.full(len(time), node), time, arrival, sequence, np.arange(len(time))))
-        events = EventsByArrival(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-        if not len(events.time):
-            raise fail("events", "at least one", "none")
-        events = events.select(np.lexsort((events.place, events.arrival)))
-        uncounted = events.sequence < 0
-        events.sequence[uncounted] = count_equal_rows_before(events.node[uncounted], events.time[uncounted])
-        # Moments to the nearest step from the first.
-        if self.step is None:
-            return events
-        first, half = self._find_first_moment(), self.step // 2
-        time, arrival = ((moments - first + half) // self.step for moments in (events.time, events.arrival))
-        return events._replace(time=time, arrival=arrival)
+        """Return the events in order of arrival; where steps have a length, times are the nearest steps."""
+        events = sort_by_arrival(self.columns)
+        return events if self.step is None else events.convert_to_steps(self._find_first_moment(), self.step)
 
     def _judge_events(self, window: float, ahead: float) -> tuple[EventsByArrival, Int[np.ndarray, " events"]]:
         """Return the events in order of arrival, and what a timeline with these limits would do with each."""
-        events, matrices = self._sort_by_arrival(), self._list_value_matrices()
-
-        def values(i: int) -> np.ndarray:
-            """Return the values of the event with number i."""
-            return np.asarray(matrices[events.node[i]][events.place[i]])
-
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
-        return events, judge_events(events, values, self._are_rows_joint, *limits)
+        events = self._sort_by_arrival()
+        return events, judge_events(events, self._list_value_matrices(), self._are_rows_joint, *limits)

@@ -6,9 +6,9 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from heliograph.files.recording_rows import RecordingRows
-from heliograph.files.table import TIME
-from heliograph.files.table_rows import convert_to_doubles, find_missing
+from heliograph.files.recordings.recording_rows import RecordingRows
+from heliograph.files.tables.table import TIME
+from heliograph.files.tables.table_rows import convert_to_doubles, find_missing
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network

@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import heliograph.files.table
+import heliograph.files.tables.table
 
-tables = heliograph.files.table
+tables = heliograph.files.tables.table
 
 TEXTS = {
     "plain": "time,a,b\n0,1,2\n1,,3\n2,4,\n3,,\n4,5e-3,-6\n",

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from heliograph.disk.atomic_files import FORMATS, format_of
-from heliograph.files.block_size import USUAL_BLOCK, BlockSize
-from heliograph.files.csv_columns import read_csv_blocks
-from heliograph.files.parquet_columns import convert_integers_of_arrow, read_parquet_blocks
-from heliograph.files.table_rows import (
+from heliograph.files.tables.block_size import USUAL_BLOCK, BlockSize
+from heliograph.files.tables.csv_columns import read_csv_blocks
+from heliograph.files.tables.parquet_columns import convert_integers_of_arrow, read_parquet_blocks
+from heliograph.files.tables.table_rows import (
     EXACT,
     TableRows,
     convert_to_doubles,
@@ -20,7 +20,7 @@ from heliograph.files.table_rows import (
     find_missing,
     join_rows,
 )
-from heliograph.files.table_writer import open_table
+from heliograph.files.tables.table_writer import open_table
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress, find_extension
 from heliograph.numerics.check import fail, file_path, show_value, table

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heliograph.files.table_rows import TableRows, convert_to_nanoseconds, convert_to_numbers
+from heliograph.files.tables.table_rows import TableRows, convert_to_nanoseconds, convert_to_numbers
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import fail

@@ -1,0 +1,118 @@
+"""Climbs of a log-likelihood, from several starts side by side: where they are, and which go to the same top."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.types import Bool, Float
+
+NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
+JOINED = 0.1  # standard errors between two climbs to one top, and of either from it
+BENT = 0.5  # of the information between two such climbs, that the likelihood bends by at least
+ALIKE = 0.1  # of the gain between two such climbs, that their slopes may leave unexplained
+NEIGHBOURS = 1.0  # between logarithms or logits of two such climbs, whatever the information says
+
+Evaluated = tuple[Float[np.ndarray, " climbs"], Float[np.ndarray, "climbs p"], Float[np.ndarray, "climbs p p"]]
+Evaluate = Callable[[Float[np.ndarray, "climbs p"]], Evaluated]
+
+
+class OpenEnds(NamedTuple):
+    """Coordinates by which an end of a domain is at infinity.
+
+    A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
+    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
+    """
+
+    low: Bool[np.ndarray, " p"]
+    high: Bool[np.ndarray, " p"]
+    single: Bool[np.ndarray, " p"]
+
+    @staticmethod
+    def unbounded(count: int) -> "OpenEnds":
+        """Return the domains of so many real numbers, without ends."""
+        none = np.zeros(count, dtype=bool)
+        return OpenEnds(none, none, none)
+
+    @property
+    def free(self) -> Bool[np.ndarray, " p"]:
+        """Coordinates that are real numbers (no logarithm or logit): they end nowhere, and their scale is unknown."""
+        return np.asarray(~(self.low | self.high))
+
+
+class ClimbEnds(NamedTuple):
+    """Ends of the searches, one a climb.
+
+    x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
+    steps: number of steps that were taken. Shapes: x, gradient (climbs, p), total, converged, remaining (climbs,).
+    """
+
+    x: Float[np.ndarray, "climbs p"]
+    total: Float[np.ndarray, " climbs"]
+    gradient: Float[np.ndarray, "climbs p"]
+    converged: Bool[np.ndarray, " climbs"]
+    remaining: Float[np.ndarray, " climbs"]
+    steps: int
+
+    @property
+    def order(self) -> np.ndarray:
+        """Climbs from the highest likelihood to the lowest."""
+        return np.argsort(-np.nan_to_num(self.total, nan=-np.inf), kind="stable")
+
+
+class Climbs(NamedTuple):
+    """Climbs (searches side by side) between two steps.
+
+    x: points (climbs, p). total: log-likelihood l there (climbs,), gradient (climbs, p), information I (climbs, p, p).
+    model: B, a model of minus the Hessian of l (climbs, p, p). radius: of the trust region (climbs,). remaining: what a
+    full step would gain, g' I^-1 g / 2. done: climbs that go no further. joined: the climb that each joined, or itself.
+    """
+
+    x: np.ndarray
+    total: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
+    model: np.ndarray
+    radius: np.ndarray
+    remaining: np.ndarray
+    done: np.ndarray
+    converged: np.ndarray
+    joined: np.ndarray
+
+    def ends(self, steps: int) -> ClimbEnds:
+        """Return where the climbs (searches side by side) are after `steps` steps; `joined`: the climb each joined."""
+        climb = self.joined
+        for _ in range(len(climb)):  # a climb may join one that joins a third
+            climb = climb[climb]
+        x, total, gradient = self.x[climb], self.total[climb], self.gradient[climb]
+        return ClimbEnds(x, total, gradient, self.converged[climb], self.remaining[climb], steps)
+
+
+def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
+    """Return the state in which each climb a is ended that goes to the same top as a higher climb b.
+
+    Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
+    information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
+    x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
+    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (climbs, p). `domains`: which are plain real numbers.
+    """
+    climbs, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
+    d = state.x[None, :] - state.x[:, None]  # [a, b]: from climb a to climb b, (a, b, p)
+    # d' I d: the greater of the two values by the information of a and of b; `squared` [c, a, b] uses I of climb c.
+    squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
+    distance = np.maximum(squared[climbs, climbs, :], squared[climbs, :, climbs].T)
+    # [a, b]: l_b - l_a; the same if l were quadratic; and the fall of the slope, (g_a - g_b)' d.
+    gain = state.total[None] - state.total[:, None]
+    gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
+    slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
+    near_top = (2 * state.remaining < JOINED**2) & (state.joined == climbs)  # 2 * remaining: distance squared
+    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
+    neighbours &= np.all(moving[:, None] == moving[None], axis=2)
+    is_quadratic = np.abs(gain - gain_of_quadratic) <= ALIKE * gain + NOISE * np.abs(state.total)
+    no_saddle = is_quadratic & (slope_fall >= BENT * distance)
+    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
+    # [a, b] is true where b goes on: the higher one, of two that are as high the first.
+    is_higher = same_top & ((gain > 0) | ((gain == 0) & (climbs[None] < climbs[:, None])))
+    joins = ~state.done & np.any(is_higher, axis=1)
+    best = np.argmax(np.where(is_higher, state.total[None], -np.inf), axis=1)
+    return state._replace(joined=np.where(joins, best, state.joined), done=state.done | joins)
