@@ -76,11 +76,11 @@ def event_filter(
     described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
-    loses = any(_may_lose_components(step) for step in steps)
+    may_lose = any(_may_lose_components(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
     fields_of_both: dict[str, Any] = {  # of the filter of a random trigger, and of that of a threshold
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
-        "loses": loses, "outputs": outputs,
+        "may_lose": may_lose, "outputs": outputs,
     }  # fmt: skip
     # A random trigger: one Gaussian is enough. The claim rests on the laws of noises, not on their moments alone.
     premise = Premise(plant, sensor, channel, trigger, order=None)
@@ -92,12 +92,12 @@ def event_filter(
     # A threshold: a sum of Gaussians, by the value with which the sender compares. Ages of that value are counted up to
     # the heartbeat.
     filter = EventFilter(
-        trigger=_check_threshold_rule(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
-        known=known,
-        lost=lost,
-        delivers=all(_delivers_y_unchanged(step) for step in steps),
-        alike=all(_has_same_law_in_every_mode(step) for step in steps),
-        ages=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
+        trigger=_check_threshold_rule(trigger, lost if may_lose else None, outputs, first(channel).outputs, steps),
+        pieces=known,
+        lost_references=lost,
+        delivers_signal=all(_delivers_y_unchanged(step) for step in steps),
+        same_law_in_modes=all(_has_same_law_in_every_mode(step) for step in steps),
+        age_count=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
         **fields_of_both,
         **make_sizes("nominal", start, received),
     )
