@@ -212,9 +212,9 @@ class OpenLoop(AbstractGaussianStateFilter):
 
     @property
     def attitude(self) -> Angles:
-        """Return the places of the plant's attitudes, which it turns."""
-        places: Angles = first(self.plant).manifold.rotations
-        return places
+        """Return the indices of the plant's attitudes, which it turns."""
+        indices: Angles = first(self.plant).manifold.rotations
+        return indices
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:

@@ -231,7 +231,7 @@ def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
             tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count
         ),
         senders=np.arange(count)[None],  # numbered among the members
-        places=((0,),),
+        indices=((0,),),
         nodes=names,
         alpha=None,
         quantizer=None,
