@@ -12,11 +12,11 @@ from heliograph.filters.words.bit_likelihoods import is_free_of_flips, make_link
 from heliograph.filters.words.two_hypothesis_filter import make_two_hypotheses_filter
 from heliograph.filters.words.word_filter import WordFilter
 from heliograph.filters.wrappers.late_data import late_filter
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, read_first_plant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
 from heliograph.model.words.encoder import Dither, Words
 from heliograph.model.words.word_channel import FLAG, find_carried_components, rewrite_about_centres
@@ -157,4 +157,4 @@ def word_filter(
         **make_sizes("nominal", start, len(indices) + dithers),
     )
     filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else make_two_hypotheses_filter(one_gaussian)
-    return with_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))
+    return with_assumed(filter, AssumedModel(plant, sensor, channel, encoder=encoder, order=None))
