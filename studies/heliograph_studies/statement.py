@@ -88,9 +88,9 @@ def unless_empty(says_something: bool | np.bool) -> Verdict:
     return "holds" if says_something else "holds_vacuously"
 
 
-def if_applies(premise: bool | np.bool, condition: bool | np.bool) -> Verdict:
-    """ "holds" or "fails" where the premise is met, else "does_not_apply"."""
-    return holds(condition) if premise else "does_not_apply"
+def if_applies(assumed: bool | np.bool, condition: bool | np.bool) -> Verdict:
+    """ "holds" or "fails" where the assumed model is met, else "does_not_apply"."""
+    return holds(condition) if assumed else "does_not_apply"
 
 
 def vacuous(condition: bool | np.bool, anyway: bool | np.bool) -> Verdict:

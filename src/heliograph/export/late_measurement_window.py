@@ -66,11 +66,11 @@ def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
     expected = f"no part that goes by steps where the plant's time does not (its input {TIME_STEP!r})"
     if filter.horizon is not None:
         raise fail("window", expected, f"one that covers {filter.horizon} steps")
-    premise = filter.premise
-    if premise is not None:
-        if what := find_indivisible_part(premise.plant, premise.sensor, premise.channel, premise.trigger):
+    assumed = filter.assumed
+    if assumed is not None:
+        if what := find_indivisible_part(assumed.plant, assumed.sensor, assumed.channel, assumed.trigger):
             raise fail("window", expected, what)
-        if what := explain_uneven_prediction(first(premise.plant), filter.inputs.index(TIME_STEP)):
+        if what := explain_uneven_prediction(first(assumed.plant), filter.inputs.index(TIME_STEP)):
             warnings.warn(f"window: predictions depend on what comes late: {what}", stacklevel=4)
     return count
 

@@ -54,11 +54,11 @@ def _find_noise_deviations(filter: AbstractFilter) -> np.ndarray | None:
     The noise of z is M v + n: the sensor's noise v times the link's mean gain M, and the link's own noise n. A filter
     of which no sensor is known, or whose noise depends on the inputs, says none.
     """
-    premise = filter.premise
-    sensor = None if premise is None or premise.sensor is None else first(premise.sensor)
-    if premise is None or sensor is None or not isinstance(sensor.noise, AbstractNoise):
+    assumed = filter.assumed
+    sensor = None if assumed is None or assumed.sensor is None else first(assumed.sensor)
+    if assumed is None or sensor is None or not isinstance(sensor.noise, AbstractNoise):
         return None
-    noise, link = np.asarray(sensor.noise.covariance), premise.channel and first(premise.channel)
+    noise, link = np.asarray(sensor.noise.covariance), assumed.channel and first(assumed.channel)
     variances: np.ndarray = np.diagonal(noise)
     if isinstance(link, AbstractRandomAffine):
         try:

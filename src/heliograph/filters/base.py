@@ -20,10 +20,10 @@ from heliograph.filters.rows.run_over_data import Filtered, run_over_data, scan_
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector_check import check_vector
+from heliograph.model.assumed.assumed_model import NOTHING, AssumedModel, StaticAssumedModel, believes
 from heliograph.model.checks.plant_inputs import check_time_step, do_inputs_spoil
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
-from heliograph.model.premises.premise import NOTHING, Premise, StaticPremise, believes
 from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
@@ -63,14 +63,14 @@ class AbstractFilter(Module):
         states: names of the states that are estimated, n of them.
         inputs: names of the inputs that `predict` takes.
         received: length of the measurement z; 0 for a filter that uses none, and then z may have any length.
-        kept: the premise (the models that the claim is about), as `believes` keeps it; none where a filter has none.
+        kept: the assumed model, which the claim is about, as `believes` keeps it; none where a filter has none.
     """
 
     claim: eqx.AbstractVar[Claim]
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
     received: eqx.AbstractVar[int]
-    kept: StaticPremise = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)
+    kept: StaticAssumedModel = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)
 
     if not TYPE_CHECKING:  # a type checker knows all attributes
 
@@ -276,9 +276,9 @@ class AbstractFilter(Module):
         return ()
 
     @property
-    def premise(self) -> Premise | None:
+    def assumed(self) -> AssumedModel | None:
         """Plant, sensor, channel and trigger under which the claim holds; None if the filter does not say."""
-        return self.kept.premise
+        return self.kept.assumed
 
     @property
     def of_atoms(self) -> bool:

@@ -161,8 +161,8 @@ def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSe
     Raises:
         ValueError: another filter.
     """
-    premise = filter.premise
-    plant, sensor = (None, None) if premise is None else (premise.plant, premise.sensor)
+    assumed = filter.assumed
+    plant, sensor = (None, None) if assumed is None else (assumed.plant, assumed.sensor)
     # A model that does not vary has arrays for matrices.
     if (
         filter.claim == "exact"

@@ -271,9 +271,9 @@ def make_multistep_predictor(
     Received numbers are not predicted if the filter receives none, or if it also uses that nothing arrives. Nor are
     they if z tells the mode: E[z] is found by a correction with zeros, which would stand for a mode.
     """
-    premise = filter.premise  # the models for which the filter was made
-    plant = plant if premise is None else premise.plant
-    sensor = sensor if premise is None or premise.sensor is None else premise.sensor
+    assumed = filter.assumed  # the models for which the filter was made
+    plant = plant if assumed is None else assumed.plant
+    sensor = sensor if assumed is None or assumed.sensor is None else assumed.sensor
     has_flag_in_z = isinstance(filter, SideInformationFilter) and filter.flagged
     receives_mode = isinstance(filter, ModeObservedFilter) or has_flag_in_z
     transform = getattr(filter, "transform", None)
@@ -293,8 +293,8 @@ def _find_received_noise(filter: AbstractFilter) -> ReceivedNoise | OverTime | N
     Return None if neither has outliers, or if they cannot be separated from the rest of z: the sensor depends on modes
     or inputs, or the channel mixes the noises of several outputs, delays them, or reports more numbers after them.
     """
-    premise = filter.premise  # the models for which the filter was made
-    sensor, channel = (None, None) if premise is None else (premise.sensor, premise.channel)
+    assumed = filter.assumed  # the models for which the filter was made
+    sensor, channel = (None, None) if assumed is None else (assumed.sensor, assumed.channel)
     if sensor is None or channel is None or memories(sensor):
         return None
     link, sensor_noise = first(channel), first(sensor).noise

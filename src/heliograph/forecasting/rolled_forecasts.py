@@ -31,11 +31,11 @@ def roll_forecasts(
 
 
 def _forecast_from_each_row(
-    predictor: MultistepPredictor, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
+    predictor: MultistepPredictor, z: jax.Array, u: jax.Array, windows: jax.Array, indices: jax.Array
 ) -> PyTree:
     """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 
-    They are (rows, places, K, ...), of mixtures of K parts, with variances in place of covariances. A backtest scores
+    They are (rows, indices, K, ...), of mixtures of K parts, with variances in place of covariances. A backtest scores
     them by the later rows.
 
     Args:
@@ -43,16 +43,16 @@ def _forecast_from_each_row(
         z: measurements (rows, received).
         u: inputs (rows, inputs).
         windows: inputs of the rows ahead of each row (rows, ahead, inputs).
-        places: which of the rows ahead are returned, from 0.
+        indices: which of the rows ahead are returned, from 0.
     """
     filter, length = predictor.filter, windows.shape[1]
 
     def select(moments: Moments | None) -> PyTree:
-        """Return the moments at `places` (the horizons among all rows ahead), with variances instead of covariances."""
+        """Return the moments at `indices` (the horizons among all rows ahead), variances for covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
-        return jax.tree.map(lambda leaf: leaf[places], moments._replace(covariances=variances))
+        return jax.tree.map(lambda leaf: leaf[indices], moments._replace(covariances=variances))
 
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the filter's state after row k, and the moments that it forecasts from there.

@@ -107,7 +107,7 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
         The fused mean and covariance, with the claim (exact, upper bound or nominal) that the rule gives them.
 
     Raises:
-        ValueError: no estimates, estimates of different state dimensions, angles that are no places in the state.
+        ValueError: no estimates, estimates of different state dimensions, angles that are no indices in the state.
 
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
@@ -119,14 +119,14 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     rule.check(len(estimates))
     # Angles within half a turn of those of the first estimate.
     means = np.stack([np.asarray(fill_masked(e.mean)) for e in estimates], axis=-2)
-    places, attitude = read_manifold(angles, means.shape[-1])
+    indices, attitude = read_manifold(angles, means.shape[-1])
     if attitude or any(estimate.attitude for estimate in estimates):
         raise fail("fusion", "estimates without attitudes", [estimate.attitude or attitude for estimate in estimates])
-    means = wrap_near(means, means[..., :1, :], places)
+    means = wrap_near(means, means[..., :1, :], indices)
     # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(fill_masked(e.covariance)) for e in estimates], axis=-3)
     mean, covariance = _combine_all(rule, means, covariances)
-    return Estimate(wrap_angles(np.asarray(mean), places), covariance, rule.claim([e.claim for e in estimates]))
+    return Estimate(wrap_angles(np.asarray(mean), indices), covariance, rule.claim([e.claim for e in estimates]))
 
 
 @compile_on_call

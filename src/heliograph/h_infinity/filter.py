@@ -10,10 +10,10 @@ import numpy as np
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.error_system import GrowthSystem
+from heliograph.model.assumed.assumed_model import WITHOUT_ATTITUDE
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import WITHOUT_ATTITUDE
 from heliograph.model.sensor import AnySensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.float64 import in_float64

@@ -196,6 +196,6 @@ def _place_in_upper_triangles(
     *leading, rows, columns = triangle_indices = np.nonzero(np.triu(np.ones(shape)))
     mirrored_indices = *leading, columns, rows
     count = len(rows)
-    places = np.empty(shape, dtype=int)
-    places[triangle_indices] = places[mirrored_indices] = np.arange(count)
-    return places, triangle_indices, np.eye(count)[:, places]
+    indices = np.empty(shape, dtype=int)
+    indices[triangle_indices] = indices[mirrored_indices] = np.arange(count)
+    return indices, triangle_indices, np.eye(count)[:, indices]

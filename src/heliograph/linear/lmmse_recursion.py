@@ -9,8 +9,8 @@ from heliograph.factors.covariance_factors import rounding_of
 from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last_step
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.estimate import Claim, weakest
-from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float
@@ -137,7 +137,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         gains_by_step.append(gains)
     over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
     claim = _lower_unsupported_claim(claim, rounding.worst, rounding.when)
-    return with_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
+    return with_assumed(Schedule(over_time, system.mean, claim), system.kept.assumed)
 
 
 def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionStep) -> Gains:

@@ -12,10 +12,10 @@ from heliograph.linear.plant_and_measurement_maps import (
     make_plant_and_measurement_maps,
 )
 from heliograph.linear.system import LinearSystem, Steps, repeat_last_step
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
@@ -198,9 +198,9 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     refuse_lift(degree, n, m, horizon)
     routes = make_plant_and_measurement_maps(plant, sensor, channel, 2 * degree, horizon)
     moments = initial_monomial_moments(plant_0, 2 * degree)
-    premise = Premise(plant, sensor, channel, order=2 * degree)
+    assumed = AssumedModel(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
-        return with_premise(_lift_chain(routes, degree, moments, (n, m)), premise)
+        return with_assumed(_lift_chain(routes, degree, moments, (n, m)), assumed)
     # Start of the lifted state: E Y_0 and Cov Y_0.
     second = products_of_monomials(moments, n + 1, degree)
     mean, covariance = mean_and_covariance(second)
@@ -215,7 +215,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         received_rounding=received_rounding,
         start_rounding=EPS * np.diag(second)[:-1],
     )
-    return with_premise(system, premise)
+    return with_assumed(system, assumed)
 
 
 def _lift_chain(

@@ -11,10 +11,10 @@ from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.monomial_lifted_system import initial_monomial_moments, lifted_system, refuse_lift
 from heliograph.linear.plant_and_measurement_maps import check_model, make_plant_and_measurement_maps
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -82,7 +82,7 @@ def quadratic_system_with_linear_estimate(
         second = next_second
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))
     system = LinearSystem(over_time, mean, initial, projection=make_linear_rows(total, 2, n), rounding=rounding)
-    return with_premise(system, Premise(plant, sensor, channel, order=4))
+    return with_assumed(system, AssumedModel(plant, sensor, channel, order=4))
 
 
 def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:

@@ -9,8 +9,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.linear.jump_system import propagate_by_mode
+from heliograph.model.assumed.assumed_model import NOTHING, StaticAssumedModel
 from heliograph.model.estimate import STRENGTH, Claim
-from heliograph.model.premises.premise import NOTHING, StaticPremise
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, file_path, instance, show_value
 from heliograph.numerics.module import Module, readable
@@ -63,7 +63,7 @@ class LinearSystem(Module):
     rounding: Float[np.ndarray, "time N"]
     received_rounding: Float[np.ndarray, "time m"]
     start_rounding: Float[np.ndarray, "N"]
-    kept: StaticPremise = eqx.field(
+    kept: StaticAssumedModel = eqx.field(
         static=True, default=NOTHING, init=False, repr=False, compare=False
     )  # models that it was made of
 
@@ -210,7 +210,7 @@ class Schedule(Module):
     gains: Gains
     start: Float[np.ndarray, "N"]
     claim: Claim = eqx.field(static=True)
-    kept: StaticPremise = eqx.field(
+    kept: StaticAssumedModel = eqx.field(
         static=True, default=NOTHING, init=False, repr=False, compare=False
     )  # models that it was made for
 

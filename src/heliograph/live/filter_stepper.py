@@ -256,11 +256,11 @@ class DecidingSender(NamedTuple):
 
 def find_deciding_sender(filter: AbstractFilter) -> DecidingSender | None:
     """Return the sender whose silence a filter can interpret, or None if there is none."""
-    premise = filter.premise  # the plant, sensor, channel and trigger that the filter was made for
-    if not filter.silence_tells or premise is None or premise.trigger is None:
+    assumed = filter.assumed  # the plant, sensor, channel and trigger that the filter was made for
+    if not filter.silence_tells or assumed is None or assumed.trigger is None:
         return None
-    assert premise.sensor is not None and premise.channel is not None  # a sender has both
-    return DecidingSender(premise.trigger, premise.channel, outputs=len(first(premise.sensor).outputs))
+    assert assumed.sensor is not None and assumed.channel is not None  # a sender has both
+    return DecidingSender(assumed.trigger, assumed.channel, outputs=len(first(assumed.sensor).outputs))
 
 
 class CompiledFilter:

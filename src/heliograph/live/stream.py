@@ -74,8 +74,8 @@ class Stream:
         if not isinstance(filter, AbstractFilter):
             raise fail("stream", "a filter", type(filter).__name__)
         # The sensor and the channel that the filter was made for, where it says so.
-        self.filter, premise = filter, filter.premise
-        sensor, channel = (None, None) if premise is None else (premise.sensor, premise.channel)
+        self.filter, assumed = filter, filter.assumed
+        sensor, channel = (None, None) if assumed is None else (assumed.sensor, assumed.channel)
         # Rules by which values are refused before the filter, and the number of refused values by reason (received,).
         self.limits = make_limits(filter.received, limits, invalid, stuck, sensor, channel)
         self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}

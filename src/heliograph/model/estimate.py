@@ -32,8 +32,8 @@ class Estimate(Module):
     modes: probabilities of the present mode (..., M), of a filter that weighs modes; None of all others. Chains of
     plant, sensor and links are one joint chain, in this order, the first slowest (`joint_modes`).
 
-    attitude: places of the states that are the rotation vectors of attitudes, three of each. Their errors, of which the
-    covariance is, are turns in the estimated axes, `error`.
+    attitude: indices of the states that are the rotation vectors of attitudes, three of each. Their errors, whose
+    covariance this is, are turns in the estimated axes, `error`.
 
     Shapes: mean (..., n), covariance (..., n, n).
     """

@@ -159,9 +159,9 @@ class AbstractPlant(Module):
         return drawn
 
 
-def split_inputs(u: Array, places: Sequence[Sequence[int]]) -> list[jax.Array]:
+def split_inputs(u: Array, indices: Sequence[Sequence[int]]) -> list[jax.Array]:
     """Return the inputs of each part of a model, from all inputs u (inputs,) and the indices of each part's own."""
-    return [jnp.asarray(u)[np.array(own, int)] for own in places]
+    return [jnp.asarray(u)[np.array(own, int)] for own in indices]
 
 
 class JointNoise(Module):
@@ -169,15 +169,15 @@ class JointNoise(Module):
 
     Args:
         plants: the plants.
-        places: places of each plant's inputs among all.
+        indices: indices of each plant's inputs among all.
     """
 
     plants: tuple[AbstractPlant, ...]
-    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
         """Return the covariance under the input u."""
-        pairs = zip(self.plants, split_inputs(u, self.places), strict=True)
+        pairs = zip(self.plants, split_inputs(u, self.indices), strict=True)
         return jnp.asarray(jax.scipy.linalg.block_diag(*(plant.noise_covariance(own) for plant, own in pairs)))
 
     @property
@@ -187,7 +187,7 @@ class JointNoise(Module):
 
     def sample(self, key: jax.Array, u: jax.Array) -> jax.Array:
         """Draw each plant's."""
-        parts = zip(self.plants, jax.random.split(key, len(self.plants)), split_inputs(u, self.places), strict=True)
+        parts = zip(self.plants, jax.random.split(key, len(self.plants)), split_inputs(u, self.indices), strict=True)
         return jnp.concatenate([plant.sample_noise(k, own) for plant, k, own in parts])
 
 
@@ -379,7 +379,7 @@ AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime ho
 
 
 def read_manifold(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
-    """Return which of `states` states are angles or attitudes, from the places of angles or from the states' plant."""
+    """Return which of `states` states are angles or attitudes, from the indices of angles or from the states' plant."""
     plant = first(angles)
     if not isinstance(plant, AbstractPlant):
         return Manifold(angles_at(angles, states))

@@ -79,8 +79,8 @@ class AbstractSensor(Module):
         """Return the sensor under the inputs u of a plant, whose names are `names`: a sensor that depends on none."""
         if not self.inputs:
             return self
-        places = np.array([list(names).index(name) for name in self.inputs])
-        return _sensor_under_inputs(self, u[places])
+        indices = np.array([list(names).index(name) for name in self.inputs])
+        return _sensor_under_inputs(self, u[indices])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
         """Return the sensor under example inputs; raise ValueError if the plant, with inputs `names`, lacks one of its.
@@ -352,7 +352,7 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
 
 
 def angles_of_outputs(angles: "Sequence[int] | AnySensor", outputs: int) -> Angles:
-    """Return which of `outputs` outputs are angles, from their places or from the sensor whose outputs they are."""
+    """Return which of `outputs` outputs are angles, from their indices or from the sensor whose outputs they are."""
     sensor = first(angles)
     if not isinstance(sensor, AbstractSensor):
         return angles_at(angles, outputs)

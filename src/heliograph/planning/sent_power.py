@@ -203,7 +203,7 @@ def _compute_innovation_moments(
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
-    model, state, moments = filter.premise, filter.init(), []  # the filter's model of plant and sensor
+    model, state, moments = filter.assumed, filter.init(), []  # the filter's model of plant and sensor
     assert model is not None and model.sensor is not None  # since it predicts a measurement
     for k, u in enumerate(inputs):
         state = filter.predict(state, u, k)

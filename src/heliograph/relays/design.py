@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from heliograph.linear.system import Gains, Schedule
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.estimate import lower_claim_by_noise
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compile_in_float64
@@ -156,8 +156,8 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         )
         schedules[name] = Schedule(gains, start_mean, lower_claim_by_noise("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
-    premise = Premise(network.plant, relays=network, gains=relayed)
-    return {name: with_premise(schedule, premise) for name, schedule in schedules.items()}
+    assumed = AssumedModel(network.plant, relays=network, gains=relayed)
+    return {name: with_assumed(schedule, assumed) for name, schedule in schedules.items()}
 
 
 def _make_gains(

@@ -161,7 +161,7 @@ def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arra
             x: changes of the n free entries of the gains (n,), in units of `unit`.
             steps: steps of a period.
             base: gains that x changes (slots, F n, R).
-            where: places of the free entries in them, one array of indices (n,) for each axis.
+            where: indices of the free entries in them, one array of indices (n,) for each axis.
             unit: size of each free entry (n,).
             limit: greatest power of each slot (slots,).
             multipliers: lambda_s (slots,).

@@ -10,8 +10,8 @@ from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.system import LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.estimate import lower_claim_by_noise
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.relays import RelayNetwork, RelaySteps
 from heliograph.numerics.check import instance, table
 from heliograph.numerics.float64 import compile_in_float64
@@ -86,8 +86,8 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     relayed = {name: np.asarray(gains[name]) * receives[:, None, end - size : end]
                for name, size, end in zip(network.relays, network.received, ends, strict=False)}  # fmt: skip
     x_of_state = np.eye(n, d + r)
-    premise = Premise(network.plant, relays=network, gains=relayed)
-    return with_premise(LinearSystem(system, mean, covariance, x_of_state), premise)
+    assumed = AssumedModel(network.plant, relays=network, gains=relayed)
+    return with_assumed(LinearSystem(system, mean, covariance, x_of_state), assumed)
 
 
 class ReceiverViewOfRelays(NamedTuple):

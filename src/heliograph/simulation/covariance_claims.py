@@ -1,6 +1,6 @@
 """Claims (exact, upper, nominal) of a network's covariances: a filter's own where its model is the world, else nominal.
 
-A premise is the world that a filter was made for, or in which it stands: plant, sensor, channel and so on.
+An assumed model is the world that a filter was made for, or in which it stands: plant, sensor, channel and so on.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,9 +13,9 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
+from heliograph.model.assumed.agreement import RANGE, join_assumed, list_differences, restrict_assumed_to_rows
+from heliograph.model.assumed.assumed_model import AssumedModel, StaticAssumedModel
 from heliograph.model.estimate import Claim
-from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, restrict_premise_to_rows
-from heliograph.model.premises.premise import Premise, StaticPremise
 from heliograph.numerics.check import fail
 from heliograph.simulation.centres.fusion_centre import (
     find_claim_of_informed_fusion,
@@ -73,7 +73,7 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
     """Return a copy of the filter that claims "nominal" at most for its covariance, as do the filters inside it.
 
     "nominal" means that the covariance is right only if the filter's models are. In its field `kept` the copy remembers
-    the models for which it was made (its premise), and whether its claim was lowered.
+    the models for which it was made (its assumed model), and whether its claim was lowered.
     """
 
     def is_inner(leaf: object) -> bool:
@@ -86,11 +86,11 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
     was_lowered = filter.claim != lower_claim(filter.claim) or filter.kept.lowered
     # Fields are frozen. The copy is no one else's yet, so that they may be set here.
     object.__setattr__(lowered, "claim", lower_claim(filter.claim))
-    object.__setattr__(lowered, "kept", StaticPremise(filter.premise, was_lowered))
+    object.__setattr__(lowered, "kept", StaticAssumedModel(filter.assumed, was_lowered))
     return lowered
 
 
-def lower_claim_if_mistaken(own_models: Premise, filter: AbstractFilter) -> AbstractFilter:
+def lower_claim_if_mistaken(own_models: AssumedModel, filter: AbstractFilter) -> AbstractFilter:
     """Return the filter itself if it was made for `own_models`, else a copy that claims "nominal" at most.
 
     Args:
@@ -107,7 +107,7 @@ def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     nodes = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
-            own_models = find_premise(network, name)
+            own_models = find_assumed(network, name)
             filters = {label: lower_claim_if_mistaken(own_models, filter) for label, filter in node.filters.items()}
             nodes[name] = _replace_filters(node, filters)
     return nodes
@@ -134,7 +134,7 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
     """
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
-    own_models = find_common_premise(network)
+    own_models = find_common_assumed(network)
     return {
         name: lower_claim_if_mistaken(own_models, filter_or_fusion)
         if isinstance(filter_or_fusion, AbstractFilter)
@@ -168,15 +168,15 @@ def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilt
     return changed
 
 
-def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
+def list_mistaken_parts(own: AssumedModel, filter: AbstractFilter) -> tuple[str, ...]:
     """Return in which parts of the model (such as "sensor") a filter differs from the models at its node, `own`."""
-    return (UNSAID,) if filter.premise is None else list_differences(filter.premise, own)
+    return (UNSAID,) if filter.assumed is None else list_differences(filter.assumed, own)
 
 
-def find_premise(network: HasNodes, name: str) -> Premise:
+def find_assumed(network: HasNodes, name: str) -> AssumedModel:
     """Return the models at a node, for which a filter there has to be made if its claim is to hold.
 
-    A claim (that a filter's covariance is exact or a bound) is about one world, its premise. It is the plant, and the
+    A claim (that a filter's covariance is exact or a bound) is about one world: the plant, and the
     node's sensor, channel and trigger (rule of when to send), with its limits if they refuse values. In a network of
     relays it is the plant, the relays, and the relays' gains.
     """
@@ -184,14 +184,14 @@ def find_premise(network: HasNodes, name: str) -> Premise:
     if isinstance(node, Node):
         # Limits without bounds refuse only error codes of the sensor, and these depend on the state in no way.
         limits = node.limits if node.limits is not None and node.limits.bounded else None
-        return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
+        return AssumedModel(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     # Nodes that share one channel receive certain rows of it.
     if network.common is not None:
-        return restrict_premise_to_rows(
-            Premise(plant, network.common.sensor, network.common.channel), network.rows[name]
+        return restrict_assumed_to_rows(
+            AssumedModel(plant, network.common.sensor, network.common.channel), network.rows[name]
         )
     if network.relays is None:  # a node without a sensor
-        return Premise(plant)
+        return AssumedModel(plant)
     # Gains of the relays, each of which runs a single filter by a schedule.
     schedules = {
         relay: filter
@@ -200,42 +200,42 @@ def find_premise(network: HasNodes, name: str) -> Premise:
         for filter in network.nodes[relay].filters.values()
     }
     gains = {relay: f.gains.values.gain for relay, f in schedules.items() if isinstance(f, ScheduledFilter)}
-    return Premise(plant, relays=network.relays, gains=gains)
+    return AssumedModel(plant, relays=network.relays, gains=gains)
 
 
-def find_common_premise(network: HasNodes) -> Premise:
+def find_common_assumed(network: HasNodes) -> AssumedModel:
     """Return the models of a central filter: the plant, and the sensors and channels of all nodes in their order.
 
     `network.common`: the sensor and channel that all nodes share, or None.
     """
     if network.common is not None:
-        return Premise(network.plant, network.common.sensor, network.common.channel)
+        return AssumedModel(network.plant, network.common.sensor, network.common.channel)
     nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
-    return join_premises([find_premise(network, name) for name in nodes]) if nodes else Premise(network.plant)
+    return join_assumed([find_assumed(network, name) for name in nodes]) if nodes else AssumedModel(network.plant)
 
 
 def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
     """Yield the filters made for other models than those of the place where they stand; central filters come last."""
     for name in network.names:
         if filters := network.nodes[name].filters:
-            yield from _yield_mistaken_beliefs(name, find_premise(network, name), filters)
+            yield from _yield_mistaken_beliefs(name, find_assumed(network, name), filters)
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     if central:
-        yield from _yield_mistaken_beliefs(FUSED, find_common_premise(network), central)
+        yield from _yield_mistaken_beliefs(FUSED, find_common_assumed(network), central)
 
 
 def _yield_mistaken_beliefs(
-    node: str, own_models: Premise, filters: Mapping[str, AbstractFilter]
+    node: str, own_models: AssumedModel, filters: Mapping[str, AbstractFilter]
 ) -> Iterator[MistakenBelief]:
     """Yield the filters of a node that claim a covariance but were made for other models than `own_models`, the node's.
 
-    Each comes with the parts of the models that differ. A filter may not say for which models it was made: it has no
-    premise then, and is left out. But if its claim was lowered already (`filter.kept.lowered`), it is yielded: somebody
-    knew that its models are not the node's.
+    Each comes with the parts of the models that differ. A filter may not say for which models it was made: it is left
+    out then. But if its claim was lowered already (`filter.kept.lowered`), it is yielded: somebody knew that
+    its models are not the node's.
     """
     for label, filter in filters.items():
         was_lowered = filter.kept.lowered
-        can_be_judged = filter.premise is not None or was_lowered
+        can_be_judged = filter.assumed is not None or was_lowered
         if filter.claim != "none" and can_be_judged and (mistaken_parts := list_mistaken_parts(own_models, filter)):
             yield MistakenBelief(node=node, filter=label, parts=mistaken_parts, lowered=was_lowered)
 

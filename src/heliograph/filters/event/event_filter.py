@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -53,13 +54,26 @@ RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 COUNTED = 16  # lost transmissions that are counted; more are as many
 
 
+class Message(NamedTuple):
+    """What came from a sender at a step.
+
+    sender: its number; value: what arrived, all NaN in silence; losses: how many it reports (1 or 0 where only the last
+    one is known), NaN if it reports none; has_sent: it has a reference to compare its signal with.
+    """
+
+    sender: int
+    value: jax.Array
+    losses: jax.Array
+    has_sent: jax.Array
+
+
 class EventFilter(AbstractSizedFilter):
     """The Gaussian sum of `event_filter`: each Gaussian is over (x, r), the plant's state and the senders' reference.
 
-    A sender transmits its signal y if |y - r| > delta. known: pieces of that interval, one Gaussian for each piece in
-    which y - r lay last; lost: Gaussians whose reference is a value that was lost; loses: transmissions may be lost;
-    delivers: what arrives is y itself; alike: what arrives has the same law in every mode of the link; outputs: length
-    of y; ages: the largest number of steps since a transmission that is counted, plus 1.
+    A sender transmits its signal y if |y - r| > delta. pieces: of that interval, one Gaussian for each in which y - r
+    lay last; lost_references: Gaussians whose reference is a value that was lost; may_lose: transmissions may be lost;
+    delivers_signal: what arrives is y itself; same_law_in_modes: what arrives has the same law in every mode of the
+    link; outputs: length of y; age_count: the largest number of steps since a transmission that is counted, plus 1.
     """
 
     plant: AnyPlant
@@ -68,26 +82,26 @@ class EventFilter(AbstractSizedFilter):
     trigger: AbstractThreshold
     initial: Float[Array, " M"]
     transform: AbstractTransform
-    known: int = eqx.field(static=True)
-    lost: int = eqx.field(static=True)
-    loses: bool = eqx.field(static=True)
-    delivers: bool = eqx.field(static=True)
-    alike: bool = eqx.field(static=True)
+    pieces: int = eqx.field(static=True)
+    lost_references: int = eqx.field(static=True)
+    may_lose: bool = eqx.field(static=True)
+    delivers_signal: bool = eqx.field(static=True)
+    same_law_in_modes: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
-    ages: int = eqx.field(static=True)
+    age_count: int = eqx.field(static=True)
 
     @property
     def reference_may_be_lost(self) -> bool:
         """True if the value that the sender compares with may be one that the filter never received."""
-        return self.loses and self.trigger.reference == "sent"
+        return self.may_lose and self.trigger.reference == "sent"
 
     def with_room_for_heartbeats_of(self, others: Sequence[AbstractFilter]) -> "EventFilter":
-        """Return the filter with as many `ages`, counts of steps since a sender sent, as the largest of the others."""
-        ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
-        if self.trigger.heartbeat is None or ages <= self.ages:
+        """Return the filter with the largest `age_count`, of steps since a sender sent, of its own and the others'."""
+        age_count = max((other.age_count for other in others if isinstance(other, EventFilter)), default=self.age_count)
+        if self.trigger.heartbeat is None or age_count <= self.age_count:
             return self
         filter_with_room = copy(self)
-        object.__setattr__(filter_with_room, "ages", ages)  # fields are frozen
+        object.__setattr__(filter_with_room, "age_count", age_count)  # fields are frozen
         return filter_with_room
 
     @property
@@ -110,7 +124,7 @@ class EventFilter(AbstractSizedFilter):
         joint = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), known_reference)  # r = 0
         # Probabilities of each sender's status: link mode, steps since it sent, transmissions lost (S, M, A, C).
         counts = COUNTED if self.trigger.losses == "numbered" else 1
-        label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
+        label = jnp.zeros((len(self.senders), len(self.initial), self.age_count, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
         prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], joint), label[None])
         # Before its first transmission a sender that needs a reference must send.
@@ -119,24 +133,24 @@ class EventFilter(AbstractSizedFilter):
 
     def _pad_sum(self, single: GaussianSum) -> GaussianSum:
         """Return the one Gaussian of `single`, then copies of weight 0, so that all steps have as many Gaussians."""
-        count = self._known_reference_count + self.reference_may_be_lost * self.lost
+        count = self._known_reference_count + self.reference_may_be_lost * self.lost_references
         copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
         return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))
 
     @property
     def region(self) -> SilentRegion:
-        """The region |y - r| <= delta, of signal y and reference r, in which a sender is silent, in `known` pieces."""
-        return SilentRegion(len(self.states), self.trigger, self.outputs, self.known)
+        """The region |y - r| <= delta, of signal y and reference r, in which a sender is silent, in its pieces."""
+        return SilentRegion(len(self.states), self.trigger, self.outputs, self.pieces)
 
     @property
     def _known_reference_count(self) -> int:
         """Number of Gaussians whose reference r the filter knows.
 
-        Silence leaves one Gaussian for each of the `known` pieces of |y - r| <= delta. If a value may be lost and does
+        Silence leaves one Gaussian for each of the pieces of |y - r| <= delta. If a value may be lost and does
         not become the reference, silence leaves another one for each piece of |y - r| > delta.
         """
         outside = self.region.count_outside_parts(self.senders[0])
-        return self.known + (outside if self.loses and not self.reference_may_be_lost else 0)
+        return self.pieces + (outside if self.may_lose and not self.reference_may_be_lost else 0)
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
@@ -158,7 +172,7 @@ class EventFilter(AbstractSizedFilter):
         # Ages grow by one. An age that has reached the heartbeat stays there until the sender sends again.
         if self.trigger.heartbeat is not None:
             older = jnp.concatenate([jnp.zeros_like(status[..., :1, :]), status[..., :-1, :]], axis=-2)
-            age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
+            age, oldest = jnp.arange(self.age_count)[:, None], self.trigger.heartbeat
             status = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, status, 0.0)
         return EventBelief(state.weight, gaussian=x_and_r, label=status, begun=state.begun, moved=jnp.asarray(True))
 
@@ -181,11 +195,9 @@ class EventFilter(AbstractSizedFilter):
         # Senders one after the other, each given those before it; each sends the entries `components` of y.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
-            reported_losses = losses[s] if len(losses) else jnp.asarray(jnp.nan)
+            message = Message(s, received, losses[s] if len(losses) else jnp.asarray(jnp.nan), has_sent[s])
             xry = augment_by_signal(plant, sensor, self.transform, mixture, start)  # joint Gaussians of (x, r, y)
-            posterior, mean_of_value, covariance_of_value = self._condition_on_sender(
-                xry, channel, received, reported_losses, s, has_sent[s]
-            )
+            posterior, mean_of_value, covariance_of_value = self._condition_on_message(xry, message, channel)
             # Normalise the weights; their sum was p(value or silence of sender s | data before).
             log_likelihood_of_sender = log_total_weight(posterior.log_weight)
             log_likelihood += log_likelihood_of_sender
@@ -198,52 +210,39 @@ class EventFilter(AbstractSizedFilter):
         innovation = Innovation(*append_losses(jnp.concatenate(innovations), covariances, losses), log_likelihood)
         return EventBelief.from_sum(mixture, has_sent, state.moved), innovation
 
-    def _condition_on_sender(
-        self,
-        xry: GaussianSum,
-        channel: ChannelByPattern,
-        z: jax.Array,
-        losses: jax.Array,
-        s: int,
-        has_sent: jax.Array,
+    def _condition_on_message(
+        self, xry: GaussianSum, message: Message, channel: ChannelByPattern
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition the sum on what came from sender s: a value z, or nothing (z all NaN).
+        """Condition a sum of Gaussians of (x, r, y) on what came from a sender: a value, or nothing.
 
-        `xry`: Gaussians of the plant's state x, the senders' reference r and their signal y. `losses`: losses
-        reported by the sender, NaN if none are. `has_sent`: whether the sender has a reference to compare y with.
+        x is the plant's state, r the senders' reference and y their signal. `channel`: the link, by mode.
         Returns the sum over (x, r), and the predicted mean and covariance of a value, 0 where none came.
         """
+        z = message.value
 
-        def update_by_silence(xry: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Return the sum given silence of sender s; no value is expected, so zeros as its mean and covariance."""
-            posterior = self._condition_on_silence(xry, channel, losses, s, has_sent)
+        def condition_on_silence(xry: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
+            """Return the sum given silence; no value is expected, so zeros as its mean and covariance."""
+            posterior = self._condition_on_silence(xry, message, channel)
             return posterior, jnp.zeros_like(z), jnp.zeros((len(z), len(z)))
 
-        def update_by_value(xry: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Return the sum given the value z of sender s, and the value's predicted mean and covariance."""
-            return self._condition_on_value(xry, channel, z, losses, s, has_sent)
-
         corrected: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(
-            jnp.any(~jnp.isnan(z)), update_by_value, update_by_silence, xry
+            jnp.any(~jnp.isnan(z)),
+            lambda xry: self._condition_on_value(xry, message, channel),
+            condition_on_silence,
+            xry,
         )
         return corrected
 
-    def _condition_on_silence(
-        self, xry: GaussianSum, channel: ChannelByPattern, losses: jax.Array, s: int, has_sent: jax.Array
-    ) -> GaussianSum:
-        """Return the sum over (x, r) given silence of sender s: it sent nothing, or what it sent was lost.
+    def _condition_on_silence(self, xry: GaussianSum, message: Message, channel: ChannelByPattern) -> GaussianSum:
+        """Return the sum over (x, r) given silence of a sender: it sent nothing, or what it sent was lost.
 
-        Args:
-            xry: K Gaussians of the state x, and the senders' references r and signals y; one sends if |y - r| > delta.
-            channel: the link, by mode.
-            losses: 1 if the sender reports that its value was lost, 0 if none was; NaN if nothing is reported.
-            s: number of the sender.
-            has_sent: whether the sender has a reference to compare y with.
+        `xry`: K Gaussians of the state x, and the senders' references r and signals y; one sends if |y - r| > delta.
         """
         # Probabilities (K, M, A, C) of Gaussian, link mode, steps since sent and number of losses, for each cause:
         #   unsent: y was not sent;  dropped: y was sent by the rule |y - r| > delta, and lost;
         #   forced: y had to be sent wherever it lay (first value or heartbeat), and was lost.
-        unsent, must_send = split_by_obligation(xry.label[:, s], has_sent, self.trigger.heartbeat)
+        s, losses = message.sender, message.losses
+        unsent, must_send = split_by_obligation(xry.label[:, s], message.has_sent, self.trigger.heartbeat)
         loss_probability = self._loss_probability(channel, s)[:, None, None]
         dropped, forced = (
             status_after_sending(status * loss_probability, is_lost=True) for status in (unsent, must_send)
@@ -265,10 +264,10 @@ class EventFilter(AbstractSizedFilter):
         """
         sender, x_and_r = self.senders[s], np.arange(len(self.states) + self.outputs)
         # |y - r| <= delta: it was not sent, or it had to be sent nevertheless and was lost.
-        inside = xry.relabel_sender(s, by_cause.unsent + by_cause.forced if self.loses else by_cause.unsent)
+        inside = xry.relabel_sender(s, by_cause.unsent + by_cause.forced if self.may_lose else by_cause.unsent)
         no_lost_references = inside.select_range(0, 0)
         pieces, _ = self.region.truncate_inside(inside, no_lost_references, sender)
-        if self.loses:
+        if self.may_lose:
             # |y - r| > delta: it was sent and lost.
             sent = xry.relabel_sender(s, by_cause.dropped + by_cause.forced)
             outside = self.region.truncate_outside(sent, sender, scale=1.0)
@@ -279,15 +278,15 @@ class EventFilter(AbstractSizedFilter):
         """Return the sum over (x, r) given silence of sender s, if a value y that was lost is its next reference r.
 
         A sender sends its signal y if |y - r| > delta; r, the value sent last, may be lost. `xry`: Gaussians of (x, r,
-        y), x the plant's state, r known in the first `known`. `by_cause`: probabilities of sender status and cause of
-        silence. Returned are `known` with a known r, one for each piece of |y - r| <= delta, then `lost` ones.
+        y), x the plant's state, r known in the first `pieces`. `by_cause`: probabilities of sender status and cause of
+        silence. Returned are those with a known r, one for each piece of |y - r| <= delta, then `lost_references`.
         """
         n, sender = len(self.states), self.senders[s]
         x_and_r = np.arange(n + self.outputs)
         # Not sent: |y - r| <= delta, and r stays.
         unsent = xry.relabel_sender(s, by_cause.unsent)
         known, lost_before = self.region.truncate_inside(
-            unsent.select_range(0, self.known), unsent.select_range(self.known), sender
+            unsent.select_range(0, self.pieces), unsent.select_range(self.pieces), sender
         )
         # Sent by the rule and lost: |y - r| > delta. Forced and lost: y anywhere. In both cases y is the new r.
         outside = merge_groups(
@@ -296,33 +295,28 @@ class EventFilter(AbstractSizedFilter):
         )
         anywhere = merge_groups(xry.relabel_sender(s, by_cause.forced))
         lost_now = concatenate_sums([outside, anywhere]).select_components(self._find_new_reference(sender))
-        # Of all Gaussians with a lost reference, those nearest in r are merged until `lost` remain.
+        # Of all Gaussians with a lost reference, those nearest in r are merged until few remain.
         few_lost = reduce_to_count(
             concatenate_sums([lost_before.select_components(x_and_r), lost_now]),
-            self.lost,
+            self.lost_references,
             slice(n + sender.start, n + sender.stop),
         )
         return concatenate_sums([known.select_components(x_and_r), few_lost])
 
     def _condition_on_value(
-        self,
-        xry: GaussianSum,
-        channel: ChannelByPattern,
-        z: jax.Array,
-        losses: jax.Array,
-        s: int,
-        has_sent: jax.Array,
+        self, xry: GaussianSum, message: Message, channel: ChannelByPattern
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Return the sum over (x, r) given a value z of sender s, and the predicted mean and covariance of z.
+        """Return the sum over (x, r) given a value z of a sender, and the predicted mean and covariance of z.
 
         Each Gaussian of `xry`, over (x, r, y), gets a Kalman update, is cut to where the sender sends, and all are
-        merged. `losses`: number of losses that the sender reports, NaN if none; `has_sent`: it has a reference r.
+        merged.
         """
+        s, z, losses = message.sender, message.value, message.losses
         # Status probabilities (K, M, A, C), by link mode, steps since sent and losses, times P(z's pattern | mode).
         sender, arrived = self.senders[s], ~jnp.isnan(z)
         pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
-        kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
-        chance = jnp.asarray(channel.chance)[:, kind]
+        pattern_number = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
+        chance = jnp.asarray(channel.chance)[:, pattern_number]
         arrival_probability = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
         status = xry.label[:, s] * arrival_probability[:, None, None]
         if self.trigger.losses == "numbered":  # the sender's counter says how many were lost before
@@ -330,18 +324,20 @@ class EventFilter(AbstractSizedFilter):
             status = status * (jnp.isnan(losses) | (jnp.arange(COUNTED) == number))
         # The Gaussians before z and updated by z, for each mode, or once if all modes have the same law.
         updated, prior, links = [], [], []
-        for j in range(1 if self.alike else status.shape[1]):
-            status_of_mode = status if self.alike else jnp.zeros_like(status).at[:, j].set(status[:, j])
-            mode = jnp.argmax(chance > 0) if self.alike else j
+        for j in range(1 if self.same_law_in_modes else status.shape[1]):
+            status_of_mode = status if self.same_law_in_modes else jnp.zeros_like(status).at[:, j].set(status[:, j])
+            mode = jnp.argmax(chance > 0) if self.same_law_in_modes else j
             moments = channel.mean, channel.gain_covariance, channel.noise
-            links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
+            links.append(
+                LinkMoments(*jax.tree.map(lambda part, at=(mode, pattern_number): jnp.asarray(part)[at], moments))
+            )
             prior.append(xry.relabel_sender(s, status_of_mode))
             updated.append(
-                condition_parts_on_received(prior[j], z, arrived, links[j], sender, self.outputs, self.delivers)
+                condition_parts_on_received(prior[j], z, arrived, links[j], sender, self.outputs, self.delivers_signal)
             )
         # Cut to where the sender sends: several times the blocks [updated, prior], each by mode. Sorted by mode again.
         count, size = len(links), len(status)
-        sent = self._restrict_to_sent(concatenate_sums([*updated, *prior]), s, has_sent)
+        sent = self._restrict_to_sent(concatenate_sums([*updated, *prior]), message)
         blocks = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
         sorted_blocks = [concatenate_sums(blocks[j :: 2 * count]) for j in range(2 * count)]
         sent_updated, sent_prior = sorted_blocks[:count], sorted_blocks[count:]
@@ -351,13 +347,14 @@ class EventFilter(AbstractSizedFilter):
         predicted_z = predict_sent_value(sent_prior, links, sender, self.outputs)
         return self._pad_sum(merged), predicted_z.mean[0], predicted_z.covariance[0]
 
-    def _restrict_to_sent(self, xry: GaussianSum, s: int, has_sent: jax.Array) -> GaussianSum:
-        """Restrict each Gaussian of (x, r, y) to where sender s sends: |y - r| > delta, or anywhere if it must send.
+    def _restrict_to_sent(self, xry: GaussianSum, message: Message) -> GaussianSum:
+        """Restrict each Gaussian of (x, r, y) to where the sender sends: |y - r| > delta, or anywhere if it must send.
 
         Returns three groups in one sum: each Gaussian cut to the pieces of |y - r| > delta; each uncut, as a fallback,
         with P(sent) = FLOOR if |y - r| > delta is less probable, else 0; each uncut where the sender must send.
         """
-        by_rule, must_send = split_by_obligation(xry.label[:, s], has_sent, self.trigger.heartbeat)
+        s = message.sender
+        by_rule, must_send = split_by_obligation(xry.label[:, s], message.has_sent, self.trigger.heartbeat)
         sent_by_rule, sender = xry.relabel_sender(s, by_rule), self.senders[s]
         # 1 - RIM: y was compared before it was rounded, and may lie inside by as much.
         outside = self.region.truncate_outside(sent_by_rule, sender, scale=1 - RIM)

@@ -11,12 +11,12 @@ from heliograph.filters.event.gaussian_in_ball import MOST_COMPONENTS
 from heliograph.filters.event.stochastic_event_filter import StochasticEventFilter
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, unstack, vary_over_steps
 from heliograph.model.plant import AnyPlant, read_first_plant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
@@ -76,32 +76,32 @@ def event_filter(
     described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
-    loses = any(_may_lose_components(step) for step in steps)
+    may_lose = any(_may_lose_components(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
     fields_of_both: dict[str, Any] = {  # of the filter of a random trigger, and of that of a threshold
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
-        "loses": loses, "outputs": outputs,
+        "may_lose": may_lose, "outputs": outputs,
     }  # fmt: skip
     # A random trigger: one Gaussian is enough. The claim rests on the laws of noises, not on their moments alone.
-    premise = Premise(plant, sensor, channel, trigger, order=None)
+    assumed = AssumedModel(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _decide_claim(plant, sensor, channel, trigger)
-        return with_premise(
-            StochasticEventFilter(trigger=trigger, **fields_of_both, **make_sizes(claim, start, received)), premise
+        return with_assumed(
+            StochasticEventFilter(trigger=trigger, **fields_of_both, **make_sizes(claim, start, received)), assumed
         )
     # A threshold: a sum of Gaussians, by the value with which the sender compares. Ages of that value are counted up to
     # the heartbeat.
     filter = EventFilter(
-        trigger=_check_threshold_rule(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
-        known=known,
-        lost=lost,
-        delivers=all(_delivers_y_unchanged(step) for step in steps),
-        alike=all(_has_same_law_in_every_mode(step) for step in steps),
-        ages=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
+        trigger=_check_threshold_rule(trigger, lost if may_lose else None, outputs, first(channel).outputs, steps),
+        pieces=known,
+        lost_references=lost,
+        delivers_signal=all(_delivers_y_unchanged(step) for step in steps),
+        same_law_in_modes=all(_has_same_law_in_every_mode(step) for step in steps),
+        age_count=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
         **fields_of_both,
         **make_sizes("nominal", start, received),
     )
-    return with_premise(filter, premise)
+    return with_assumed(filter, assumed)
 
 
 def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:

@@ -20,14 +20,14 @@ from heliograph.model.trigger import AbstractThreshold
 class SilentRegion(NamedTuple):
     """The region |y - r| <= delta of a threshold, of each component, of all in a box, or in a ball.
 
-    states, outputs: lengths n of x and m of y, of Gaussians over (x, r, y); known: pieces into which the interval of
-    the first component is cut. A sender is a slice of the components of y.
+    states, outputs: lengths n of x and m of y, of Gaussians over (x, r, y); pieces: into how many the interval of the
+    first component is cut. A sender is a slice of the components of y.
     """
 
     states: int
     trigger: AbstractThreshold
     outputs: int
-    known: int
+    pieces: int
 
     @property
     def is_ball(self) -> bool:
@@ -70,12 +70,12 @@ class SilentRegion(NamedTuple):
         (direction, delta), *rest = self._error_directions(sender)
         # Each known Gaussian once for each piece [low, high] of the interval [-1, 1], piece after piece, in units of
         # delta.
-        size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
+        size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.pieces + 1)
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
-        cut = concatenate_sums([known] * self.known)
+        cut = concatenate_sums([known] * self.pieces)
         # A ball: cut to the piece of the first component, then all to the ball.
         if self.is_ball:
-            if self.known > 1:  # a single piece is the whole ball
+            if self.pieces > 1:  # a single piece is the whole ball
                 cut = truncate_between(cut, direction, low * delta, high * delta)
             cut = self._truncate_to_ball(concatenate_sums([cut, unknown]), sender, 1.0, inside=True)
         else:
@@ -86,8 +86,8 @@ class SilentRegion(NamedTuple):
             for direction, delta in rest:
                 cut = truncate_between(cut, direction, -delta, delta)
         # The first size * pieces are the known ones; merge those of the same piece.
-        count = size * self.known
-        return merge_groups(cut.select_range(0, count), self.known), cut.select_range(count)
+        count = size * self.pieces
+        return merge_groups(cut.select_range(0, count), self.pieces), cut.select_range(count)
 
     def truncate_outside(self, mixture: GaussianSum, sender: slice, scale: float) -> GaussianSum:
         """Truncate each Gaussian to |y - r| > scale delta, in `count_outside_parts` pieces, and return their sum.

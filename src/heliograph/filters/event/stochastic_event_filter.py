@@ -59,7 +59,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     trigger: StochasticTrigger | Periodic
     initial: Float[Array, " M"]
     transform: AbstractTransform
-    loses: bool = eqx.field(static=True)
+    may_lose: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
 
     @property
@@ -197,7 +197,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         while_up = silent.relabel_sender(0, law[None] * (1 - lost))
         if len(down):  # weight 0 if the flag says that the link is down
             while_up = while_up.scale_weights(jnp.where(down[0] > 0, -jnp.inf, 0.0))
-        if not self.loses:
+        if not self.may_lose:
             return merge_groups(while_up)
         while_down = _sum_of_one_gaussian(jnp.zeros(()), prior, law).relabel_sender(0, law[None] * lost)
         if len(down):  # weight 0 if the flag says that the link is up

@@ -30,9 +30,9 @@ from heliograph.filters.gaussian.robust_scores import (
 )
 from heliograph.filters.received_outlier_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step
-from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import TINY, fail, scalar
@@ -316,7 +316,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
         received=filter.received,
     )  # fmt: skip
-    return with_premise(adaptive, filter.premise)
+    return with_assumed(adaptive, filter.assumed)
 
 
 def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:

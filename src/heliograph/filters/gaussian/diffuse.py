@@ -19,12 +19,12 @@ from heliograph.factors.diffuse_gaussian import (
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, second_moments_at_start
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import perfect
 from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.estimate import Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor, check_linear, check_sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike
@@ -107,4 +107,4 @@ def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
     filter = DiffuseFilter(
         plant=plant, sensor=sensor, **make_sizes(lower_claim_by_noise("exact", plant, sensor), plant, outputs)
     )
-    return with_premise(filter, Premise(plant, sensor, perfect(outputs)))
+    return with_assumed(filter, AssumedModel(plant, sensor, perfect(outputs)))

@@ -7,12 +7,12 @@ from heliograph.filters.gaussian.gaussian_prediction import choose_initial_momen
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
 from heliograph.model.estimate import lower_claim_by_noise
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import first, unstack
 from heliograph.model.plant import AnyPlant, read_first_plant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AnySensor, is_linear
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import ArrayLike, Float
@@ -50,7 +50,7 @@ def _make_gaussian_filter(
     check_link(first(sensor), first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
     mean, covariance, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
-    premise = Premise(plant, sensor, channel)  # what the claim rests on: the channel with its memory
+    assumed = AssumedModel(plant, sensor, channel)  # what the claim rests on: the channel with its memory
     # Moments of the channel without its memory: where that matters, the described channel is not the true one.
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
@@ -73,7 +73,7 @@ def _make_gaussian_filter(
         observed_angles=angles,
         **make_sizes(claim, start, first(channel).outputs),
     )
-    return with_premise(filter, premise)
+    return with_assumed(filter, assumed)
 
 
 @accept_limits

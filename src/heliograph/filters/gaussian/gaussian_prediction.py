@@ -29,12 +29,12 @@ from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cub
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.filters.wrappers.accepted_models import accept_limits
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, read_first_plant
-from heliograph.model.premises.premise import believes
 from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
@@ -212,9 +212,9 @@ class OpenLoop(AbstractGaussianStateFilter):
 
     @property
     def attitude(self) -> Angles:
-        """Return the places of the plant's attitudes, which it turns."""
-        places: Angles = first(self.plant).manifold.rotations
-        return places
+        """Return the indices of the plant's attitudes, which it turns."""
+        indices: Angles = first(self.plant).manifold.rotations
+        return indices
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:

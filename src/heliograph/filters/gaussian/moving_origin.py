@@ -13,10 +13,10 @@ from heliograph.factors.pivots import unit_of
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
-from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.compensated_arithmetic import Compensated, compensate, split_sum
@@ -209,7 +209,7 @@ def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFi
         return filter
     has_known_gain = all(not np.any(step.gain_covariance) and not step.uncertain for step in unstack(base.channel))
     about_origin = CentredFilter(base=base, known_gain=has_known_gain, **make_sizes(base.claim, base, base.received))
-    return with_premise(about_origin, base.premise)
+    return with_assumed(about_origin, base.assumed)
 
 
 def _start_at_zero(base: Any) -> Any:

@@ -9,11 +9,11 @@ from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
 from heliograph.filters.gaussian.robust_scores import AbstractWeightingRule
 from heliograph.filters.received_outlier_noise import ReceivedNoise, Vector, separate_outlier_noise
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_told_numbers
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, read_first_plant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.numpy_or_jax import is_traced

@@ -22,10 +22,10 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.gaussian_prediction import smoother_step_by_transform
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.assumed.agreement import join_assumed
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import have_same_structure, stack
-from heliograph.model.premises.agreement import join_premises
-from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -142,6 +142,6 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     # weaker than "exact" becomes "nominal".
     claim: Claim = "exact" if weakest([filter.claim for filter in nodes]) == "exact" else "nominal"
     central = SequentialFilter(filters=nodes, **make_sizes(claim, nodes[0], sum(filter.received for filter in nodes)))
-    # A premise is the model (plant, sensor, channel) under which a claim holds. The joint one needs that of every node.
-    premises = [filter.premise for filter in nodes if filter.premise is not None]
-    return with_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)
+    # The models (plant, sensor, channel) under which the claim holds need those of every node.
+    assumed_models = [filter.assumed for filter in nodes if filter.assumed is not None]
+    return with_assumed(central, join_assumed(assumed_models) if len(assumed_models) == len(nodes) else None)

@@ -29,13 +29,13 @@ from heliograph.filters.linear.linear_filter_state import (
 from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
+from heliograph.model.assumed.assumed_model import believes, with_assumed
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, at, first, stack_over_time
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
@@ -174,7 +174,7 @@ class LinearFilter(AbstractSizedFilter):
 
         Where no gain is random, they are the filter's own covariances, and the filter itself is returned.
         """
-        if self.premise is None or self.premise.channel is None or first(self.premise.channel).has_known_gain:
+        if self.assumed is None or self.assumed.channel is None or first(self.assumed.channel).has_known_gain:
             return self  # no gain is random
         from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
 
@@ -397,4 +397,4 @@ def as_current_filter(
 
 def _claim_nominal(filter: LinearFilter) -> LinearFilter:
     """Return the same filter with the claim "nominal", since it ignores a delay or memory that its link has."""
-    return with_premise(replace(filter, claim="nominal"), filter.premise)
+    return with_assumed(replace(filter, claim="nominal"), filter.assumed)

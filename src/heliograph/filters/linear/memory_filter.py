@@ -18,11 +18,11 @@ from heliograph.filters.linear.scheduled_gains import ScheduledFilter, ScheduleS
 from heliograph.filters.linear.unconditional_mean import UnconditionalMean, centre_plant
 from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -138,4 +138,4 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
         centre=centre,
     )
     # Covariances of products of two numbers are moments of order 4.
-    return with_premise(filter, Premise(plant, sensor, channel, order=4))
+    return with_assumed(filter, AssumedModel(plant, sensor, channel, order=4))

@@ -17,12 +17,12 @@ from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.monomial_lifted_system import lifted_system
 from heliograph.linear.plant_and_measurement_maps import check_model
 from heliograph.linear.system import LinearSystem
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import at, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
@@ -211,7 +211,7 @@ def polynomial_filter(
     claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     filter = PolynomialFilter(inner, degree, endless=_is_steady(plant, sensor, channel, system), centre=centre)
-    return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
+    return with_assumed(filter, AssumedModel(plant, sensor, channel, order=2 * degree))
 
 
 def lift_about_mean(
@@ -259,7 +259,7 @@ def scheduled_polynomial_filter(
     centre, system = lift_about_mean(plant, sensor, channel, degree, horizon)
     schedule = lmmse(system, polynomial_claim(plant, sensor, channel, degree))
     filter = PolynomialFilter(ScheduledFilter(schedule, first(plant).states), degree, centre=centre)
-    return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
+    return with_assumed(filter, AssumedModel(plant, sensor, channel, order=2 * degree))
 
 
 def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:

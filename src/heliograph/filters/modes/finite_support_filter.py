@@ -30,11 +30,11 @@ from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_told_numbers
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, list_models_by_step, steps_covered, vary_over_steps
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angles.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.check import fail, scalar

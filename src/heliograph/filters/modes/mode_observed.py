@@ -24,12 +24,12 @@ from heliograph.filters.linear.linear_filter_state import (
 )
 from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.modes.jump_linear_filter import claim_of_modes
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
@@ -295,4 +295,4 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
         **make_sizes(claim, start, received_numbers),
     )
     received = at_each_step(lambda link: with_flag(link, late=late), channel) if memories(channel) else channel
-    return with_premise(filter, Premise(plant, sensor, received))
+    return with_assumed(filter, AssumedModel(plant, sensor, received))

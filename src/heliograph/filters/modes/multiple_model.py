@@ -51,12 +51,12 @@ from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherS
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.markov_jump_models import ModalPlant, list_mode_models, transition_over
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float

@@ -36,12 +36,12 @@ from heliograph.filters.particles.resampling import (
 )
 from heliograph.filters.particles.state_particles import MANY, StateParticleFilter, build_state_particles
 from heliograph.filters.wrappers.accepted_models import accept_limits
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angles.angle import Angles, wrap_angles
 from heliograph.numerics.check import check_count

@@ -38,12 +38,12 @@ from heliograph.filters.modes.side_information_state import (
     mode_probabilities,
     split_columns,
 )
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack, vary_over_steps
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
@@ -367,7 +367,7 @@ def side_information_filter(
     if flags is not None and len(memories(channel)) != 1:
         return filter
     received = channel if flags is None else at_each_step(lambda link: with_flag(link, chances), channel)
-    return with_premise(filter, Premise(plant, sensor, received))
+    return with_assumed(filter, AssumedModel(plant, sensor, received))
 
 
 @cache_by_object

@@ -12,11 +12,11 @@ from heliograph.filters.words.bit_likelihoods import is_free_of_flips, make_link
 from heliograph.filters.words.two_hypothesis_filter import make_two_hypotheses_filter
 from heliograph.filters.words.word_filter import WordFilter
 from heliograph.filters.wrappers.late_data import late_filter
+from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, read_first_plant
-from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
 from heliograph.model.words.encoder import Dither, Words
 from heliograph.model.words.word_channel import FLAG, find_carried_components, rewrite_about_centres
@@ -131,14 +131,14 @@ def word_filter(
     refuse_angles("word filter", plant, sensor)
     # The codewords, the component of y (or FLAG) at each output of the channel, and what the link does to bits.
     words = _alphabet_of(first(sensor), encoder)
-    places = find_carried_components(channel)
+    indices = find_carried_components(channel)
     links = at_each_step(make_link_of_bits, channel)
     no_flips = all(is_free_of_flips(link) for link in unstack(links))
     if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     # A dither that is subtracted again is received with each codeword, after what the channel delivers.
-    dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
+    dithers = sum(place != FLAG for place in indices) if words.dither == "subtracted" else 0
     one_gaussian = WordFilter(
         plant=plant,
         transform=rule,
@@ -150,11 +150,11 @@ def word_filter(
         low=words.low,
         spacing=words.step,
         centre=words.centre,
-        places=places,
+        indices=indices,
         bits=words.bits,
         dither=words.dither,
         certain=no_flips,
-        **make_sizes("nominal", start, len(places) + dithers),
+        **make_sizes("nominal", start, len(indices) + dithers),
     )
     filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else make_two_hypotheses_filter(one_gaussian)
-    return with_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))
+    return with_assumed(filter, AssumedModel(plant, sensor, channel, encoder=encoder, order=None))

@@ -117,7 +117,7 @@ def build_behind_words(
     outputs = len(first(sensor).outputs)
     instance("encoder", encoder, Words, "Words").check_outputs(outputs)
     check_sent(first(sensor), first(channel))
-    places, numbers = find_carried_components(channel), rewrite_about_centres(encoder, channel)
+    indices, numbers = find_carried_components(channel), rewrite_about_centres(encoder, channel)
     # The channel of codewords as numbers, z = G (y - c) + n: in each mode if modes are reported, else at each step.
     channel_by_mode = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
     channels = [first(link) for link in channel_by_mode or unstack(numbers)]
@@ -130,10 +130,10 @@ def build_behind_words(
     # The sensor of y - c with rounding, and the filter of numbers behind it.
     rounded = at_each_step(lambda sensor: _add_rounding_noise(sensor, encoder, gaussian, fades), sensor)
     base = make(plant, rounded, numbers)
-    overload = bound_overload(plant, rounded, numbers, encoder, places)
+    overload = bound_overload(plant, rounded, numbers, encoder, indices)
     refuse_overload(overload)
-    words = tuple(i for i, place in enumerate(places) if place != FLAG)  # rows of z that are words
-    centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
+    words = tuple(i for i, place in enumerate(indices) if place != FLAG)  # rows of z that are words
+    centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in indices])
     gains = _gains_by_mode(channels if channel_by_mode else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
     claim_of_delay: Claim = "upper" if first(channel).past else "exact"
@@ -143,9 +143,9 @@ def build_behind_words(
         centres=centres,
         gains=gains,
         words=words,
-        flag=len(places) - 1 if channel_by_mode else None,
+        flag=len(indices) - 1 if channel_by_mode else None,
         overload=overload,
-        **make_sizes(claim, start, len(places) + gains.shape[1]),
+        **make_sizes(claim, start, len(indices) + gains.shape[1]),
     )
 
 

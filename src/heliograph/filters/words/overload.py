@@ -78,7 +78,7 @@ class Overload(NamedTuple):
 
 
 def bound_overload(
-    plant: AnyPlant, sensor: AnySensor, numbers: Channel, encoder: Words, places: tuple[int, ...]
+    plant: AnyPlant, sensor: AnySensor, numbers: Channel, encoder: Words, indices: tuple[int, ...]
 ) -> Overload:
     """Return how often codewords overload, and a bound on what that does to the rms error of a linear filter.
 
@@ -104,12 +104,12 @@ def bound_overload(
         sensor: sensor of y - c, whose noise includes that of rounding.
         numbers: the channel that carries codewords, as a random affine map of y - c.
         encoder: rule that turns numbers into codewords: `step` D, range `low` to `high`, `dither`.
-        places: for each output of the channel the component of y that it carries; negative if it reports the channel's
+        indices: for each output of the channel the component of y that it carries; negative if it reports the channel's
             mode instead.
     """
     link = at(numbers, k=0)
     # The sum over j assumes one gain per step: no late messages, no link with memory, every output a signal component.
-    no_bound = link.past or link.remembers or any(place < 0 for place in places)
+    no_bound = link.past or link.remembers or any(place < 0 for place in indices)
     # Steps that are looked at, as far as plant, sensor and channel are defined.
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
     outputs = len(at(sensor, k=0).outputs)
@@ -127,7 +127,7 @@ def bound_overload(
     # Without a bound the second number is NaN, unless overloads are so rare that they do not matter.
     if links is None or system is None:
         return Overload(probability, np.asarray(0.0 if probability.max() < RARE else np.nan))
-    return Overload(probability, np.asarray(_bound_error(system, rms_excess, links, places)))
+    return Overload(probability, np.asarray(_bound_error(system, rms_excess, links, indices)))
 
 
 RARE = 1e-9  # probability below which an overload is left out, behind links of which the bound is not known
@@ -276,7 +276,7 @@ def _bound_error(
     system: LinearSystem,
     rms_excess: Float[np.ndarray, "steps outputs"],
     links: list[SecondOrder],
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
 ) -> float:
     """Return a bound on the change of the rms error by overloads, relative to the rms error that the filter claims.
 
@@ -288,16 +288,16 @@ def _bound_error(
         system: plant, sensor and links.
         rms_excess: rms of the distance by which a codeword misses a signal beyond its range, at each step k.
         links: moments of the channel at each step.
-        places: for each output of the channel, the component of the signal that it carries.
+        indices: for each output of the channel, the component of the signal that it carries.
     """
     gains = lmmse(system).gains
     largest, n = 0.0, system.mean.size
-    terms = np.zeros((0, n, len(places)))  # ((I - K H) A)^j K s, a row of (n, outputs) for each j
+    terms = np.zeros((0, n, len(indices)))  # ((I - K H) A)^j K s, a row of (n, outputs) for each j
     for k in range(system.horizon):
         # s = sqrt(E g^2) (rms excess), with the link's gain g at each output.
         second_moment = np.asarray(links[k].power.center)
         rms_gain = np.sqrt(np.maximum(np.einsum("iikk->i", second_moment[..., :-1, :-1]), 0.0))
-        newest = gains.gain[k] * (rms_gain * rms_excess[k][list(places)])
+        newest = gains.gain[k] * (rms_gain * rms_excess[k][list(indices)])
         # Earlier terms move by (I - K H) A. Those that have become rounding are left out.
         is_used = np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(newest).max()
         terms = np.concatenate([gains.transition[k] @ terms[is_used], newest[None]])

@@ -47,7 +47,7 @@ class WordFilter(AbstractGaussianStateFilter):
         low: of each component, a word.
         spacing: D of each component.
         centre: of the words of each component.
-        places: component of y of each output of the channel; FLAG for an output that reports the mode.
+        indices: component of y of each output of the channel; FLAG for an output that reports the mode.
         bits: of a codeword; 0 for codewords without end.
         dither: of the encoder.
         certain: True if no bit flips.
@@ -59,7 +59,7 @@ class WordFilter(AbstractGaussianStateFilter):
     low: Array
     spacing: Array
     centre: Array
-    places: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
     bits: int = eqx.field(static=True)
     dither: Dither = eqx.field(static=True)
     certain: bool = eqx.field(static=True)
@@ -102,14 +102,14 @@ class WordFilter(AbstractGaussianStateFilter):
 
         A sensor sends codewords (values rounded to low + i spacing, i written in bits), of which the link may flip some
         bits. z (one step) has a number for each output of the channel: a received codeword, or the mode of the link, as
-        `places` says. If dither (noise that the sender adds before rounding) is subtracted, that of each codeword
+        `indices` says. If dither (noise that the sender adds before rounding) is subtracted, that of each codeword
         follows. A component may come several times, as copies over several paths. A codeword is returned as its number
         i. `link`: the channel's mixture of bit error rates at this step.
         """
-        outputs = len(self.places)
+        outputs = len(self.indices)
         # Rows of z that are words, the component of y of each, and how many steps it lies above the lowest word.
-        rows = [i for i, place in enumerate(self.places) if place != FLAG]
-        component = np.array([self.places[i] for i in rows])
+        rows = [i for i, place in enumerate(self.indices) if place != FLAG]
+        component = np.array([self.indices[i] for i in rows])
         dither = z[outputs:] if len(z) > outputs else jnp.zeros(len(rows))
         index = (z[np.array(rows)] - jnp.asarray(self.low)[component]) / jnp.asarray(self.spacing)[component]
         arrived = ~jnp.isnan(index) & ~jnp.isnan(dither)
@@ -222,12 +222,12 @@ class WordFilter(AbstractGaussianStateFilter):
         second = signal.covariance + jnp.diag(rounding_variance) + jnp.outer(mean, mean)
         about_centre = signal._replace(mean=mean, noise=noise, second=second)
         # Rows of z that are codewords (not the reported mode, FLAG), and the component of y in each.
-        rows = np.array([i for i, place in enumerate(self.places) if place != FLAG])
-        component = np.array(self.places)[rows]
+        rows = np.array([i for i, place in enumerate(self.indices) if place != FLAG])
+        component = np.array(self.indices)[rows]
         gain = jnp.asarray(numbers.mean_gain)
         values = z[rows] - jnp.asarray(self.centre)[component]
         # Dithers that are subtracted pass the link's mean gain, as the words do.
-        dithers = jnp.sum(gain, axis=1) * z[len(self.places) :] if len(z) > len(self.places) else 0.0
+        dithers = jnp.sum(gain, axis=1) * z[len(self.indices) :] if len(z) > len(self.indices) else 0.0
         # Innovation: value - dither - (gain mean + offset), and its covariance; NaN where nothing arrived.
         value = values - dithers - (gain @ mean + jnp.asarray(numbers.offset))
         covariance = innovation_covariance(about_centre, numbers)

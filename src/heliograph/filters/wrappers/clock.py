@@ -22,11 +22,11 @@ from heliograph.filters.gaussian.signal_moments import (
 from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, read_first_plant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import fail, items

@@ -18,12 +18,12 @@ from heliograph.filters.linear.linear_filter_state import LinearBelief, PlantMot
 from heliograph.filters.linear.precomputed_filter import PlannedFilter, plan_filter
 from heliograph.filters.wrappers.late_data import LateFilter, Make, build_known_delay_filter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.augmented.bias import append_driving_plant
 from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree

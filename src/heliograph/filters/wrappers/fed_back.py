@@ -14,13 +14,13 @@ from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cub
 from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at, first, stack_over_time
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64

@@ -12,12 +12,12 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, delayed
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float, Int, PyTree
@@ -119,11 +119,11 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     """
     instance("filter", filter, AbstractFilter, "a filter")
     delayed_filter = LateFilter(filter, check_count("delay", delay, least=0))
-    premise = filter.premise
-    if premise is None or not delay or premise.channel is None:
-        return with_premise(delayed_filter, premise)
-    channel = at_each_step(lambda link: delayed(link, delay), premise.channel)
-    return with_premise(delayed_filter, premise.replaced(channel=channel))
+    assumed = filter.assumed
+    if assumed is None or not delay or assumed.channel is None:
+        return with_assumed(delayed_filter, assumed)
+    channel = at_each_step(lambda link: delayed(link, delay), assumed.channel)
+    return with_assumed(delayed_filter, assumed.replaced(channel=channel))
 
 
 class KnownDelayFilter(AbstractWrapper):

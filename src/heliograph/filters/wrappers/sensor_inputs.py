@@ -17,11 +17,11 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.float64 import in_float64
@@ -120,6 +120,6 @@ def build_filter_of_inputs(
     if not hasattr(base, "sensor"):
         first(sensor).refuse_inputs(f"a {type(base).__name__}")
     filter = FilterOfInputs(base=base, plant=plant, sensor=sensor, **make_sizes(base.claim, base, base.received))
-    # The premise, the models under which the filter's claim holds, has the sensor with its inputs.
-    premise = base.premise
-    return with_premise(filter, premise and premise.replaced(sensor=sensor))
+    # The assumed model, the models under which the filter's claim holds, has the sensor with its inputs.
+    assumed = base.assumed
+    return with_assumed(filter, assumed and assumed.replaced(sensor=sensor))

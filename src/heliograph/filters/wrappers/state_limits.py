@@ -31,10 +31,10 @@ from heliograph.filters.remark import Remark
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
 from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits
 from heliograph.filters.wrappers.sensor_inputs import StateUnderInputs
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 
@@ -244,5 +244,5 @@ def build_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter
     limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)
     claim: Claim = weakest([base.claim, "nominal"])
     limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))
-    premise = base.premise
-    return with_premise(limited, premise and premise.replaced(plant=plant))
+    assumed = base.assumed
+    return with_assumed(limited, assumed and assumed.replaced(plant=plant))

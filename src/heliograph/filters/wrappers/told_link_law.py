@@ -22,12 +22,12 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.channel import Channel
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.estimate import Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angles.angle import Angles
 from heliograph.numerics.float64 import in_float64
@@ -279,9 +279,9 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         numbers=numbers,
         **make_sizes(claim, base, len(values) + len(numbers)),
     )
-    # The premise: the models under which the claim holds. Here they are the channel and sensor given.
-    premise = base.premise
-    return with_premise(filter, premise and premise.replaced(sensor=sensor, channel=channel))
+    # The assumed: the models under which the claim holds. Here they are the channel and sensor given.
+    assumed = base.assumed
+    return with_assumed(filter, assumed and assumed.replaced(sensor=sensor, channel=channel))
 
 
 @in_float64

@@ -172,7 +172,7 @@ def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> G
 
 
 def find_upstream_nodes(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
-    """Return, for each node, the places of the nodes from which a directed path leads to it, itself included.
+    """Return, for each node, the indices of the nodes from which a directed path leads to it, itself included.
 
     Nodes that are reached from the same ones, as those of one strongly connected component, share one array.
     """
@@ -185,7 +185,7 @@ def find_upstream_nodes(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
         for i in (*range(count), *reversed(range(count))):
             for sender in senders[i]:
                 sources[i] |= sources[sender]
-    # The places of the bits that are set, once for each set of them.
+    # The indices of the bits that are set, once for each set of them.
     as_bytes = {bits: np.frombuffer(bits.to_bytes(count // 8 + 1, "little"), np.uint8) for bits in set(sources)}
-    places = {bits: np.flatnonzero(np.unpackbits(row, bitorder="little")) for bits, row in as_bytes.items()}
-    return [places[bits] for bits in sources]
+    indices = {bits: np.flatnonzero(np.unpackbits(row, bitorder="little")) for bits, row in as_bytes.items()}
+    return [indices[bits] for bits in sources]

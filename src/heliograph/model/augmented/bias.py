@@ -128,24 +128,24 @@ class DrivenTransition(Module):
         plant: the plant of x.
         bias: that of b.
         coupling: E.
-        places: of the inputs of b among those of x.
+        indices: of the inputs of b among those of x.
     """
 
     plant: AbstractPlant
     bias: LinearPlant
     coupling: Array
-    places: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return the next state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
 
-        E is `self.coupling`, through which the biases drive the plant. u_b are the inputs at `self.places`, which move
+        E is `self.coupling`, through which the biases drive the plant. u_b are the inputs at `self.indices`, which move
         the biases.
         """
         n = len(self.plant.states)
         state, biases = x[:n], x[n:]
         next_state = self.plant.transition(state, u) + jnp.asarray(self.coupling) @ biases
-        return jnp.concatenate([next_state, self.bias.transition(biases, u[np.array(self.places, int)])])
+        return jnp.concatenate([next_state, self.bias.transition(biases, u[np.array(self.indices, int)])])
 
 
 def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
@@ -175,18 +175,18 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
     centers = [model.initial_mean - law.mean for model, law in zip(models, laws, strict=True)]
     center, start = library(*centers).concatenate(centers), Independent(laws)
     # The noises are one law if both are laws. Else one of them is a covariance that depends on the inputs.
-    places = tuple(plant.inputs.index(name) for name in bias.inputs)
+    indices = tuple(plant.inputs.index(name) for name in bias.inputs)
     constant_noises = [model.noise for model in models if isinstance(model.noise, AbstractNoise)]
     all_inputs = tuple(range(len(plant.inputs)))
     both_are_laws = len(constant_noises) == len(models)
-    noise = Independent(constant_noises) if both_are_laws else JointNoise(models, (all_inputs, places))
+    noise = Independent(constant_noises) if both_are_laws else JointNoise(models, (all_inputs, indices))
     if not isinstance(plant, LinearPlant):
         if np.any(np.asarray(coupling)[list(plant.manifold.rotations)]):
             raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
-        move = DrivenTransition(plant, bias, coupling, places)
+        move = DrivenTransition(plant, bias, coupling, indices)
         return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
     # Both are linear: the matrices of [x; b]. `inputs_of_bias` @ u is the inputs of b.
-    inputs_of_bias = np.eye(len(plant.inputs))[list(places)]
+    inputs_of_bias = np.eye(len(plant.inputs))[list(indices)]
     matrix, input_matrix = _make_driven_matrices(plant, bias, coupling, inputs_of_bias)
     return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 

@@ -69,19 +69,19 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor
 
 
 class InputDependentSensors(Module):
-    """Sensors side by side of which some depend on inputs, with the places of their inputs among all.
+    """Sensors side by side of which some depend on inputs, with the indices of their inputs among all.
 
     Args:
         parts: the sensors.
-        places: places of each one's inputs among all.
+        indices: indices of each one's inputs among all.
     """
 
     parts: tuple[AbstractSensor, ...]
-    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def given(self, u: jax.Array) -> list[Any]:
         """Return the sensors as they are under all inputs u (inputs,)."""
-        return [part.given(own) for part, own in zip(self.parts, split_inputs(u, self.places), strict=True)]
+        return [part.given(own) for part, own in zip(self.parts, split_inputs(u, self.indices), strict=True)]
 
 
 class JointMatrix(InputDependentSensors):

@@ -126,14 +126,14 @@ def check_inputs(
         if id(plant) not in known and first(plant).inputs == tuple(names):
             _check_functions_of_inputs(plant, u, steps)
         known.add(id(plant))
-    for sensor, places in _sensors_of_inputs(models, names):
+    for sensor, indices in _sensors_of_inputs(models, names):
         if id(sensor) not in known:
-            _check_functions_of_inputs(sensor, u[:, places], steps)
+            _check_functions_of_inputs(sensor, u[:, indices], steps)
         known.add(id(sensor))
 
 
 def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
-    """Yield the sensors in `models` that depend on inputs, all of which are in `names`, with their places there."""
+    """Yield the sensors in `models` that depend on inputs, all of which are in `names`, with their indices there."""
     for sensor in yield_models_of_class(models, AbstractSensor):
         own = first(sensor).inputs
         if own and set(own) <= set(names):
@@ -290,8 +290,8 @@ def do_inputs_spoil(
         if not names or plant.inputs != tuple(names):
             continue
         spoilt |= _returns_invalid_value(plant, u, precision)
-    for sensor, places in _sensors_of_inputs(model, names):
-        spoilt |= _returns_invalid_value(at(sensor, k), u[np.array(places)], precision)
+    for sensor, indices in _sensors_of_inputs(model, names):
+        spoilt |= _returns_invalid_value(at(sensor, k), u[np.array(indices)], precision)
     return spoilt
 
 

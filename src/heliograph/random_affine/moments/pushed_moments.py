@@ -90,7 +90,7 @@ def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> 
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
     mapped_products = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
-    mapped = mapped_products.reshape(-1)[_choose_product_places(outputs, order // 2)]
+    mapped = mapped_products.reshape(-1)[_choose_product_indices(outputs, order // 2)]
     return mapped
 
 
@@ -126,8 +126,8 @@ def _read_tabulated_moments(noise: TabulatedNoise, order: int) -> Array1:
 @cache_arrays
 def _positions_of_lower_order(dimension: int, order: int, above: int) -> np.ndarray:
     """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
-    places = position(dimension + 1, above)
-    return np.array([places[(*p[:-1], p[-1] + above - order)] for p in list_exponents(dimension + 1, order)])
+    indices = position(dimension + 1, above)
+    return np.array([indices[(*p[:-1], p[-1] + above - order)] for p in list_exponents(dimension + 1, order)])
 
 
 def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array2:
@@ -151,7 +151,7 @@ def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) ->
 
 
 @cache_arrays
-def _choose_product_places(variables: int, degree: int) -> np.ndarray:
+def _choose_product_indices(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place in the flattened table of products of monomials of degree k.
 
     If several products give the same monomial, it is the place of the last one.

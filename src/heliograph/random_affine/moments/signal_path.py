@@ -43,14 +43,14 @@ class ChannelPosition(NamedTuple):
         positions = [self._replace(prefix=f"{self.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
         return list(zip(maps, positions, strict=True))
 
-    def select_components(self, places: Sequence[int]) -> "ChannelPosition":
-        """Return the position at a map that takes only the components of y at these places.
+    def select_components(self, indices: Sequence[int]) -> "ChannelPosition":
+        """Return the position at a map that takes only the components of y at these indices.
 
         The signal then has the rows and columns of E (y, 1)(y, 1)' of these components and of the constant.
         """
         if self.signal is None:
             return self
-        chosen = np.array([*places, -1])
+        chosen = np.array([*indices, -1])
         second = self.signal.second[chosen[:, None], chosen]
         return self._replace(signal=self.signal._replace(second=second))
 

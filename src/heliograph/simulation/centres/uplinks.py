@@ -120,9 +120,9 @@ class Uplinks(Module):
         gain = jnp.zeros((nodes, m, n)) if self.groups else jnp.tile(jnp.eye(n), (nodes, 1, 1))
         offset = jnp.where(np.arange(m) < np.array(self.received)[:, None], 0.0, jnp.nan)
         delay = self.fixed_delay
-        # A group holds nodes whose channels have one structure: `group.places` are their numbers.
+        # A group holds nodes whose channels have one structure: `group.indices` are their numbers.
         for group in self.groups:
-            node_numbers = jnp.asarray(group.places)
+            node_numbers = jnp.asarray(group.indices)
             matrices, delays = _draw_links(group, jnp.asarray(self.delay)[node_numbers], key, k)  # [G b; 0 1]
             size = matrices.shape[1] - 1
             gain = gain.at[node_numbers, :size].set(matrices[:, :-1, :-1])

@@ -11,11 +11,11 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.words.linear_word_filter import SEEN
 from heliograph.filters.wrappers.told_link_law import ToldFilter, believe_typical
+from heliograph.model.assumed.agreement import CHANNEL
+from heliograph.model.assumed.same_plant_and_sensor import find_sensor_matrix
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.premises.agreement import CHANNEL
-from heliograph.model.premises.same_plant_and_sensor import find_sensor_matrix
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import DOUBLE

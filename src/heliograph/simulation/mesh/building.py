@@ -44,7 +44,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
         edges=build_edges(fusion, graph),
         observation_model=_model_measurements(network, nodes),
         senders=graph.senders,
-        places=tuple(tuple(index[node] for node in group) for group in groups),
+        indices=tuple(tuple(index[node] for node in group) for group in groups),
         nodes=graph.nodes,
         alpha=None if fusion.alpha is None else np.asarray(fusion.alpha),  # an argument of the program, no constant
         quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
@@ -59,15 +59,15 @@ def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObser
     Nodes of one group of the network have models of one structure, which are stacked.
     """
     models_by_group: list[ObservationModel | None] = []
-    places: dict[str, int] = {}  # of each node among all, group after group
+    number_of_node: dict[str, int] = {}  # of each node among all, group after group
     for names in network.groups:
         sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
         channels = [node.channel for node in sensors]
         models_by_group.append(stack_nodes([node.sensor for node in sensors], channels) if sensors else None)
-        places |= {node: len(places) + i for i, node in enumerate(names)}
+        number_of_node |= {node: len(number_of_node) + i for i, node in enumerate(names)}
     return SeparateObservations(
         groups=tuple(models_by_group),
-        order=np.array([places[node] for node in nodes]),
+        order=np.array([number_of_node[node] for node in nodes]),
         size=max(1, *(node.received for node in network.nodes.values())),
         counts=tuple(map(len, network.groups)),
     )

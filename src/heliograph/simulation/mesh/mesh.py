@@ -59,7 +59,7 @@ class Mesh(Module):
         edges: by which messages arrive or get lost.
         observation_model: of the nodes' measurements.
         senders: numbers of the nodes of which each node receives (node, degree), itself first.
-        places: numbers in the mesh of the nodes of each group of the network that the mesh estimates at.
+        indices: numbers in the mesh of the nodes of each group of the network that the mesh estimates at.
         nodes: their names.
         alpha: where nodes send on events, the threshold of `find_event_senders`.
         quantizer: of the estimates that are sent, stacked by node.
@@ -73,7 +73,7 @@ class Mesh(Module):
     edges: MeshEdges
     observation_model: SeparateObservations
     senders: np.ndarray
-    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
     alpha: np.ndarray | None
     quantizer: AbstractQuantizer | None
@@ -383,9 +383,9 @@ class Mesh(Module):
     def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
         """Return the estimates (1, node, ...) of each group of nodes, from means and covariances in the mesh's order.
 
-        `self.places`: numbers of each group's nodes in the mesh. The first axis, of filters, has length 1.
+        `self.indices`: numbers of each group's nodes in the mesh. The first axis, of filters, has length 1.
         """
-        groups = map(jnp.array, self.places)
+        groups = map(jnp.array, self.indices)
         return tuple(Estimate(mean[nodes][None], covariance[nodes][None], self.claim) for nodes in groups)
 
 

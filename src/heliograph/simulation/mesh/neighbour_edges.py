@@ -86,7 +86,7 @@ class MeshEdges(Module):
                 after, by_edge = self._draw_group(group, state, key, k, exchange)
                 next_states.append(after)
                 # Each edge of the group has its place in the flattened (node, degree).
-                arrives = arrives.ravel().at[self.slots[group.places]].set(by_edge).reshape(arrives.shape)
+                arrives = arrives.ravel().at[self.slots[group.indices]].set(by_edge).reshape(arrives.shape)
             states = tuple(next_states)
             arrivals_by_round.append(arrives)
         return states, jnp.stack(arrivals_by_round, axis=1)

@@ -16,14 +16,14 @@ from heliograph.filters.innovation import gaussian_innovation, no_innovation
 from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import AbstractQuantizer
+from heliograph.model.assumed.assumed_model import with_assumed
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.simulation.centres.observation_model import SeparateObservations, stack_nodes
-from heliograph.simulation.covariance_claims import find_premise
+from heliograph.simulation.covariance_claims import find_assumed
 from heliograph.simulation.mesh.late_and_quantized_messages import MessagesOnTheWay, quantize_estimate
 from heliograph.simulation.mesh.mesh import Mesh
 from heliograph.simulation.mesh.neighbour_edges import MeshEdges
@@ -192,8 +192,8 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         received=own + sum(_count_message_numbers(len(network.states), size) for size in of_neighbours),
     )
     # The claim (what the covariance is said to be: exact, upper bound or nominal) is that of the whole network. The
-    # premise, attached here, holds the models under which it is true: plant, and the node's sensor and channel.
-    return with_premise(filter, find_premise(network, node))
+    # assumed model, attached here, holds the models under which it is true: plant, and the node's sensor and channel.
+    return with_assumed(filter, find_assumed(network, node))
 
 
 def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
@@ -231,7 +231,7 @@ def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
             tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count
         ),
         senders=np.arange(count)[None],  # numbered among the members
-        places=((0,),),
+        indices=((0,),),
         nodes=names,
         alpha=None,
         quantizer=None,

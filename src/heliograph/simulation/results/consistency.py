@@ -70,12 +70,12 @@ def nees(
         truth: true states, NaN for components that are not known. The others are judged, by their part of P.
         mean: estimates, NaN where there is none.
         covariance: claimed covariances P of the errors, one (n, n) for all steps or one a step.
-        angles: places of the states that are angles in radians, whose errors are between -pi and pi. A plant may be
+        angles: indices of the states that are angles in radians, whose errors are between -pi and pi. A plant may be
             given instead; errors of its attitudes are then rotation vectors. None are angles by default.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite, a matrix that is no covariance, angles that are
-            no places in the state.
+            no indices in the state.
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
@@ -104,7 +104,7 @@ def nis(
             as a filter's own innovations are between -pi and pi already.
 
     Raises:
-        ValueError: shapes that do not fit, infinite numbers, a matrix that is no covariance, angles that are no places
+        ValueError: shapes that do not fit, infinite numbers, a matrix that is no covariance, angles that are no indices
             in the innovation.
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.

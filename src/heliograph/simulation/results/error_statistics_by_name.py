@@ -25,7 +25,7 @@ from heliograph.simulation.results.plots import (
     FAR,
     choose_colour,
     choose_filters,
-    find_state_places,
+    find_state_indices,
     legend_outside,
     make_panels,
 )
@@ -182,10 +182,10 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
         """
         # The filters and states that are drawn, over steps 1, 2, ..., on one axes for each state.
         node, filters = choose_filters(self, node, filters)
-        places = find_state_places(states, self.states)
+        indices = find_state_indices(states, self.states)
         time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
-        drawn = make_panels(axes, len(places), time, self.units)
-        for panel, i in zip(drawn, places, strict=True):
+        drawn = make_panels(axes, len(indices), time, self.units)
+        for panel, i in zip(drawn, indices, strict=True):
             for number, name in enumerate(filters):
                 # Solid: actual; dashed: claimed, the root of the variance that the filter states.
                 score, colour = self[node][name], choose_colour(number)

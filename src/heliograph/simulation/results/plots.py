@@ -36,8 +36,8 @@ def choose_filters(
     return chosen_node, names
 
 
-def find_state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
-    """Return the places of the chosen `states` in `known`, or of all if None; raise ValueError for an unknown state."""
+def find_state_indices(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
+    """Return the indices of the chosen `states` in `known`, or of all if None; an unknown one is a ValueError."""
     one_or_all = [states] if isinstance(states, str) else states
     chosen = list(known if one_or_all is None else one_or_all)
     for name in chosen:

@@ -38,7 +38,7 @@ from heliograph.simulation.results.plots import (
     choose_filters,
     draw_modes,
     draw_state,
-    find_state_places,
+    find_state_indices,
     legend_outside,
     make_panels,
 )
@@ -332,11 +332,11 @@ class Record(SavableResults):
             ModuleNotFoundError: without matplotlib (extra "report").
         """
         node, filters = choose_filters(self.estimates, node, filters)
-        places = find_state_places(states, self.states)
+        indices = find_state_indices(states, self.states)
         check_run(run, self.runs)
         of_run: Any = ... if self.runs is None else run  # index of the run; `...` takes all of a record without runs
-        drawn = make_panels(axes, len(places), self.time, self.units)
-        for panel, i in zip(drawn, places, strict=True):
+        drawn = make_panels(axes, len(indices), self.time, self.units)
+        for panel, i in zip(drawn, indices, strict=True):
             truth = None if self.truth is None else self.truth[of_run][..., i]
             estimates = {name: self.estimates[node][name] for name in filters}
             draw_state(panel, self.time, estimates, (of_run, i), sigmas, truth)

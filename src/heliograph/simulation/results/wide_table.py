@@ -71,18 +71,18 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
     leading_axes = (steps,) if runs is None else (runs, steps)
     if runs is not None:
         _check_rows_of_runs(frame, runs, steps)
-    places: _Places = {}
+    indices: _Places = {}
     for i, (node, name, quantity, _, _) in enumerate(frame.columns):
-        places.setdefault((node, name, quantity), []).append(i)
-    _sort_places(frame, places)
-    values = {key: frame.iloc[:, columns].to_numpy().reshape(*leading_axes, -1) for key, columns in places.items()}
+        indices.setdefault((node, name, quantity), []).append(i)
+    _sort_indices(frame, indices)
+    values = {key: frame.iloc[:, columns].to_numpy().reshape(*leading_axes, -1) for key, columns in indices.items()}
     # States as the truth, else the first mean, has them.
-    named = next((columns for (_, _, quantity), columns in places.items() if quantity in ("truth", "mean")), [])
+    named = next((columns for (_, _, quantity), columns in indices.items() if quantity in ("truth", "mean")), [])
     measurements = {node: z for (node, _, quantity), z in values.items() if quantity == "measurement"}
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in measurements}
     for node, name, quantity in values:
         if quantity in COVARIANCE:
-            estimates.setdefault(node, {})[name] = _read_estimate(frame, places, values, (node, name, quantity))
+            estimates.setdefault(node, {})[name] = _read_estimate(frame, indices, values, (node, name, quantity))
     return {
         "time": np.asarray(frame.index.get_level_values("time"))[:steps],
         "states": tuple(frame.columns[i][LEVELS.index("component")] for i in named),
@@ -107,19 +107,19 @@ def _check_rows_of_runs(frame: "pd.DataFrame", runs: int, steps: int) -> None:
         raise fail("table, rows", expected, f"{len(frame)} of {runs} runs, some in another order or missing")
 
 
-def _sort_places(frame: "pd.DataFrame", places: _Places) -> None:
+def _sort_indices(frame: "pd.DataFrame", indices: _Places) -> None:
     """Put the columns of each quantity into one order, by what they say of themselves: states as the first of them has.
 
-    `places`: of each key, the places of its columns, which are changed. Components that are no states are numbered.
+    `indices`: of each key, the indices of its columns, which are changed. Components that are no states are numbered.
 
     Raises:
         ValueError: a quantity without some of the states.
     """
     labels = [(str(column[3]), str(column[4])) for column in frame.columns]  # component and other
     states = next(
-        ([labels[i][0] for i in found] for (*_, kind), found in places.items() if kind in ("truth", "mean")), []
+        ([labels[i][0] for i in found] for (*_, kind), found in indices.items() if kind in ("truth", "mean")), []
     )
-    for (node, name, quantity), found in places.items():
+    for (node, name, quantity), found in indices.items():
         if quantity == "measurement" or quantity == MODES:
             found.sort(key=lambda i: int(labels[i][0].removeprefix("z")))
             continue
@@ -133,16 +133,16 @@ def _sort_places(frame: "pd.DataFrame", places: _Places) -> None:
         found[:] = [there[label] for label in wanted]
 
 
-def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
+def _read_estimate(frame: "pd.DataFrame", indices: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
     """Return the estimate of a node's filter from a table.
 
-    A key is (node, filter, quantity). `key`: the key of the covariance, whose quantity says the claim. `places`: of
-    each key, the places of its columns. `values`: arrays (run, time, component) by key.
+    A key is (node, filter, quantity). `key`: the key of the covariance, whose quantity says the claim. `indices`: of
+    each key, the indices of its columns. `values`: arrays (run, time, component) by key.
     """
     node, name, quantity = key
     mean, covariance = values[node, name, "mean"], values[key]
     # The last level of a mean's columns numbers the states of attitudes "0", "1" and so on. For others it is "".
-    numbers = [frame.columns[i][LEVELS.index("other")] for i in places[node, name, "mean"]]
+    numbers = [frame.columns[i][LEVELS.index("other")] for i in indices[node, name, "mean"]]
     attitude_states = len(numbers) - numbers.count("")
     return Estimate(
         mean=mean,

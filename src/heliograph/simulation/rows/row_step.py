@@ -38,17 +38,17 @@ class NetworkStep(Module):
         network: the network.
         filters: its filters.
 
-    Field `places`: by group, where each node's measurements stand among all of a row (node, received).
+    Field `columns`: by group, the columns of a row that are each node's measurements (node, received).
     """
 
     filters: AllFilters
-    places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
+    columns: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
         """Store the filters and, by group of nodes, the indices of each node's components in the joined measurement."""
         self.filters = filters
         indices = {name: tuple(rows) for name, rows in network.rows.items()}
-        self.places = tuple(tuple(indices[name] for name in names) for names in network.groups)
+        self.columns = tuple(tuple(indices[name] for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Return all filters' states after step k, without implausible measurements, and the outputs.
@@ -63,7 +63,7 @@ class NetworkStep(Module):
 
     def group_measurements(self, received: jax.Array) -> list[jax.Array]:
         """Return the measurements (node, received) of each group, from those of all nodes in their order."""
-        return [received[np.array(columns, dtype=int)] for columns in self.places]  # of nodes without a sensor none
+        return [received[np.array(columns, dtype=int)] for columns in self.columns]  # of nodes without a sensor none
 
 
 class RowLayout(NamedTuple):
@@ -343,7 +343,7 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
         """
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:
-            """Return `done` with the `together` rows of iteration i stepped, in parallel, at their places."""
+            """Return `done` with the `together` rows of iteration i stepped, in parallel, where they stand."""
             rows_of_iteration = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
             stepped = jax.vmap(lambda row: step(numbers, row))(rows_of_iteration)
             return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, axis=0)

@@ -87,13 +87,13 @@ class ChannelGroup(Module):
         channel: the stack, with a leading axis of channels.
         checksums: of their names (channel,), which seed their draws.
         memories: numbers that seed the draws of their memories (channel, memory).
-        places: of each among all channels (channel,).
+        indices: of each among all channels (channel,).
     """
 
     channel: Channel
     checksums: np.ndarray
     memories: np.ndarray
-    places: np.ndarray
+    indices: np.ndarray
 
 
 def group_channels(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
@@ -115,16 +115,16 @@ def group_channels(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     # A group for each structure: its channels stacked, then one row for each name that has one of them.
     groups = []
     for row_of in rows_by_structure.values():
-        places = np.array([i for i, channel in enumerate(listed) if id(channel) in row_of])
-        rows = np.array([row_of[id(listed[i])] for i in places])
+        indices = np.array([i for i, channel in enumerate(listed) if id(channel) in row_of])
+        rows = np.array([row_of[id(listed[i])] for i in indices])
         stacked = stack([unnamed[identity] for identity in row_of])
         channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, stacked)
         groups.append(
             ChannelGroup(
                 channel=channel,
-                checksums=checksums[places],
-                memories=np.stack([memories[i] for i in places]),
-                places=places,
+                checksums=checksums[indices],
+                memories=np.stack([memories[i] for i in indices]),
+                indices=indices,
             )
         )
     return tuple(groups)

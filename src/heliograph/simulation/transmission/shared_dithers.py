@@ -24,10 +24,10 @@ def refuse_shared_dithers(network: Network, z: Mapping[str, Float[np.ndarray, "s
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or node.encoder is None or not node.encoder.subtracts:
             continue
-        places = [place for place in find_carried_components(node.channel) if place != FLAG]
-        for component in dict.fromkeys(places):  # copies of a word have one dither
+        indices = [place for place in find_carried_components(node.channel) if place != FLAG]
+        for component in dict.fromkeys(indices):  # copies of a word have one dither
             # Dithers stand at the end of what is received.
-            drawn = z[name][:, node.received - len(places) + places.index(component)]
+            drawn = z[name][:, node.received - len(indices) + indices.index(component)]
             dithers, sender = drawn[~np.isnan(drawn)], f"{name}.{node.outputs[component]}"
             if len(dithers) >= FEWEST and seen.setdefault(dithers.tobytes(), sender) != sender:
                 first_sender = seen[dithers.tobytes()]

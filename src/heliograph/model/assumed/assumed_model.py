@@ -29,11 +29,11 @@ MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim res
 
 
 @readable
-class Premise:
+class AssumedModel:
     """What a filter believes of the world: its claim is about this plant, sensor, channel and trigger.
 
-    In a network the claim holds as far as they are the node's own (`heliograph.model.premises.agreement`). The premise
-    is kept beside the filter's numbers and decides none of them: filters that differ in it alone have one structure.
+    In a network the claim holds as far as they are the node's own (`heliograph.model.assumed.agreement`). It is
+    kept beside the filter's numbers and decides none of them: filters that differ in it alone have one structure.
 
     Args:
         plant: the plant.
@@ -69,84 +69,83 @@ class Premise:
         self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
         self.encoder = encoder
 
-    def replaced(self, **parts: Any) -> "Premise":
-        """Return the premise, the models that a filter was made for, with some of them replaced, such as plant=..."""
+    def replaced(self, **parts: Any) -> "AssumedModel":
+        """Return the models that a filter was made for with some of them replaced, such as plant=..."""
         other = copy(self)
         other.__dict__.update(parts)
         return other
 
 
-class StaticPremise:
-    """A premise as a static field of a tree of arrays: all of them are equal, so that none decides what is compiled.
+class StaticAssumedModel:
+    """An assumed model as a static field of a tree of arrays: all are equal, so that none decides what is compiled.
 
-    lowered: whether the claim was lowered, since the filter runs in another world than its premise.
+    lowered: whether the claim was lowered, since the filter runs in another world than its assumed model.
     """
 
-    def __init__(self, premise: Premise | None, lowered: bool = False):
-        """Hold a premise, None of a filter without one, and whether the filter's claim was lowered to nominal."""
-        self.premise, self.lowered = premise, lowered
+    def __init__(self, assumed: AssumedModel | None, lowered: bool = False):
+        """Hold an assumed model, None of a filter without one, and whether the filter's claim was lowered."""
+        self.assumed, self.lowered = assumed, lowered
 
     def __eq__(self, other: object) -> bool:
-        """Return True for any other premise."""
-        return isinstance(other, StaticPremise)
+        """Return True for any other assumed model."""
+        return isinstance(other, StaticAssumedModel)
 
     def __hash__(self) -> int:
-        """Return the hash that all premises have."""
-        return hash(StaticPremise)
+        """Return the hash that all assumed models have."""
+        return hash(StaticAssumedModel)
 
 
-NOTHING = StaticPremise(None)
+NOTHING = StaticAssumedModel(None)
 
 
-class HasPremise(Protocol):
+class HasAssumedModel(Protocol):
     """A filter, a schedule or a linear system, which keeps what it was made for."""
 
     @property
-    def kept(self) -> StaticPremise:
-        """The premise as it is kept."""
+    def kept(self) -> StaticAssumedModel:
+        """The assumed model as it is kept."""
 
 
-B = TypeVar("B", bound=HasPremise)
+B = TypeVar("B", bound=HasAssumedModel)
 P = ParamSpec("P")
 
 
-def with_premise(made: B, premise: Premise | None) -> B:
-    """Return a copy of a filter, schedule or system that keeps what it was made for, its premise.
+def with_assumed(made: B, assumed: AssumedModel | None) -> B:
+    """Return a copy of a filter, schedule or system that keeps what it was made for, its assumed model.
 
-    Later a network compares the premise with its own models, to decide whether the claim on the covariance holds.
+    Later a network compares the assumed model with its own models, to decide whether the claim on the covariance holds.
 
     Args:
         made: the filter, schedule or system, whose numbers stay.
-        premise: the plant, sensor, channel and so on that it assumes; None if they are not known.
+        assumed: the plant, sensor, channel and so on that it assumes; None if they are not known.
 
     Raises:
         ValueError: the plant has an unknown start, attitudes, limits or rates of its modes, and `made` is of a kind
             that has no formulas for them.
     """
     # Each property of a plant that needs formulas of its own; `made` says by a flag whether it has them.
-    unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
+    unknown = assumed is not None and isinstance(first(assumed.plant).initial_covariance, UnknownStart)
     if unknown and not getattr(made, "takes_unknown_start", False):
         raise fail("initial covariance", TAKEN_BY, "hg.diffuse")
-    attitude = () if premise is None else first(premise.plant).attitude
+    attitude = () if assumed is None else first(assumed.plant).attitude
     if attitude and not getattr(made, "attitude", ()):
         raise fail(f"plant of a {type(made).__name__}", WITHOUT_ATTITUDE, list(attitude))
-    limits = () if premise is None else first(premise.plant).limits
+    limits = () if assumed is None else first(assumed.plant).limits
     if limits and not getattr(made, "takes_limits", False):
         raise fail("plant", LIMITS_TAKEN_BY, f"limits of {[name for name, _ in limits]}")
-    rates = None if premise is None else getattr(first(premise.plant), "rates", None)
+    rates = None if assumed is None else getattr(first(assumed.plant), "rates", None)
     if rates is not None and not getattr(made, "takes_rates", False):
         raise fail("plant", RATES_TAKEN_BY, "rates of switches")
-    with_its_premise = copy(made)
-    object.__setattr__(with_its_premise, "kept", StaticPremise(premise))  # the fields of a module are frozen
-    return with_its_premise
+    with_its_assumed = copy(made)
+    object.__setattr__(with_its_assumed, "kept", StaticAssumedModel(assumed))  # the fields of a module are frozen
+    return with_its_assumed
 
 
 def believes(make: Callable[P, B]) -> Callable[P, B]:
     """Let the filter that a function makes keep the models for which it is made: plant, sensor, channel and so on.
 
-    A filter's claim says what its covariance is (exact, upper bound, nominal); its premise is the models for which that
-    is so. In a network the claim holds where these are the node's own. Without a channel, the sensor's outputs are
-    received as they are.
+    A filter's claim says what its covariance is (exact, upper bound, nominal), for these models. In a network
+    the claim holds where these are the node's own. Without a channel, the sensor's outputs are received as they are.
 
     Args:
         make: a function that makes a filter for a plant, a sensor and a channel.
@@ -162,15 +161,15 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:
-        """Make the filter by the decorated function `make`, and store the models among the arguments as its premise.
+        """Make the filter by the decorated function `make`, and store the models among the arguments.
 
         The models are the arguments of these names: plant, sensor, channel, trigger and encoder.
         """
         arguments = parameters.bind(*args, **kwargs).arguments
-        premise = Premise(**{name: arguments[name] for name in model_names if name in arguments})
-        if premise.sensor is not None and premise.channel is None:
+        assumed = AssumedModel(**{name: arguments[name] for name in model_names if name in arguments})
+        if assumed.sensor is not None and assumed.channel is None:
             # Without a channel the sensor's outputs are received as they are.
-            premise.channel = perfect(len(first(premise.sensor).outputs))
-        return with_premise(make(*args, **kwargs), premise)
+            assumed.channel = perfect(len(first(assumed.sensor).outputs))
+        return with_assumed(make(*args, **kwargs), assumed)
 
     return build

@@ -5,13 +5,13 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from heliograph.model.assumed.assumed_model import MEAN_AND_COVARIANCE
+from heliograph.model.assumed.same_program import same_function
 from heliograph.model.augmented.joint_sensors import JointSensor
 from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
 from heliograph.model.over_time import at, steps_covered
 from heliograph.model.plant import AbstractPlant, LinearPlant, MatrixOfInputs
-from heliograph.model.premises.premise import MEAN_AND_COVARIANCE
-from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.module import are_same
 from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from heliograph.model.assumed.assumed_model import MEAN_AND_COVARIANCE
+from heliograph.model.assumed.same_plant_and_sensor import agree_at_each_step, find_sensor_matrix, same_noise
 from heliograph.model.channel import Channel
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import first, unstack
-from heliograph.model.premises.premise import MEAN_AND_COVARIANCE
-from heliograph.model.premises.same_plant_and_sensor import agree_at_each_step, find_sensor_matrix, same_noise
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.module import are_same
 from heliograph.numerics.numpy_or_jax import EQUAL, is_traced

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from heliograph.model.assumed.assumed_model import MEAN_AND_COVARIANCE, AssumedModel
+from heliograph.model.assumed.same_channel import same_channel, same_observation
+from heliograph.model.assumed.same_plant_and_sensor import agree_at_each_step, same_plant, same_sensor
 from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.premises.premise import MEAN_AND_COVARIANCE, Premise
-from heliograph.model.premises.same_channel import same_channel, same_observation
-from heliograph.model.premises.same_plant_and_sensor import agree_at_each_step, same_plant, same_sensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import are_same
 from heliograph.numerics.numpy_or_jax import equal_to_rounding
@@ -25,7 +25,7 @@ RANGE = "range of values"
 ENCODER = "encoder"
 
 
-def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
+def list_differences(believed: AssumedModel, own: AssumedModel) -> tuple[str, ...]:
     """Return the names of the models that differ: those a filter was made for (`believed`), and its node's (`own`).
 
     Models are plant, sensor, channel and relays. Its claim holds only in the world for which it was made.
@@ -58,7 +58,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     return tuple(parts)
 
 
-def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
+def _enlarge_world_by_past(believed: AssumedModel, own: AssumedModel) -> AssumedModel:
     """Return the models of a node with past signals as states if the filter was made for such a larger plant.
 
     `believed` are the models that the filter was made for, and `own` those where it stands. The latter are returned
@@ -72,33 +72,33 @@ def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
     return own.replaced(plant=plant, sensor=sensor, channel=channel)
 
 
-def join_premises(premises: Sequence[Premise]) -> Premise:
-    """Return what a filter assumes (its premise) that receives the measurements of several filters of one plant.
+def join_assumed(assumed_models: Sequence[AssumedModel]) -> AssumedModel:
+    """Return what a filter assumes (its assumed model) that receives the measurements of several filters of one plant.
 
     Sensors and channels are stacked. The first trigger, encoder or range of values among them stands for all.
     """
-    if len(premises) == 1:
-        return premises[0]
-    sensors = [premise.sensor for premise in premises if premise.sensor is not None]
-    channels = [premise.channel for premise in premises if premise.channel is not None]
+    if len(assumed_models) == 1:
+        return assumed_models[0]
+    sensors = [assumed.sensor for assumed in assumed_models if assumed.sensor is not None]
+    channels = [assumed.channel for assumed in assumed_models if assumed.channel is not None]
     sensor, channel = join_links({str(i): s for i, s in enumerate(sensors)}, channels)
-    triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]
-    encoders = [premise.encoder for premise in premises if premise.encoder is not None]
-    ranges = [premise.range for premise in premises if premise.range is not None]
-    return premises[0].replaced(
+    triggers = [p.trigger for p in assumed_models if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    encoders = [assumed.encoder for assumed in assumed_models if assumed.encoder is not None]
+    ranges = [assumed.range for assumed in assumed_models if assumed.range is not None]
+    return assumed_models[0].replaced(
         sensor=sensor,
         channel=channel,
         trigger=triggers[0] if triggers else None,
         encoder=encoders[0] if encoders else None,
         range=ranges[0] if ranges else None,
-        order=None if any(premise.order is None for premise in premises) else MEAN_AND_COVARIANCE,
+        order=None if any(assumed.order is None for assumed in assumed_models) else MEAN_AND_COVARIANCE,
     )
 
 
-def restrict_premise_to_rows(premise: Premise, rows: Sequence[int]) -> Premise:
-    """Return what a filter assumes (its premise) if only these rows of its channel's outputs are received."""
-    selection = known(np.eye(first(premise.channel).outputs)[list(rows)])
-    return premise.replaced(channel=at_each_step(lambda channel: Series([channel, selection]), premise.channel))
+def restrict_assumed_to_rows(assumed: AssumedModel, rows: Sequence[int]) -> AssumedModel:
+    """Return what a filter assumes (its assumed model) if only these rows of its channel's outputs are received."""
+    selection = known(np.eye(first(assumed.channel).outputs)[list(rows)])
+    return assumed.replaced(channel=at_each_step(lambda channel: Series([channel, selection]), assumed.channel))
 
 
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
@@ -112,6 +112,6 @@ def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None)
     return are_same(believed, own)
 
 
-def _same_gains(believed: Premise, own: Premise) -> bool:
+def _same_gains(believed: AssumedModel, own: AssumedModel) -> bool:
     """Return whether each relay that a recording has runs with the gain that the filter assumes for it."""
     return all(equal_to_rounding(gain, own.gains[name]) for name, gain in believed.gains.items() if name in own.gains)
