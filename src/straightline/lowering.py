@@ -42,7 +42,8 @@ class Lowering:
         self.kernels: dict[Any, ClosedJaxpr] = {}
         # How many numbers a program within a loop or branch computes, by an estimate.
         self.sizes: dict[Jaxpr, int] = {}
-        # A loop whose turns compute no more numbers than this, all together, is written out turn by turn.
+        # A loop whose iterations compute no more numbers than this, all together, is written out iteration by
+        # iteration.
         self.written_out = WRITTEN_OUT
         # The factors A and B of each product A B', by the nodes of its entries.
         self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
