@@ -27,7 +27,7 @@ from heliograph.learning.long_run_covariance import (
     bootstrap_block_sums,
     compute_sandwich_covariance,
     estimate_long_run_covariance,
-    find_numbers_told_by_few_stretches,
+    find_numbers_in_few_stretches,
     find_profile_drop,
     remove_predicted_scores,
     student_quantile,
@@ -132,25 +132,28 @@ class Solution:
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
     @cached_property
-    def few(self) -> Bool[np.ndarray, " active"]:
+    def in_few_stretches(self) -> Bool[np.ndarray, " active"]:
         """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
         free = np.flatnonzero(self.active & self.surface.domains.free)
-        few = np.zeros(len(self.active), dtype=bool)
+        in_few_stretches = np.zeros(len(self.active), dtype=bool)
         if len(free) and not self.rank.flat.size:
-            few[free] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, free))
-        return np.asarray(few[self.active])
+            in_few_stretches[free] = find_numbers_in_few_stretches(self.surface.information_by_row(self.top.x, free))
+        return np.asarray(in_few_stretches[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
         """Return the covariance of the active coordinates along the identified directions, and its degrees of freedom.
 
         It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores (gradients of l by row),
-        estimated by `method`. Numbers whose information is in a few stretches of the data (`few`) have the model's J.
+        estimated by `method`. Numbers whose information is in a few stretches of the data (`in_few_stretches`) have the
+        model's J.
         """
-        scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
-        if self.few.any():
+        scores, by_model = self.scores, np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))
+        if self.in_few_stretches.any():
             # Here all directions are identified, so that the Hessian can be brought back to the active coordinates.
             inverse = np.linalg.inv(self.basis)
-            scores, by_model = remove_predicted_scores(scores, inverse.T @ self.hessian @ inverse, self.few)
+            scores, by_model = remove_predicted_scores(
+                scores, inverse.T @ self.hessian @ inverse, self.in_few_stretches
+            )
         estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
             estimate = estimate._replace(covariance=estimate.covariance + self._project_on_identified(by_model))
@@ -241,17 +244,19 @@ class Solution:
             level: probability with which the interval holds the number.
         """
         coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
-        is_in_few = False
+        is_in_few_stretches = False
         if coordinate is not None:
             hardly_known = self.surface.domains.single[coordinate] and error > WIDE
             if hardly_known or method == "profile":
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
-            is_in_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])  # its place among active ones
+            is_in_few_stretches = bool(
+                self.in_few_stretches[np.count_nonzero(self.active[:coordinate])]
+            )  # its place among active ones
         center = float(to_unconstrained(entry.domain, value))
         # Resampled blocks do not show how a number varies whose information is in a few stretches of the data.
-        if method == "bootstrap" and not is_in_few:
+        if method == "bootstrap" and not is_in_few_stretches:
             low, high = center + self._bootstrap_interval(slopes, level)
             return low, high
         half = student_quantile(freedom, level) * error
