@@ -48,11 +48,10 @@ class Lowering:
         # The factors A and B of each product A B', by the nodes of its entries.
         self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
 
-    def inline_program(
-        self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()
-    ) -> list[Value]:
+    def inline_program(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value]) -> list[Value]:
         """Return the results of a traced program for these arguments; only operations that they need are lowered."""
         jaxpr: Any = program
+        consts: Sequence[Any] = ()
         if isinstance(program, ClosedJaxpr):
             jaxpr, consts = program.jaxpr, program.consts
         values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.make_known_array, consts), strict=True))
