@@ -19,7 +19,8 @@ import numpy as np
 from alone import show
 from timeline import readme_network
 
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.message import read_messages
 from heliograph.serving.service import Service

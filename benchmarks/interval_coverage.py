@@ -23,7 +23,7 @@ from heliograph.engine.choice import choose_code
 from heliograph.learning.free_parameters import Parameters
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
-from heliograph.learning.likelihood.parameter_transforms import from_line
+from heliograph.learning.likelihood.parameter_transforms import from_unconstrained
 from heliograph.learning.likelihood.surface import DIFFERENCE
 from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise_from_starts
 from heliograph.learning.long_run_covariance import (
@@ -152,7 +152,7 @@ class Fits:
         return self._back(self.x - reach), self._back(self.x + reach)
 
     def _back(self, x: np.ndarray) -> np.ndarray:
-        columns = [from_line(e.domain, x[:, i]) for i, e in enumerate(self.parameters.entries)]
+        columns = [from_unconstrained(e.domain, x[:, i]) for i, e in enumerate(self.parameters.entries)]
         return np.stack(columns, axis=1)
 
 

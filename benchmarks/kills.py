@@ -19,7 +19,8 @@ from time import sleep
 from typing import Any
 
 from heliograph.files.network_file import load_network
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.serving.service import Service

@@ -12,7 +12,7 @@ from alone import milliseconds, show
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.multihop_paths.design import make_power_task
+from heliograph.planning.multihop_paths.path_problem import make_power_task
 from heliograph.planning.power_budget import make_unlimited
 
 SENSORS, STARTS, REPEATS = 20, 30, 20

@@ -355,7 +355,8 @@ class CSource:
     def _write_loop_head(self, loop: Loop) -> str:
         """Return the head of a C loop, and note the name of the counter's node.
 
-        A loop of known length counts its turns. One of unknown length (None) is endless, and a check within it ends it.
+        A loop of known length counts its iterations. One of unknown length (None) is endless, and a check within it
+        ends it.
         """
         if loop.length is None:
             return "for (;;) {"

@@ -187,9 +187,9 @@ def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> 
     return graph.constant(value.item(), type)
 
 
-def _is_constant(node: Node, number: float) -> bool:
-    """Return whether a node is the constant of this number."""
-    return bool(node.op == "constant" and node.value == number)
+def _is_zero(node: Node) -> bool:
+    """Return whether a node is the constant 0."""
+    return bool(node.op == "constant" and node.value == 0)
 
 
 def is_finite(node: Node) -> bool:
@@ -219,10 +219,10 @@ def _fold_add(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Return a simpler node for a - b, by x - 0 = x, -0 - x = -x and a - (-x) = a + x; None if nothing is simpler."""
-    if _is_constant(b, 0):
+    if _is_zero(b):
         return a
     # -0 - x is -x, but +0 - x is not: at x = 0 it is +0, and -x is -0.
-    if type in REAL and _is_constant(a, 0) and math.copysign(1, a.value) < 0:
+    if type in REAL and _is_zero(a) and math.copysign(1, a.value) < 0:
         return graph.node("neg", type, b)
     if type in REAL and b.op == "neg":
         return graph.node("add", type, a, b.args[0])
@@ -301,7 +301,7 @@ def _fold_not(graph: NodeMaker, type: Type, a: Node) -> Node | None:
 
 def _fold_shift(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a shift by no bits."""
-    return a if _is_constant(b, 0) else None
+    return a if _is_zero(b) else None
 
 
 def _fold_extremum(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:

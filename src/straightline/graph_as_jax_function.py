@@ -135,36 +135,37 @@ class _JaxEvaluation:
         """Evaluate a loop by JAX's loop, and note its results.
 
         A graph of scalar operations is evaluated by JAX, so that XLA can compile it. `loop` has nodes for each carried
-        number: its `initial` value, its `parameters` in the body, its `following` value at a turn's end, and its
+        number: its `initial` value, its `parameters` in the body, its `following` value at an iteration's end, and its
         `results` after the loop. The carry of JAX's loop is a pair: numbers, one for each parameter whose index is in
         `carried` (the others are not needed), and arrays, one for each buffer that the body fills (`filled`). Values
-        computed in a turn hold in that turn alone: after the loop `self.values` is the outer dictionary again.
+        computed in an iteration hold in that iteration alone: after the loop `self.values` is the outer dictionary
+        again.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
         carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # indices in loop.parameters
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
-        def begin_turn(carry: PyTree, counter: Any) -> None:
-            """Set `self.values` and `self.memory` to what is known outside the loop, and to the carry of this turn."""
+        def begin_iteration(carry: PyTree, counter: Any) -> None:
+            """Set `self.values` and `self.memory` to what is known outside the loop and this iteration's carry."""
             numbers, arrays = carry
             self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
             self.values |= zip((loop.parameters[k] for k in carried), numbers, strict=True)
             if loop.counter is not None:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
-        def run_turn(counter: Any, carry: PyTree) -> PyTree:
-            """Return the carry after a turn of the loop.
+        def run_iteration(counter: Any, carry: PyTree) -> PyTree:
+            """Return the carry after an iteration of the loop.
 
-            It is a pair: the numbers that the next turn gets for the parameters in `carried`, and the arrays that the
-            buffers in `filled` hold.
+            It is a pair: the numbers that the next iteration gets for the parameters in `carried`, and the arrays that
+            the buffers in `filled` hold.
             """
-            begin_turn(carry, counter)
+            begin_iteration(carry, counter)
             self.evaluate_block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
 
         def goes_on(carry: PyTree) -> jax.Array:
             """Return whether the loop goes on: compute the body up to its check, and return the loop's condition."""
-            begin_turn(carry, 0)  # a loop that ends by a condition has no counter
+            begin_iteration(carry, 0)  # a loop that ends by a condition has no counter
             check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, LoopExit))
             self.evaluate_block(loop.body.items[:check])
             assert loop.condition is not None
@@ -173,9 +174,9 @@ class _JaxEvaluation:
         # From the first carry to the last, whose values are the loop's results.
         start = [self.value(loop.initial[k]) for k in carried], [outer_memory[b] for b in filled]
         if loop.length is None:
-            numbers, arrays = lax.while_loop(goes_on, lambda carry: run_turn(0, carry), start)
+            numbers, arrays = lax.while_loop(goes_on, lambda carry: run_iteration(0, carry), start)
         else:
-            numbers, arrays = lax.fori_loop(0, loop.length, run_turn, start)
+            numbers, arrays = lax.fori_loop(0, loop.length, run_iteration, start)
         self.values, self.memory = outer_values, outer_memory | dict(zip(filled, arrays, strict=True))
         self.values |= zip((loop.results[k] for k in carried), numbers, strict=True)
 

@@ -42,16 +42,16 @@ class Lowering:
         self.kernels: dict[Any, ClosedJaxpr] = {}
         # How many numbers a program within a loop or branch computes, by an estimate.
         self.sizes: dict[Jaxpr, int] = {}
-        # A loop whose turns compute no more numbers than this, all together, is written out turn by turn.
+        # A loop whose iterations compute no more numbers than this, all together, is written out iteration by
+        # iteration.
         self.written_out = WRITTEN_OUT
         # The factors A and B of each product A B', by the nodes of its entries.
         self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
 
-    def inline_program(
-        self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()
-    ) -> list[Value]:
+    def inline_program(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value]) -> list[Value]:
         """Return the results of a traced program for these arguments; only operations that they need are lowered."""
         jaxpr: Any = program
+        consts: Sequence[Any] = ()
         if isinstance(program, ClosedJaxpr):
             jaxpr, consts = program.jaxpr, program.consts
         values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.make_known_array, consts), strict=True))

@@ -114,8 +114,8 @@ class Block:
         """Return the loops around the block's nodes, innermost first."""
         return [b.owner for b in self.list_enclosing_blocks() if isinstance(b.owner, Loop)]
 
-    def count_turns(self) -> int:
-        """Return how many turns these loops make together; of unknown length one."""
+    def count_iterations(self) -> int:
+        """Return how many iterations these loops make together; of unknown length one."""
         lengths = [loop.length for loop in self.list_loops()]
         return math.prod(1 if length is None or length == ANY_LENGTH else length for length in lengths)
 
@@ -123,10 +123,10 @@ class Block:
 class Buffer:
     """Numbers in memory, `size` of each run; a table has the same numbers in all runs.
 
-    `kind`: "input", "scratch", "table", or "carried" by a loop, of which each turn fills it anew. A buffer that the
-    program fills is read after the statement of `block` that fills it. A buffer `inside` another starts at a place of
-    it. `first`: for each entry of a row the first place in the row that has the same number, as across the diagonal of
-    a symmetric matrix; empty where all entries differ.
+    `kind`: "input", "scratch", "table", or "carried" by a loop, of which each iteration fills it anew. A buffer that
+    the program fills is read after the statement of `block` that fills it. A buffer `inside` another starts at a place
+    of it. `first`: for each entry of a row the first place in the row that has the same number, as across the diagonal
+    of a symmetric matrix; empty where all entries differ.
     """
 
     __slots__ = ("block", "first", "inside", "kind", "parts", "shape", "stores", "table", "type")
@@ -186,9 +186,9 @@ class Store:
 class Loop:
     """A body that is repeated: `length` times, or while any run's condition holds (then `length` is None).
 
-    Of ANY_LENGTH are the loops of a scan over rows, whose code reads the number of turns when it is called.
-    `parameters` stand for the carry in the body, `initial` and `following` for the carry before and after a turn,
-    `results` for the carry after the last one. `counter` counts the turns from 0. `block` is the enclosing block.
+    Of ANY_LENGTH are the loops of a scan over rows, whose code reads the number of iterations when it is called.
+    `parameters` stand for the carry in the body, `initial` and `following` for the carry before and after an iteration,
+    `results` for the carry after the last one. `counter` counts the iterations from 0. `block` is the enclosing block.
     """
 
     __slots__ = ("block", "body", "condition", "counter", "following", "initial", "length", "parameters", "results")
@@ -196,17 +196,17 @@ class Loop:
     def __init__(self, body: Block, length: int | None, initial: Sequence[Node]):
         """Make a loop whose body is the block `body`.
 
-        `length` is the number of turns, None if a condition ends the loop. `initial` holds the carried numbers before
-        the first turn. The other lists have an entry for each carried number, and are filled later.
+        `length` is the number of iterations, None if a condition ends the loop. `initial` holds the carried numbers
+        before the first iteration. The other lists have an entry for each carried number, and are filled later.
         """
         self.body, self.length, self.initial = body, length, list(initial)
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self
-        self.parameters: list[Node] = []  # carried numbers at the beginning of a turn
-        self.following: list[Node] = []  # carried numbers at the end of a turn
-        self.results: list[Node] = []  # carried numbers after the last turn
+        self.parameters: list[Node] = []  # carried numbers at the beginning of an iteration
+        self.following: list[Node] = []  # carried numbers at the end of an iteration
+        self.results: list[Node] = []  # carried numbers after the last iteration
         self.condition: Node | None = None  # the loop goes on while it holds; None if `length` is known
-        self.counter: Node | None = None  # the number of the turn; None if nothing uses it
+        self.counter: Node | None = None  # the number of the iteration; None if nothing uses it
 
 
 class LoopExit:

@@ -266,7 +266,7 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
     def list_owners(block: Block) -> list[Any]:
         """Return the guards, and the loops that end by a condition, around a block.
 
-        These may make runs differ within the block. A loop of known length cannot: all runs make the same turns.
+        These may make runs differ within the block. A loop of known length cannot: all runs make the same iterations.
         """
         return [
             b.owner

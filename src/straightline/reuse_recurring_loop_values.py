@@ -9,12 +9,12 @@ whose next values are in S. S is moved to a guarded block, which an iteration sk
 numbers of S that others need, and the outcomes of the tests, are stored as a row of a ring of RING rows. If after rows
 0 ... p - 1 the numbers C have the bits that they had before row 0, a cycle of period p is found: as long as the tests
 have the outcomes of the cycle's next row, that row has the numbers of the iteration. If they have not, or if the ring
-is full without a cycle, S is computed again and stored from row 0 on. "Turn" stands for iteration in names.
+is full without a cycle, S is computed again and stored from row 0 on.
 
-All results have the bits that they had. A turn of a filter of four states and two outputs, 1,400 operations, takes 120
-ns in a program of one run, 22 in a cycle, and a tenth more than 120 where one is sought in vain. Of 35 filters of
-levels, trends, oscillations, positions and seasons 22 stand still after some hundreds of rows; 11 go round in 2 to 8.
-A sensor that is read every tenth row makes a cycle too.
+All results have the bits that they had. An iteration of a filter of four states and two outputs, 1,400 operations,
+takes 120 ns in a program of one run, 22 in a cycle, and a tenth more than 120 where one is sought in vain. Of 35
+filters of levels, trends, oscillations, positions and seasons 22 stand still after some hundreds of rows; 11 go round
+in 2 to 8. A sensor that is read every tenth row makes a cycle too.
 """
 
 from collections import Counter, defaultdict
@@ -28,7 +28,7 @@ from straightline.program import REFERRING, list_needed_items, list_used_nodes
 from straightline.rules.elementwise import select
 from straightline.size_limits import DEAR
 
-RING = 32  # rows: of a longer cycle every turn is computed
+RING = 32  # rows: of a longer cycle every iteration is computed
 INTEGERS: dict[Type, Type] = {"f64": "i64", "f32": "i32"}  # that have the bits of a real number
 
 
@@ -193,7 +193,7 @@ class RingBuffer:
         return [self._graph.load(buffer, column, buffer.shape[1:], (row,)) for buffer, column in self._columns]
 
 
-class RingTurn(NamedTuple):
+class RingRow(NamedTuple):
     """What an iteration does with the ring of stored rows.
 
     row: the row that it fills or reads. computes: whether it computes the recurring numbers and fills the row, since no
@@ -232,17 +232,17 @@ def _rewrite_loop(
     test_ring, value_ring = (RingBuffer(graph, [n.type for n in nodes], loop) for nodes in (recurring.tests, stored))
     # The last row before the first iteration is RING - 1, so that row 0 is next.
     last_row, period = _carry_integer(graph, loop, RING - 1), _carry_integer(graph, loop, 0)
-    turn = _choose_ring_row(graph, recurring.tests, test_ring, last_row, period)
-    closes_cycle = _move_to_guarded_block(graph, loop, recurring, stored, turn, (test_ring, value_ring))
+    ring_row = _choose_ring_row(graph, recurring.tests, test_ring, last_row, period)
+    closes_cycle = _move_to_guarded_block(graph, loop, recurring, stored, ring_row, (test_ring, value_ring))
     # A cycle that closes with row p - 1 has the period p.
     zero, one = graph.constant(0, "i64"), graph.constant(1, "i64")
-    new_period = select(graph, closes_cycle, graph.node("add", "i64", turn.row, one), zero)
+    new_period = select(graph, closes_cycle, graph.node("add", "i64", ring_row.row, one), zero)
     # The rest of the program loads the recurring numbers from the iteration's row.
-    loaded = dict(zip(stored, value_ring.load(turn.row), strict=True))
+    loaded = dict(zip(stored, value_ring.load(ring_row.row), strict=True))
     for x in items:
         if x not in recurring.nodes:
             _replace_uses(x, loaded)
-    loop.following += [turn.row, select(graph, turn.computes, new_period, period)]
+    loop.following += [ring_row.row, select(graph, ring_row.computes, new_period, period)]
     body.items += rest
     graph.current = enclosing
 
@@ -252,28 +252,28 @@ def _move_to_guarded_block(
     loop: Loop,
     recurring: RecurringNodes,
     stored: Sequence[Node],
-    turn: RingTurn,
+    ring_row: RingRow,
     rings: tuple[RingBuffer, RingBuffer],
 ) -> Node:
     """Move the recurring numbers to a guarded block of the loop's body; return whether a cycle closes there.
 
     Numbers of a loop's iterations, such as covariances of a filter, may recur in a cycle; rings store the rows of
     recent iterations, so that later ones read them. An iteration skips the block unless it has to compute the numbers
-    (`turn.computes`). The block also stores the iteration's row in the two `rings`: the outcomes of the tests, and the
-    numbers that the rest of the program needs (`stored`). A cycle closes if the next values of the carried numbers,
+    (`ring_row.computes`). The block also stores the iteration's row in the two `rings`: the outcomes of the tests, and
+    the numbers that the rest of the program needs (`stored`). A cycle closes if the next values of the carried numbers,
     from which the recurring ones follow, have the bits that they had before row 0. In iterations that skip the block
     the result is False.
     """
     # Make a conditional block in the loop's body, and move the recurring nodes there.
-    guard = Guard(Block(loop.body, pinned=True), turn.computes)
+    guard = Guard(Block(loop.body, pinned=True), ring_row.computes)
     graph.current, guard.body.items = guard.body, [*recurring.nodes]
     for n in recurring.nodes:
         n.block = guard.body
     # Store the row, and compare the carried numbers with those before row 0.
     test_ring, value_ring = rings
-    test_ring.store(recurring.tests, turn.row)
-    value_ring.store(stored, turn.row)
-    guard.values = [_compare_with_start(graph, loop, recurring.carried, turn.restarts)]
+    test_ring.store(recurring.tests, ring_row.row)
+    value_ring.store(stored, ring_row.row)
+    guard.values = [_compare_with_start(graph, loop, recurring.carried, ring_row.restarts)]
     # Back in the loop's body: the block's result is a node there.
     graph.current = loop.body
     guard.results = [graph.make_fresh_node("guarded", "bool", (), loop.body, (guard, 0))]
@@ -283,7 +283,7 @@ def _move_to_guarded_block(
 
 def _choose_ring_row(
     graph: Graph, outcomes: Sequence[Node], test_ring: RingBuffer, last_row: Node, period: Node
-) -> RingTurn:
+) -> RingRow:
     """Choose the row of the ring that an iteration reads, or fills with numbers that it computes.
 
     A loop, such as a Kalman filter over rows of data, often comes to compute the same covariances again and again in a
@@ -310,7 +310,7 @@ def _choose_ring_row(
     is_full = node("eq", "bool", last_row, graph.constant(RING - 1, "i64"))
     restarts = node("or", "bool", node("not", "bool", knows_no_cycle), is_full)
     row_to_fill = select(graph, restarts, zero, next_row)
-    return RingTurn(row=select(graph, computes, row_to_fill, next_in_cycle), computes=computes, restarts=restarts)
+    return RingRow(row=select(graph, computes, row_to_fill, next_in_cycle), computes=computes, restarts=restarts)
 
 
 def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], restarts: Node) -> Node:

@@ -37,7 +37,7 @@ LITTLE = 400_000
 # and 0.02.
 TABLE = 64
 LOADED = TABLE**2
-# Numbers that all turns of a loop compute, written out; of an array that a loop carries outside memory; terms of a
+# Numbers that all iterations of a loop compute, written out; of an array that a loop carries outside memory; terms of a
 # product by a known matrix in memory, its zeros left out; entries that updates at places of the data may change. The
 # noise of 32 outputs, 64 columns, in memory: 75 us a step and run, and 2.5 s of LLVM, for 103 and 6.1 written out; as
 # known to be of its own for each of 64 outputs 2 us written out, for 2.0 ms.

@@ -7,7 +7,8 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.source_translator import Translator

@@ -74,11 +74,11 @@ def test_values_of_a_device_count_from_online_to_offline(network, offline, onlin
     sources, used = TopicReader(table(Available("zigbee2mqtt/+/availability")), network), []
     for word in (None, online, offline, offline, online):
         if word is not None:
-            assert sources.take_device_word("zigbee2mqtt/a/availability", word, "m")
+            assert sources.device_statuses.take_status_message("zigbee2mqtt/a/availability", word, "m")
         used.append([bool(sources.read(f"zigbee2mqtt/{device}", {"temperature": 1}, "m")) for device in "ab"])
     assert used == [[True, True], [True, True], [False, True], [False, True], [True, True]]
     assert sources.notes == ["messages left out, of devices offline: zigbee2mqtt/a (2)"]
-    assert not sources.unknown.total() and not sources.take_device_word("zigbee2mqtt/a", "1", "m")
+    assert not sources.unknown.total() and not sources.device_statuses.take_status_message("zigbee2mqtt/a", "1", "m")
 
 
 def test_conditions_hold_together(network):
@@ -90,7 +90,7 @@ def test_conditions_hold_together(network):
     used = []
     for topic, word in [("gateway/status", '{"word": "UP"}'), ("gateway/status", "gone"), ("gateway/status", "up"),
                         ("zigbee2mqtt/a/LWT", "Offline")]:  # fmt: skip
-        assert sources.take_device_word(topic, word, "m")
+        assert sources.device_statuses.take_status_message(topic, word, "m")
         used.append([bool(sources.read("zigbee2mqtt/a", {"temperature": 1, "fix": fix}, "m")) for fix in (2, 3)])
     assert used == [[False, True], [False, False], [False, True], [False, False]]
     assert sources.excluded["zigbee2mqtt/a"] == 4 and sources.offline["zigbee2mqtt/a"] == 2

@@ -26,9 +26,9 @@ def network():
 
 def test_a_push_replays_its_row_and_those_after_it(network, monkeypatch):
     timeline, stepped = hg.Timeline(network, 100.0), []
-    pool = timeline._fleet.pool
-    step = pool.step_slots_in_place
-    monkeypatch.setattr(pool, "step_slots_in_place", lambda *rows: (stepped.append(rows), step(*rows))[1])
+    state_table = timeline._fleet.state_table
+    step = state_table.step_slots_in_place
+    monkeypatch.setattr(state_table, "step_slots_in_place", lambda *rows: (stepped.append(rows), step(*rows))[1])
     pushes = (1.0, 1), (3.0, 2), (5.0, 3), (2.0, 6), (4.5, 8), (0.5, 14), (2.0, 14)  # the last one is a copy
     for time, rows in pushes:
         timeline.push("a", 0, time, 1.0, 6.0)

@@ -89,8 +89,8 @@ def test_closed_forms_are_the_best_amplitudes(budget, options):
 
 def test_full_power_of_a_poor_transmitter_hurts():
     """b = (1, 1), D = diag(0.01, 10), N = 0.01; of x+ = 0.95 x + w, Var w = 0.1: 0.3696 at full power, 0.0170."""
+    from heliograph.planning.network_to_sum_of_links import steady_covariance_with_information
     from heliograph.planning.sum_of_links import SummedLinks, find_amplitudes_by_formula
-    from heliograph.planning.sum_of_links_design import steady_covariance_with_information
 
     links = SummedLinks(np.ones((2, 1)), np.diag([0.01, 10.0]), np.ones(2), 0.01, np.ones(2))
     full = links.information(np.ones(2))[0, 0]

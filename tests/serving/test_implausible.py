@@ -74,7 +74,8 @@ def test_limits_hold_here_too_and_it_is_said_once():
     item = hg.linear_filter(plant, SENSOR, HOP)
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, {"f": item}, limits=(-5, 5), invalid=-999)})
     said = []
-    from heliograph.live.fleet import Fleet, Options
+    from heliograph.live.fleet import Fleet
+    from heliograph.live.fleet_options import Options
     from heliograph.live.network_step_program import NetworkProgram
 
     service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore(), said.append)
@@ -98,7 +99,8 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     )
     filters = {"lost": lost, "fine": hg.linear_filter(plant, SENSOR, HOP)}
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, filters)})
-    from heliograph.live.fleet import Fleet, Options
+    from heliograph.live.fleet import Fleet
+    from heliograph.live.fleet_options import Options
     from heliograph.live.network_step_program import NetworkProgram
 
     service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore())

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.brokers.broker_address import parse_address
 from heliograph.serving.brokers.source_translator import Translator

@@ -6,7 +6,8 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 import heliograph as hg
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.output import Estimates
 from heliograph.serving.service import Service

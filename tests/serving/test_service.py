@@ -12,7 +12,8 @@ from pydantic import TypeAdapter
 
 import heliograph as hg
 from heliograph.live import LinkCounts
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.observation import watch_of
 from heliograph.serving.output import Estimates, Refused
@@ -291,4 +292,4 @@ def test_memory_is_bounded_by_the_window():
     sent = lines([{"node": "a", "sequence": k, "time": 0.1 * k, "values": [float(z[k])]} for k in range(2000)])
     for begin in range(0, 2000, 50):
         service.take(sent[begin : begin + 50])
-        assert service.fleet.pool.used <= WINDOW / 0.1 + 50 + 2
+        assert service.fleet.state_table.used <= WINDOW / 0.1 + 50 + 2

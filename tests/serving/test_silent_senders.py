@@ -102,11 +102,11 @@ def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_mega
     assert ((tmp_path / "a.db-wal").stat().st_size - before) * DAY / 600 < 10e6
     # The state is that of a value that came: of 600 ages one has a probability.
     (row, *_) = service.plants["p0"].rows.held
-    numbers = service.fleet.pool.table[row.slot]
+    numbers = service.fleet.state_table.table[row.slot]
     assert len(pack_plant(service.plants["p0"], service.fleet)) < numbers.nbytes / 4
     restored = unpack_plant("p0", pack_plant(service.plants["p0"], service.fleet), service.fleet)
     (again, *_) = restored.rows.held
-    assert service.fleet.pool.table[again.slot].tobytes() == numbers.tobytes()
+    assert service.fleet.state_table.table[again.slot].tobytes() == numbers.tobytes()
 
 
 @pytest.mark.slow

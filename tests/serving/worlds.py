@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 
 SENSOR = hg.LinearSensor([[1.0]], 0.1)

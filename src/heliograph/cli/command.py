@@ -94,10 +94,10 @@ def _run_command(arguments: Sequence[str] | None) -> int:
         return _print_refusal(str(error))
     except OSError as error:
         # What has no name of a file is the standard output, if that cannot be written to.
-        place = error.filename
-        if not place and (error.errno in FULL or _output_is_lost()):
-            place = "standard output"
-        return _print_refusal(f"{place}: {error.strerror or error}" if place else str(error))
+        where = error.filename
+        if not where and (error.errno in FULL or _output_is_lost()):
+            where = "standard output"
+        return _print_refusal(f"{where}: {error.strerror or error}" if where else str(error))
     except MissingPackagesError as error:
         return _print_refusal(str(error))
     except ModuleNotFoundError as error:

@@ -261,9 +261,9 @@ def _write_lagged_estimates(
     lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if lagged is None:
         return []
-    beside = choose_lagged_output(target)
-    write(lagged, beside)
-    return [f"{beside}: {len(lagged.time)} rows, each given what came {lag:g} later"]
+    lagged_target = choose_lagged_output(target)
+    write(lagged, lagged_target)
+    return [f"{lagged_target}: {len(lagged.time)} rows, each given what came {lag:g} later"]
 
 
 def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":

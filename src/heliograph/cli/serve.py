@@ -77,7 +77,7 @@ class ServeOptions:
             reference: the Python file of the network, as FILE or FILE:NAME.
         """
         from heliograph.files.network_file import load_module
-        from heliograph.live.fleet import Options
+        from heliograph.live.fleet_options import Options
         from heliograph.numerics.times.dates import horizons_in
         from heliograph.serving.brokers.broker_address import parse_address
         from heliograph.serving.settings import (

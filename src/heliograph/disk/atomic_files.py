@@ -276,11 +276,11 @@ def find_foreign_files(folder: Path) -> list[str]:
 def _find_files(folder: Path) -> dict[str, Path]:
     """Return all files in a folder, and links, by their paths relative to it with slashes; none in caches of Python."""
     found = dict[str, Path]()
-    for place, folders, files in os.walk(folder):
-        links = [name for name in folders if (Path(place) / name).is_symlink()]
+    for parent, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(parent) / name).is_symlink()]
         folders[:] = [name for name in folders if name != "__pycache__"]
         for name in (*files, *links):
-            path = Path(place) / name
+            path = Path(parent) / name
             found[path.relative_to(folder).as_posix()] = path
     return found
 

@@ -15,15 +15,15 @@ def refuse_replacing(read: Iterable[object], written: Iterable[object], folder: 
         folder: the folder that the command replaces as a whole; None if there is none.
     """
     sources = [path for path in read if isinstance(path, Path)]
-    places = [path for path in written if isinstance(path, Path)]
-    for place in places:
-        if any(place.resolve() == source.resolve() for source in sources):
-            raise fail(f"output file {place}", "another file than the measurements", "the same")
+    files = [path for path in written if isinstance(path, Path)]
+    for file in files:
+        if any(file.resolve() == source.resolve() for source in sources):
+            raise fail(f"output file {file}", "another file than the measurements", "the same")
     if folder is None:
         return
     replaced = folder.resolve()
-    for path in [*sources, *places]:
-        if replaced in (path.resolve(), *path.resolve().parents) and (path in places or path.exists()):
+    for path in [*sources, *files]:
+        if replaced in (path.resolve(), *path.resolve().parents) and (path in files or path.exists()):
             raise fail(f"output folder {folder}", f"one without {path.name}, which would be lost with it", str(path))
 
 

@@ -30,7 +30,7 @@ def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
     if len(program.parts) == 1:
         return ""
     count = max(program.filter.received, 1)
-    weight = f"    {real} weight[{count}];\n" if "weight" in program.parts[1].beside else ""
+    weight = f"    {real} weight[{count}];\n" if "weight" in program.parts[1].other_results else ""
     return (
         f"typedef struct {{\n    {real} value[{count}];\n{weight}    {real} nis;\n    {real} arrived;\n"
         f"}} {prefix}_innovation;\n\n"
@@ -48,7 +48,7 @@ def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
         "its squared size nis in units of its covariance (NaN: nothing arrived), chi-squared of so many degrees of",
         "freedom as components arrived; also of a measurement that it refuses.",
     ]
-    if "weight" in program.parts[1].beside:
+    if "weight" in program.parts[1].other_results:
         lines.append("weight is how much of each component was used: 1 all, 0 left out.")
     if program.start_at is not None:
         lines += [
@@ -120,14 +120,14 @@ def _generate_part_statements(program: StepProgram, number: int, prefix: str) ->
     code: 4 the estimate would not be finite, 5 it would lose its digits, 6 the inputs are none.
 
     Args:
-        program: the step as C functions; `beside` of a part names results other than the state, such as the flags
-            "implausible" (code 5) and "spoilt" (code 6).
+        program: the step as C functions; `other_results` of a part names results other than the state, such as the
+            flags "implausible" (code 5) and "spoilt" (code 6).
         number: 0 for the whole step or the prediction, 1 for the correction.
         prefix: beginning of all C names.
     """
     part, code = program.parts[number], program.computes[number]
     is_correction = part.name == "correct"
-    flags = [name for name in part.beside if name in ("implausible", "spoilt")]
+    flags = [name for name in part.other_results if name in ("implausible", "spoilt")]
     declarations = [
         f"    {prefix}_state after;",
         *([f"    {prefix}_innovation news;"] if is_correction else []),
@@ -135,7 +135,10 @@ def _generate_part_statements(program: StepProgram, number: int, prefix: str) ->
     ]
     # The call: a number without axes is passed by value (as [0] of its member), all else as an array.
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
-    written = [*(f"after.{m.name}" for m in program.members), *(_name_place_of_result(name) for name in part.beside)]
+    written = [
+        *(f"after.{m.name}" for m in program.members),
+        *(_name_place_of_result(name) for name in part.other_results),
+    ]
     arguments = [*read, *part.data, _generate_step_number_expression(program, part), *written]
     call = f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");"
     checks = [

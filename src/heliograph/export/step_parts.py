@@ -24,25 +24,25 @@ class PartOfStep(NamedTuple):
         name: "step", "predict" or "correct".
         data: names of the data, "z", "u" or both.
         function: from (arrays of the state, data, number of the step) to arrays of the state, mean, covariance, and
-            what is `beside`.
+            what is `other_results`.
         examples: arguments that it takes.
-        beside: names of the other results. "implausible": the estimate would lose its digits, and what was computed
-            must not be used; "spoilt": an input has too few digits.
+        other_results: names of the other results. "implausible": the estimate would lose its digits, and what was
+            computed must not be used; "spoilt": an input has too few digits.
     """
 
     name: str
     data: tuple[str, ...]
     function: Callable[..., list[jax.Array]]
     examples: tuple[Any, ...]
-    beside: tuple[str, ...]
+    other_results: tuple[str, ...]
 
 
 def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
     """Return the functions to export: one step or, if `apart`, prediction and correction, for numbers of type `real`.
 
     C code is later written from these JAX functions. Each has example arguments, whose shapes alone count, and the
-    names of its results `beside` state and estimate: "implausible" says that the estimate lost its digits and must not
-    be used, "spoilt" that an input has too few digits.
+    names of its results `other_results` state and estimate: "implausible" says that the estimate lost its digits and
+    must not be used, "spoilt" that an input has too few digits.
 
     Args:
         filter: the filter.
@@ -56,7 +56,11 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     if not apart:
         return [
             PartOfStep(
-                "step", ("z", "u"), _make_step_function(filter, tree, real), examples=(leaves, z, u, k), beside=flags
+                "step",
+                ("z", "u"),
+                _make_step_function(filter, tree, real),
+                examples=(leaves, z, u, k),
+                other_results=flags,
             )
         ]
     # Make one correction, to see whether the filter weighs components.
@@ -65,14 +69,18 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     results_of_correction = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
     return [
         PartOfStep(
-            "predict", ("u",), _make_prediction_function(filter, tree, real), examples=(leaves, u, k), beside=flags
+            "predict",
+            ("u",),
+            _make_prediction_function(filter, tree, real),
+            examples=(leaves, u, k),
+            other_results=flags,
         ),
         PartOfStep(
             "correct",
             ("z",),
             _make_correction_function(filter, tree, real),
             examples=(leaves, z, k),
-            beside=results_of_correction,
+            other_results=results_of_correction,
         ),
     ]
 

@@ -168,17 +168,17 @@ def _lower_part_to_c(
         names: the members that are read, and those that are results; used where `kept` is given.
     """
     state_count = len(part.examples[0])
-    beside = state_count + 2  # number of the first result behind mean and covariance
+    first_other = state_count + 2  # number of the first result behind mean and covariance
 
     def choose_results(*arguments: Any) -> list[jax.Array]:
         """Return the results that are kept, then those beside state and estimate."""
         results = part.function(*arguments)
-        return results if kept is None else [*(results[n] for n in kept), *results[beside:]]
+        return results if kept is None else [*(results[n] for n in kept), *results[first_other:]]
 
     array_names: tuple[list[str], list[str]] = ([], [])  # of arguments, and of results: by default those of `to_c`
     if kept is not None:
         read, members = ([m.name for m in some] for some in names)
-        array_names = [*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside]
+        array_names = [*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.other_results]
     # Arguments that are finite, by number: arrays of the state, data but z (NaN: did not arrive), the step's number.
     finite_data = [state_count + n for n, name in enumerate(part.data) if name != "z"]
     step_number = state_count + len(part.data)

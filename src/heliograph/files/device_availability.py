@@ -131,35 +131,35 @@ class DeviceStatuses:
         conditions = self.find_conditions(topic)
         if not conditions:
             return False
-        # The words of a topic are one bit for each condition. They are stored when they have changed.
-        content, bits_before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
+        # The statuses of a topic are one bit for each condition. They are stored when they have changed.
+        content, bits_before = _decode_payload(payload, where), self._encode_statuses_as_bits(topic)
         for condition in conditions:
-            self._note_word(condition, topic, offline=content != "" and condition.says_offline(content, where))
-        if self._encode_words_as_bits(topic) != bits_before:
+            self._note_status(condition, topic, offline=content != "" and condition.says_offline(content, where))
+        if self._encode_statuses_as_bits(topic) != bits_before:
             self._changed.add(topic)
         return True
 
-    def pop_changed_words(self) -> dict[str, int]:
-        """Return {topic: its words as a number, as `restore` takes it} of the words changed since the last call."""
+    def pop_changed_statuses(self) -> dict[str, int]:
+        """Return {topic: its statuses as a number, as `restore` takes it} of those changed since the last call."""
         changed, self._changed = self._changed, set()
-        return {topic: self._encode_words_as_bits(topic) for topic in changed}
+        return {topic: self._encode_statuses_as_bits(topic) for topic in changed}
 
-    def restore(self, words: Mapping[str, int]) -> None:
-        """Take over stored words: `words` maps a topic to a number whose bit i is 1 if its condition i is offline."""
-        for topic, bits in words.items():
+    def restore(self, stored: Mapping[str, int]) -> None:
+        """Take over `stored` statuses: by topic a number whose bit i is 1 if its condition i is offline."""
+        for topic, bits in stored.items():
             for i, condition in enumerate(self.find_conditions(topic)):
-                self._note_word(condition, topic, offline=bool((bits >> i) & 1))
+                self._note_status(condition, topic, offline=bool((bits >> i) & 1))
 
-    def _note_word(self, condition: Available, topic: str, offline: bool) -> None:
-        """Note the last word of a topic for a condition; a device counts as online until it says offline."""
+    def _note_status(self, condition: Available, topic: str, offline: bool) -> None:
+        """Note the last status of a topic for a condition; a device counts as online until it says offline."""
         self._heard.add(condition)
         if offline:
             self._offline.add((condition, topic))
         else:
             self._offline.discard((condition, topic))
 
-    def _encode_words_as_bits(self, topic: str) -> int:
-        """Return the words of a topic as a number: bit i is 1 if its i-th condition says offline."""
+    def _encode_statuses_as_bits(self, topic: str) -> int:
+        """Return the statuses of a topic as a number: bit i is 1 if its i-th condition says offline."""
         conditions = self.find_conditions(topic)
         return sum(1 << i for i, condition in enumerate(conditions) if (condition, topic) in self._offline)
 

@@ -167,7 +167,7 @@ def horizon_design(
         text = f"no level could be proven over the horizon ({status})"
         return _make_unsolved_design(system, separate, float("nan"), text)
     # The solver's answer must satisfy every step's inequality itself.
-    level_part, *step_parts = [np.asarray(values[entries]) for entries in problem.places]
+    level_part, *step_parts = [np.asarray(values[entries]) for entries in problem.slices]
     solved = [layout.unpack(part) for layout, part in zip(layouts, step_parts, strict=True)]
     level_squared = level_part.item()
     first_weight = (1 - MARGIN) * level_squared * allowed if start is None else start

@@ -242,13 +242,12 @@ class HorizonProblem:
             initial: P_0; if None the largest allowed, nearly level^2 W.
         """
         cp = import_cvxpy()
-        self.layouts = layouts
-        # One vector: the level squared (place 0), then each step's unknowns (places 1, 2, ...).
+        # One vector: the level squared, then each step's unknowns.
         sizes = [1, *(layout.size for layout in layouts)]
-        self.places = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+        self.slices = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        # The weight P before a step is a constant plus linear maps of unknowns, by the place of these in the vector. At
+        # The weight P before a step is a constant plus linear maps of unknowns, by the slice of these in the vector. At
         # the start it is nearly level^2 W, which is linear in the level squared; or it is P_0, a constant below that.
         largest_initial = {0: (1 - MARGIN) * weight.ravel()[:, None]}
         if initial is None:
@@ -266,7 +265,7 @@ class HorizonProblem:
             if forms is None or not is_like_last:
                 forms = make_linear_forms(step, layout)
             self._add_step(k, step, forms, weight_forms, weight_constant, start)
-            multipliers = self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :]
+            multipliers = self.unknowns[self.slices[k + 1]][layout.size - layout.multipliers :]
             self.constraints.append(multipliers >= 0)
             # The weight before the next step is an unknown of this one.
             weight_forms, weight_constant, start = {k + 1: forms.weight}, np.zeros_like(weight), None
@@ -291,11 +290,11 @@ class HorizonProblem:
         all that the step depends on, of length q.
 
         Args:
-            k: number of the step. In the vector of unknowns level^2 stands at place 0, the unknowns of this step at
-                place k + 1.
+            k: number of the step. In the vector of unknowns level^2 is slice 0, and the unknowns of this step are
+                slice k + 1.
             step: its matrices in scaled coordinates: `target` M'M, `energy` of (v, rho).
             forms: matrices of the step as linear maps of its unknowns, each matrix written row by row.
-            weight_forms: {place: P, the weight before the step, as a linear map of the unknowns there}.
+            weight_forms: {slice: P, the weight before the step, as a linear map of its unknowns}.
             weight_constant: the part of P without unknowns.
             start: an initial weight that may couple x and e, at the first step; else None.
         """
@@ -307,12 +306,12 @@ class HorizonProblem:
         # block; `entries`: of its entries in the matrix (q, q) written row by row.
         for block in find_independent_parts(step, forms, start):
             entries = (block[:, None] * q + block).ravel()
-            # -Phi as a linear map of the unknowns at each place: of the level squared, this step's, and those of P.
+            # -Phi as a linear map of the unknowns of each slice: of the level squared, this step's, and those of P.
             maps = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
-            for place, form in weight_forms.items():
+            for i, form in weight_forms.items():
                 padded = np.zeros((q, q, form.shape[1]))
                 padded[:width, :width] = form.reshape(width, width, -1)
-                maps[place] = maps.get(place, 0.0) + padded.reshape(q * q, -1)[entries]
+                maps[i] = maps.get(i, 0.0) + padded.reshape(q * q, -1)[entries]
             self._require_semidefinite(maps, constant[np.ix_(block, block)])
         # Matrices of the unknowns that must be positive.
         for form in forms.positive:
@@ -322,17 +321,18 @@ class HorizonProblem:
             )
 
     def _require_semidefinite(self, maps: dict[int, np.ndarray], constant: np.ndarray) -> None:
-        """Require sum_i maps_i (unknowns at place i) + constant, a matrix row by row, to be positive semidefinite.
+        """Require sum_i maps_i (unknowns of slice i) + constant, a matrix row by row, to be positive semidefinite.
 
-        `maps` has the matrix of each place. `self.places` says where a place's unknowns lie in the vector of all.
+        `maps` has the matrix of each slice of unknowns, of which `self.slices` says where they lie in the vector of
+        all.
         """
         # One sparse matrix maps the vector of all unknowns to the sum.
         values, rows, columns = [], [], []
-        for place, matrix_of_map in maps.items():
+        for i, matrix_of_map in maps.items():
             map_rows, map_columns = np.nonzero(matrix_of_map)
             values.append(matrix_of_map[map_rows, map_columns])
             rows.append(map_rows)
-            columns.append(map_columns + self.places[place].start)
+            columns.append(map_columns + self.slices[i].start)
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         form = csr_array(entries, shape=(constant.size, self.unknowns.size))
         matrix = import_cvxpy().reshape(form @ self.unknowns, constant.shape, order="C") + constant

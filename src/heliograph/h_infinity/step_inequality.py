@@ -144,7 +144,7 @@ def _make_step_matrices(
 
 
 class _PartsOfEta(NamedTuple):
-    """The place of each part of eta = (x, e, f, f~, h, h~, v, rho); that of an absent function is empty."""
+    """The indices of each part of eta = (x, e, f, f~, h, h~, v, rho); that of an absent function is empty."""
 
     x: slice
     e: slice
@@ -273,16 +273,16 @@ class UnknownsLayout(NamedTuple):
 def _mirror_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
     """Return the symmetric matrix (n, n) that has these entries in its lower triangle.
 
-    The entries are listed row after row, as `_triangle_places` lists them.
+    The entries are listed row after row, as `_lower_triangle_indices` lists them.
     """
     matrix = np.zeros((n, n))
-    rows, columns = _triangle_places(n)
+    rows, columns = _lower_triangle_indices(n)
     matrix[rows, columns] = matrix[columns, rows] = entries
     return matrix
 
 
 @cache
-def _triangle_places(n: int) -> tuple[Int[np.ndarray, "triangle"], Int[np.ndarray, "triangle"]]:
+def _lower_triangle_indices(n: int) -> tuple[Int[np.ndarray, "triangle"], Int[np.ndarray, "triangle"]]:
     """Return the rows and columns of the entries of an (n, n) matrix's lower triangle, row by row."""
     return np.tril_indices(n)
 

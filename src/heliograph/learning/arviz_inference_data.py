@@ -22,7 +22,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
 
     ArviZ compares and plots Bayesian fits. The draws are normal about the maximum likelihood estimate, with the inverse
     curvature of the log-likelihood there as covariance (the Laplace approximation). They are drawn in coordinates on
-    the line, where each free number is unbounded (such as logarithms of positive numbers).
+    unconstrained coordinates (such as logarithms of positive numbers).
 
     Args:
         solution: the fit: its maximum `x` (p,), covariance and likelihood.
@@ -64,7 +64,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
 
 
 def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndarray:
-    """Return log p of each row given those before it at points of the line, (points, rows), the recordings in a row."""
+    """Return log p of each row given those before, at unconstrained points, (points, rows of all recordings)."""
     density = np.asarray(solution.surface.evaluate_rows(points).density)
     return np.concatenate([density[:, i, :steps] for i, steps in enumerate(solution.surface.data.lengths)], axis=1)
 
@@ -72,7 +72,7 @@ def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndar
 def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
     """Return the free numbers of the table (for instance logarithms of variances) at posterior draws, as a dataset.
 
-    `points`: draws of their unbounded coordinates (draws, p). All draws are one chain, axis 0.
+    `points`: draws of their unconstrained coordinates (draws, p). All draws are one chain, axis 0.
     """
     values = np.stack([solution.parameters.entries_at(x) for x in points])  # (draws, entries)
     names = [entry.name for entry in solution.parameters.entries]

@@ -1,6 +1,6 @@
 """Table of estimates with intervals: of the maximum of one form of the likelihood, and what is at a limit or a ridge.
 
-The line: free numbers as unbounded coordinates, logarithms or logits of those whose domain has ends. A coordinate is
+Free numbers have unconstrained coordinates: logarithms or logits of those whose domain has ends. A coordinate is
 active if its number is not at such an end. A ridge is a direction in which the likelihood does not change.
 """
 
@@ -13,7 +13,11 @@ from heliograph.learning.estimate_row import Row, make_unidentified_row
 from heliograph.learning.free_parameters import Parameters, TableEntry
 from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
 from heliograph.learning.likelihood.objective import Form
-from heliograph.learning.likelihood.parameter_transforms import from_line, slope_from_line, to_line
+from heliograph.learning.likelihood.parameter_transforms import (
+    from_unconstrained,
+    slope_from_unconstrained,
+    to_unconstrained,
+)
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.long_run_covariance import (
     DRAWS,
@@ -23,7 +27,7 @@ from heliograph.learning.long_run_covariance import (
     bootstrap_block_sums,
     compute_sandwich_covariance,
     estimate_long_run_covariance,
-    find_numbers_told_by_few_stretches,
+    find_numbers_in_few_stretches,
     find_profile_drop,
     remove_predicted_scores,
     student_quantile,
@@ -62,7 +66,7 @@ class Solution:
 
     @property
     def x(self) -> Float[np.ndarray, " p"]:
-        """The maximum in unbounded coordinates (p,): +-infinity where a number is at an end of its domain."""
+        """The maximum in unconstrained coordinates (p,): +-infinity where a number is at an end of its domain."""
         return self.top.limit
 
     @property
@@ -128,25 +132,28 @@ class Solution:
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
     @cached_property
-    def few(self) -> Bool[np.ndarray, " active"]:
+    def in_few_stretches(self) -> Bool[np.ndarray, " active"]:
         """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
         free = np.flatnonzero(self.active & self.surface.domains.free)
-        few = np.zeros(len(self.active), dtype=bool)
+        in_few_stretches = np.zeros(len(self.active), dtype=bool)
         if len(free) and not self.rank.flat.size:
-            few[free] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, free))
-        return np.asarray(few[self.active])
+            in_few_stretches[free] = find_numbers_in_few_stretches(self.surface.information_by_row(self.top.x, free))
+        return np.asarray(in_few_stretches[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
         """Return the covariance of the active coordinates along the identified directions, and its degrees of freedom.
 
         It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores (gradients of l by row),
-        estimated by `method`. Numbers whose information is in a few stretches of the data (`few`) have the model's J.
+        estimated by `method`. Numbers whose information is in a few stretches of the data (`in_few_stretches`) have the
+        model's J.
         """
-        scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
-        if self.few.any():
+        scores, by_model = self.scores, np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))
+        if self.in_few_stretches.any():
             # Here all directions are identified, so that the Hessian can be brought back to the active coordinates.
             inverse = np.linalg.inv(self.basis)
-            scores, by_model = remove_predicted_scores(scores, inverse.T @ self.hessian @ inverse, self.few)
+            scores, by_model = remove_predicted_scores(
+                scores, inverse.T @ self.hessian @ inverse, self.in_few_stretches
+            )
         estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
             estimate = estimate._replace(covariance=estimate.covariance + self._project_on_identified(by_model))
@@ -168,7 +175,7 @@ class Solution:
     def describe_with_cheap_errors(self) -> list[str]:
         """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
         active, values = self.active, self.parameters.entries_at(self.x)
-        # A number's variance is g' I^-1 g, with its derivative g on the line by the active coordinates.
+        # A number's variance is g' I^-1 g, with its derivative g, unconstrained too, by the active coordinates.
         information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]
         inverse = np.linalg.pinv(information, hermitian=True)
         slopes = self.parameters.slopes(self.top.x)[:, active]
@@ -180,7 +187,7 @@ class Solution:
         ]
 
     def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
-        """Return in words an estimate `value` and its interval, symmetric in the unbounded coordinate (log or logit).
+        """Return in words an estimate `value` and its interval, symmetric in the unconstrained number (log or logit).
 
         `error`: its standard error there. `slope`: its derivative, which shows whether it is identified.
         """
@@ -189,7 +196,7 @@ class Solution:
         if not self.identifies(slope):
             return f"{value:>10.4g}  (not identified)"
         with np.errstate(divide="ignore"):  # rounding may put a value at the end of its domain
-            center = float(to_line(entry.domain, value))
+            center = float(to_unconstrained(entry.domain, value))
             half = student_quantile(np.inf) * error  # infinitely many degrees of freedom: the normal law
             row = self._make_row(entry, value, error, (center - half, center + half))
         return f"{row.value:>10}  (about {row.interval})"
@@ -221,7 +228,7 @@ class Solution:
         method: Method,
         level: float,
     ) -> tuple[float, float]:
-        """Return the ends of the interval of a number of the table, in its unbounded coordinate (number, log or logit).
+        """Return the ends of the interval of a number of the table, unconstrained (the number, its log or logit).
 
         By `method`: estimate +- quantile x standard error, or quantiles of a bootstrap, or where the profile of the
         likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
@@ -230,33 +237,35 @@ class Solution:
         Args:
             entry: the number.
             value: estimate of the number.
-            slopes: its derivative, in its unbounded coordinate, by each active (not fixed) coordinate (active,).
+            slopes: its derivative, in its unconstrained coordinate, by each active (not fixed) coordinate (active,).
             error: its standard error in that coordinate.
             freedom: degrees of freedom with which the error is known.
             method: "bootstrap", "profile", or another one, for estimate +- quantile x standard error.
             level: probability with which the interval holds the number.
         """
         coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
-        is_in_few = False
+        is_in_few_stretches = False
         if coordinate is not None:
             hardly_known = self.surface.domains.single[coordinate] and error > WIDE
             if hardly_known or method == "profile":
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
-            is_in_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])  # its place among active ones
-        center = float(to_line(entry.domain, value))
+            is_in_few_stretches = bool(
+                self.in_few_stretches[np.count_nonzero(self.active[:coordinate])]
+            )  # its place among active ones
+        center = float(to_unconstrained(entry.domain, value))
         # Resampled blocks do not show how a number varies whose information is in a few stretches of the data.
-        if method == "bootstrap" and not is_in_few:
+        if method == "bootstrap" and not is_in_few_stretches:
             low, high = center + self._bootstrap_interval(slopes, level)
             return low, high
         half = student_quantile(freedom, level) * error
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, from its error and its interval in the unbounded coordinate."""
-        low, high = sorted(float(from_line(entry.domain, end)) for end in ends)
-        slope = abs(float(slope_from_line(entry.domain, to_line(entry.domain, value))))
+        """Return the row of an identified number, from its error and its interval in the unconstrained coordinate."""
+        low, high = sorted(float(from_unconstrained(entry.domain, end)) for end in ends)
+        slope = abs(float(slope_from_unconstrained(entry.domain, to_unconstrained(entry.domain, value))))
         return Row(
             name=entry.name,
             estimate=value,
@@ -296,7 +305,7 @@ class Solution:
         outward = self.top.ends[entry.coordinate]  # -1 or 1
         first, drop = np.array([-outward * FURTHER]), find_profile_drop(2 * level - 1)
         (end,) = self._find_profile_ends(entry.coordinate, first, drop)
-        limit = float(from_line(entry.domain, end if np.isfinite(end) else -outward * np.inf))
+        limit = float(from_unconstrained(entry.domain, end if np.isfinite(end) else -outward * np.inf))
         return Row(
             name=entry.name,
             estimate=value,

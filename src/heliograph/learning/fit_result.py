@@ -183,7 +183,7 @@ class Fit:
         """Return draws of the numbers and the log-likelihood of each row, as ArviZ compares models by them.
 
         The draws are of the Laplace approximation: the normal law of the curvature of the likelihood at its maximum, on
-        the line on which the numbers are unbounded, with no prior. `log_likelihood` has log p(z_k | z_1 ... z_k-1) of
+        unconstrained coordinates, with no prior. `log_likelihood` has log p(z_k | z_1 ... z_k-1) of
         each row in which something arrived, by the form of the likelihood that counts; `sample_stats` has its sum, lp.
 
         Args:

@@ -1,4 +1,4 @@
-"""Free numbers as unbounded coordinates, in which a fit searches, and as the entries of a user's table."""
+"""Free numbers as unconstrained coordinates, in which a fit searches, and as the entries of a user's table."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,10 +10,10 @@ from scipy.linalg import block_diag
 
 from heliograph.learning.likelihood.parameter_transforms import (
     count_coordinates,
-    map_from_line,
-    map_to_line,
-    slope_from_line,
-    slope_to_line,
+    map_from_unconstrained,
+    map_to_unconstrained,
+    slope_from_unconstrained,
+    slope_to_unconstrained,
 )
 from heliograph.numerics.domains import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.module import readable
@@ -55,27 +55,27 @@ class Parameter:
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
     def entries_at(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
-        """Return what the table of estimates shows of this number (entries,), at its unbounded coordinates x (size,).
+        """Return the entries of the table of estimates (entries,) that this number has at unconstrained coordinates x.
 
-        A coordinate is the logarithm or logit of a number whose domain has ends, else the number itself.
+        Coordinates (size,) are the logarithm or logit of a number whose domain has ends, else the number itself.
         """
         with jax.enable_x64(True):
             return np.asarray(self._trace_entries(np.asarray(x)))
 
     def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Return the derivatives (entries, size) of the entries at a point x (size,) of the unbounded line.
+        """Return the derivatives (entries, size) of the entries at unconstrained coordinates x (size,).
 
         Each entry of an interval has its own coordinate, so the derivatives are diagonal. JAX differentiates the
         others.
         """
         if self.domain.kind == "interval":
-            return np.diag(slope_from_line(self.domain, x))
+            return np.diag(slope_from_unconstrained(self.domain, x))
         with jax.enable_x64(True):
             return np.asarray(jax.jacfwd(self._trace_entries)(jnp.asarray(x)))
 
     def _trace_entries(self, x: Array) -> Array:
         """Return the entries (entries,) at coordinates x (size,), in operations that JAX can trace."""
-        return self.list_entries(map_from_line(self.domain, self.start.shape, x))
+        return self.list_entries(map_from_unconstrained(self.domain, self.start.shape, x))
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
@@ -116,14 +116,14 @@ class Parameters:
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """Return the coordinates (p,) on the unbounded line at which all free numbers (`self.every`) start."""
+        """Return the unconstrained coordinates (p,) at which all free numbers (`self.every`) start."""
         return np.concatenate(
-            [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
+            [map_to_unconstrained(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
 
     @property
     def entries(self) -> tuple[TableEntry, ...]:
-        """Return the entries of the table in order, each with the place of its own coordinate, or None."""
+        """Return the entries of the table in order, each with the index of its own coordinate, or None."""
         results, begin = [], 0
         for parameter in self.every:
             has_own_coordinates = parameter.domain.kind == "interval"  # one coordinate for each entry
@@ -134,7 +134,7 @@ class Parameters:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Return the names of all coordinates on the unbounded line.
+        """Return the names of all unconstrained coordinates.
 
         A number of an interval has a coordinate with the name of each entry. A simplex or a covariance has numbered
         ones, NAME(0), NAME(1), ...
@@ -146,20 +146,20 @@ class Parameters:
         )
 
     def values(self, x: Array) -> dict[str, Array]:
-        """Return the free numbers at a point x (p,) of the line, {name: number}, in operations that JAX traces."""
+        """Return the free numbers {name: number} at unconstrained coordinates x (p,), in operations that JAX traces."""
         ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
-            parameter.name: map_from_line(parameter.domain, parameter.start.shape, x[a:b])
+            parameter.name: map_from_unconstrained(parameter.domain, parameter.start.shape, x[a:b])
             for parameter, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
-        """Return the free numbers at a point x (p,) of the line, {name: number}, as plain floats and arrays."""
+        """Return the free numbers at unconstrained coordinates x (p,), {name: number}, as plain floats and arrays."""
         with jax.enable_x64(True):
             return {name: to_plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
-        """Return the values of all entries of the table (entries,) at a point x (p,) of the line."""
+        """Return the values of all entries of the table (entries,) at unconstrained coordinates x (p,)."""
         return np.concatenate([parameter.entries_at(single) for parameter, single in self._split_point(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
@@ -173,14 +173,14 @@ class Parameters:
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives (entries, p) of the entries, each taken on the line, by the coordinates x (p,).
+        """Return the derivatives (entries, p) of the entries, unconstrained, by the unconstrained coordinates x (p,).
 
-        On the line an entry is its logarithm or logit if its domain has ends. There are no warnings, since a derivative
-        may be infinite at an end.
+        An unconstrained entry is its logarithm or logit if its domain has ends. There are no warnings,
+        since a derivative may be infinite at an end.
         """
         entries = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
-            return np.stack([slope_to_line(entry.domain, value) * dv_dx for entry, value, dv_dx in entries])
+            return np.stack([slope_to_unconstrained(entry.domain, value) * dv_dx for entry, value, dv_dx in entries])
 
 
 def to_plain_number(value: Array) -> float | np.ndarray:

@@ -237,7 +237,7 @@ def _format_interval(
     """
     if solution is None or not all(solution.active[i] for i in group.coordinates):
         return ""
-    # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unbounded coordinates.
+    # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unconstrained coordinates.
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
     for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
@@ -330,7 +330,7 @@ def describe_identified_links(solution: "Solution") -> list[str]:
         return []
 
     def compute_moments_at(x: Array) -> jax.Array:
-        """Return mean gain, gain variance and noise of each output at a point x (p,) of the line, (outputs, 3)."""
+        """Return mean gain, gain variance and noise of each output (outputs, 3) at unconstrained coordinates x."""
         _, sensor, channel = join_all_nodes(description.at(description.parameters.values(x)))
         return _compute_link_moments(first(sensor), first(channel))
 

@@ -48,7 +48,7 @@ def count_cosines(steps: int) -> int:
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
-def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
+def find_numbers_in_few_stretches(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
     """Return which of k numbers have their information in only a few of the nu stretches of the data, (k,).
 
     Stretches divide the rows evenly, as many as cosines are used to estimate the covariance of summed scores. With V_b
@@ -67,16 +67,18 @@ def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "step
 
 
 def remove_predicted_scores(
-    scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
+    scores: Scores, hessian: Float[np.ndarray, "p p"], in_few_stretches: Bool[np.ndarray, " p"]
 ) -> tuple[Scores, Float[np.ndarray, "p p"]]:
     """Return the scores minus what the scores of some numbers K predict of them, and the covariance of that prediction.
 
     These are s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with s the scores of each step, H the Hessian of minus the
-    log-likelihood and K the numbers marked in `few`. If the model is true, both parts are uncorrelated, and the
-    covariances of their sums add up to H.
+    log-likelihood and K the numbers marked in `in_few_stretches`. If the model is true, both parts are uncorrelated,
+    and the covariances of their sums add up to H.
     """
-    coefficients = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])  # (few, p)
-    return [s - s[:, few] @ coefficients for s in scores], hessian[:, few] @ coefficients
+    coefficients = np.linalg.solve(
+        hessian[np.ix_(in_few_stretches, in_few_stretches)], hessian[in_few_stretches]
+    )  # (few, p)
+    return [s - s[:, in_few_stretches] @ coefficients for s in scores], hessian[:, in_few_stretches] @ coefficients
 
 
 def estimate_by_cosines(scores: Scores) -> LongRunCovariance:

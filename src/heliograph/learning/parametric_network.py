@@ -13,7 +13,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.learning.free_parameters import Parameter, Parameters, to_plain_number
-from heliograph.learning.likelihood.parameter_transforms import map_to_line
+from heliograph.learning.likelihood.parameter_transforms import map_to_unconstrained
 from heliograph.numerics.check import array, error_text, fail, function, instance, rank, show_value
 from heliograph.numerics.domains import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, mark_checked
 from heliograph.numerics.module import readable
@@ -23,7 +23,7 @@ from heliograph.simulation.network import Network
 Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
 Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
 
-ASIDE, IRRATIONAL = 0.1, 0.6180339887498949  # how far near the start is on the line; multiples of it differ
+ASIDE, IRRATIONAL = 0.1, 0.6180339887498949  # unconstrained distance of a point near the start; multiples of it differ
 
 DOMAINS: dict[Kind, Domain] = {
     "real": REAL,
@@ -147,7 +147,7 @@ class FreeNumberCollector:
             name = mark.given or _make_name_distinct(mark.place or "free number", taken)
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
-            map_to_line(name, domain, mark.start)  # raises ValueError for a start outside the domain
+            map_to_unconstrained(name, domain, mark.start)  # raises ValueError for a start outside the domain
             results.append(Parameter(name, mark.start, domain))
         return Parameters(tuple(results))
 
@@ -235,7 +235,7 @@ class Description:
         return self.start
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
-        """Return the network, of plain numbers, at a point x (p,) of the line."""
+        """Return the network, of plain numbers, at unconstrained coordinates x (p,)."""
         return self.at(self.parameters.known(x))
 
 

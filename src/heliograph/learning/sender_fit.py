@@ -22,13 +22,15 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 IMPOSSIBLE = -1e300  # log-likelihood of impossible recordings: a search needs a number
-FIRST_REACH = 0.05  # from the maximum towards an end of an interval, on the line
-LARGEST_SIMPLEX = 0.2  # edges of a first simplex, on the line
+FIRST_REACH = 0.05  # from the maximum towards an end of an interval, in unconstrained coordinates
+LARGEST_SIMPLEX = 0.2  # edges of a first simplex, in unconstrained coordinates
 MOST_EVALUATIONS = 200  # of a search, for each coordinate
 NORMAL = 1.96  # deviations of a normal law on either side, between which 95 % lie
-FURTHEST = 4.0  # on the line, in logarithms and logits: an interval that reaches so far has no end there
+FURTHEST = (
+    4.0  # in unconstrained coordinates, in logarithms and logits: an interval that reaches so far has no end there
+)
 HALVINGS = 12
-DIGITS = 1e-4  # of the line
+DIGITS = 1e-4  # of an unconstrained coordinate
 NEAR = 1e-3  # of the ends of an interval, and of what is searched for them
 
 Likelihood = Callable[[Float[np.ndarray, " p"]], float]
@@ -41,7 +43,7 @@ class SenderFit:
 
     Args:
         description: the network with free numbers.
-        x: the maximum on the line, (p,).
+        x: the maximum in unconstrained coordinates, (p,).
         total: log-likelihood of the maximum, in nats.
         table: a row for each number.
         converged: True if the search for the maximum converged.
@@ -141,7 +143,7 @@ def fit_sender(
     data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood of all recordings at a point x (p,) of the unbounded line.
+        """Return the log-likelihood of all recordings at unconstrained coordinates x (p,).
 
         `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE: a very low number that
         replaces -inf and NaN, since the search needs numbers.
@@ -276,7 +278,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
     Args:
         row: the row without an interval.
         description: the network with its free numbers.
-        likelihood: log-likelihood at a point of the line.
+        likelihood: log-likelihood at a point in unconstrained coordinates.
         top: the maximum.
         index: number of the entry of the table.
     """
@@ -294,7 +296,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
 
 
 class _BestPoint(NamedTuple):
-    """Best point of a search: x on the line (p,), its log-likelihood, and how the search ended."""
+    """Best point of a search: x in unconstrained coordinates (p,), its log-likelihood, and how the search ended."""
 
     x: Float[np.ndarray, " p"]
     total: float
@@ -344,7 +346,7 @@ class _Profile(NamedTuple):
 
         The profile is the log-likelihood with this coordinate held at `value`, maximised over the others. The search
         stops as soon as it is above `self.level`. Its first simplex is as large as the two values are apart, up to
-        LARGEST_SIMPLEX. NEAR: accuracy on the line.
+        LARGEST_SIMPLEX. NEAR: accuracy in unconstrained coordinates.
         """
         size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
         best = _climb_simplex(

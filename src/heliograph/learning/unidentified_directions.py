@@ -72,7 +72,7 @@ def find_confounded(
 
     Args:
         parameters: the free numbers.
-        points: points in unbounded coordinates x (p,): logarithms or logits of numbers whose domain has ends.
+        points: points in unconstrained coordinates x (p,): logarithms or logits of numbers whose domain has ends.
         ranks: flat directions at each point, `flat` (p, directions), in units of 1 / sqrt(information) of each
             coordinate, `unit` (p,).
     """

@@ -3,46 +3,28 @@
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from math import ceil, floor, inf, nan
-from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
+from heliograph.live.fleet_options import Options, check_options
 from heliograph.live.health.link_counts import ScreenedEvent
 from heliograph.live.health.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
 from heliograph.live.health.stuck_sensor_watch import RepeatWatch
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.plant_state import FinalisedPlant, PlantState
-from heliograph.live.plant_table import SlotTable, cut_chain_into_legs, group_by_turn
+from heliograph.live.plant_table import StateTable, cut_chain_into_legs, group_by_turn
 from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, list_columns_of_blocks
 from heliograph.model.checks.refusal_reasons import count_by_reason
 from heliograph.model.over_time import steps_covered
 from heliograph.model.readings.reading_limits import ReadingLimits
 from heliograph.model.readings.repeated_readings import Repeats
 from heliograph.model.readings.timeouts import name_timeout_unit
-from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float
 
 LAST_STEP = 2.0**53  # up to which numbers count steps one by one
-
-
-class Options(NamedTuple):
-    """Limits of a fleet: which events it accepts, and how many rows it holds.
-
-    Args:
-        window: how late an event may be, in the unit of time of the network (default 10).
-        ahead: how much later than its arrival the time of an event may be (default 0).
-        leap: how much later than all before it an event may be that no other clock has confirmed (default 10,000).
-        capacity: greatest number of rows held for each plant (default 1000).
-        step: seconds of a step, where time counts steps and messages carry dates; None where they carry steps.
-    """
-
-    window: float = 10.0
-    ahead: float = 0.0
-    leap: float = 10_000.0
-    capacity: int = 1000
-    step: float | None = None
 
 
 class Fleet:
@@ -65,8 +47,8 @@ class Fleet:
         instance("program", program, NetworkProgram, "NetworkProgram")
         instance("options", options, Options, "Options")
         network = self.network = program.network
-        self.options, self.program = _check_options(options), program
-        self.pool = SlotTable(program, alone)
+        self.options, self.program = check_options(options), program
+        self.state_table = StateTable(program, alone)
         # By name of a node, then of the inputs: its index, -1 for the inputs, and how many numbers its events have.
         self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self.sizes[INPUTS] = -1, self.program.given
@@ -86,8 +68,8 @@ class Fleet:
         self.deciding = {name: rule.trigger for name, rule in self.watched.items() if rule.trigger is not None}
         self._values_before_losses = count_values_before_losses(network, self.deciding)
         # A slot with the prior, at step -1, for plants that have not begun.
-        self._blank = self.pool.take_slot()
-        self.pool.write_prior(self._blank, -1.0)
+        self._blank = self.state_table.take_slot()
+        self.state_table.write_prior(self._blank, -1.0)
 
     @property
     def shortest_timeout(self) -> float:
@@ -107,8 +89,8 @@ class Fleet:
         """
         by_steps = self.program.dt is None
         prior_time = -1.0 if by_steps else time
-        slot = self.pool.take_slot()
-        self.pool.write_prior(slot, prior_time)
+        slot = self.state_table.take_slot()
+        self.state_table.write_prior(slot, prior_time)
         base = HeldRow((prior_time, BEFORE, 0), slot, self.width)
         base.numbers[-1] = prior_time
         return PlantState(name, self.make_rows(base), now=0.0 if by_steps else time, origin=origin, begun=time)
@@ -116,7 +98,7 @@ class Fleet:
     def end_plant(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
         self.end_silence(plant)
-        self.pool.free_slots(plant.slots)
+        self.state_table.free_slots(plant.slots)
 
     def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
         """Predict each plant to the step paired with it, without measurements; this row becomes the plant's `silence`.
@@ -129,16 +111,16 @@ class Fleet:
             before = plant.silence or plant.rows.held[-1]
             if step <= before.key[0]:  # the plant was already predicted so far
                 continue
-            slot = plant.silence.slot if plant.silence is not None else self.pool.take_slot()
+            slot = plant.silence.slot if plant.silence is not None else self.state_table.take_slot()
             plant.silence = HeldRow((step, 0, 0), slot, self.width)  # nothing came: all its numbers are NaN
-            self.pool.table[slot, self.pool.numbers] = plant.silence.numbers
+            self.state_table.table[slot, self.state_table.numbers] = plant.silence.numbers
             chains.append([before, plant.silence])
         self._step_chains(chains)
 
     def end_silence(self, plant: PlantState) -> None:
         """Forget the row of a plant that was predicted without measurements, and free its slot in the table."""
         if plant.silence is not None:
-            self.pool.free_slots([plant.silence.slot])
+            self.state_table.free_slots([plant.silence.slot])
             plant.silence = None
 
     def count_values(self, node: int) -> int:
@@ -272,7 +254,9 @@ class Fleet:
         verdict = plant.rows.judge_event(event, key, now - self.options.window, self.options.ahead)
         if verdict == "used":
             self.end_silence(plant)
-            plant.add_event(event, key, self.pool.take_slot, self.width, self._find_lost_column(event.node_index))
+            plant.add_event(
+                event, key, self.state_table.take_slot, self.width, self._find_lost_column(event.node_index)
+            )
             plant.pass_time(clock_name, clock_time, now, longest_gap, agreed)
         return verdict
 
@@ -289,7 +273,7 @@ class Fleet:
 
     def undo_events(self, plant: PlantState, clock: tuple[float, ClockLeap | None]) -> None:
         """Undo a plant's events since its rows were last made final. `clock`: its time and newest leap in time then."""
-        self.pool.free_slots(plant.undo_changes())
+        self.state_table.free_slots(plant.undo_changes())
         plant.clock = clock
 
     def finalise_plants(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
@@ -309,11 +293,11 @@ class Fleet:
 
     def step(self, plants: Iterable[PlantState]) -> None:
         """Step the changed rows of all plants, and all rows after them, at once; write them into the table."""
-        chains = list(filter(None, [plant.take_dirty_rows() for plant in plants]))
+        chains = list(filter(None, [plant.take_changed_rows() for plant in plants]))
         rows = [row for chain in chains for row in chain]
         if rows:
             numbers = np.array([number for row in rows for number in row.numbers]).reshape(len(rows), -1)
-            self.pool.table[[row.slot for row in rows], self.pool.numbers] = numbers
+            self.state_table.table[[row.slot for row in rows], self.state_table.numbers] = numbers
         self._step_chains(chains)
 
     def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
@@ -323,16 +307,16 @@ class Fleet:
         legs_of_chains = [cut_chain_into_legs(chain, by_steps, endless) for chain in chains]
         while legs_of_chains:
             for steps in group_by_turn(legs[0].steps for legs in legs_of_chains):
-                self.pool.step_slots_in_place(*map(np.array, zip(*steps, strict=True)))
+                self.state_table.step_slots_in_place(*map(np.array, zip(*steps, strict=True)))
             legs_of_chains = [legs for legs in legs_of_chains if len(legs) > 1]  # those with a gap after the first leg
             for legs in legs_of_chains:
                 _, slot_before_gap, _ = legs[0].steps[-1]
-                self.pool.pass_long_gap(slot_before_gap, to=legs[0].jump)
+                self.state_table.pass_long_gap(slot_before_gap, to=legs[0].jump)
             legs_of_chains = [legs[1:] for legs in legs_of_chains]
 
     def step_row(self, before: HeldRow, row: HeldRow) -> None:
         """Compute the state of `row`, which no plant holds, from that of the row `before`; write it into the table."""
-        self.pool.table[row.slot, self.pool.numbers] = row.numbers
+        self.state_table.table[row.slot, self.state_table.numbers] = row.numbers
         self._step_chains([[before, row]])
 
     def predict_into(self, row: HeldRow, time: float, slot: int) -> None:
@@ -348,11 +332,11 @@ class Fleet:
         begun yet. An input that is NaN keeps its value.
         """
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
-        return self.pool.predict_outputs(np.array(slots), given, self.end_step)
+        return self.state_table.predict_outputs(np.array(slots), given, self.end_step)
 
     def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
         """Return the outputs of all filters (row, output) after the rows in these slots of the table."""
-        return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
+        return self.state_table.table[np.array(slots, dtype=int), self.state_table.outputs]
 
     def find_sender_status(self, plant: PlantState, now: float = -inf) -> dict[str, SenderStatus]:
         """Return {node whose silence says something: the status of its sender by now}.
@@ -388,13 +372,4 @@ class Fleet:
     def free_slots(self, finalised: Iterable[FinalisedPlant]) -> None:
         """Free the slots that are not needed any more, once the outputs of the final rows have been read."""
         for of_plant in finalised:
-            self.pool.free_slots(of_plant.left)
-
-
-def _check_options(options: Options) -> Options:
-    """Return the options converted to floats and integers; raise ValueError if one is out of range."""
-    step = None if options.step is None else float(scalar("step", options.step, TINY))
-    leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
-    window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))
-    capacity = check_count("capacity", options.capacity)
-    return Options(window=window, ahead=ahead, leap=float(leap), capacity=capacity, step=step)
+            self.state_table.free_slots(of_plant.left)

@@ -22,34 +22,34 @@ LEAST = 2.0**-40  # of an entry of the map, in units of the movements
 STEADY = 0.01  # relative: a number that moves on by as much as before
 
 
-class FactorPlaces(NamedTuple):
-    """Places of the factors of one covariance, or several, in a row: lower (..., n (n - 1) / 2), variances (..., n)."""
+class FactorIndices(NamedTuple):
+    """Where a row has the factors of one covariance, or several: lower (..., n (n - 1) / 2), variances (..., n)."""
 
     lower: np.ndarray
     variances: np.ndarray
 
 
-def find_factor_places(places: PyTree) -> list[FactorPlaces]:
-    """Return the places in a row of all factors L and D of covariances.
+def find_factor_indices(indices: PyTree) -> list[FactorIndices]:
+    """Return the indices in a row of all factors L and D of covariances.
 
-    `places` is a state's tree whose leaves hold their own places in the row. The path of a factor L ends with LOWER,
+    `indices` is a state's tree whose leaves hold their own indices in the row. The path of a factor L ends with LOWER,
     and that of a factor D with VARIANCES.
     """
-    places_by_path = {path: leaf.astype(int) for path, leaf in split_by_path(places).items()}
-    stems = [path.removesuffix(VARIANCES) for path in places_by_path if path.endswith(VARIANCES)]
+    indices_by_path = {path: leaf.astype(int) for path, leaf in split_by_path(indices).items()}
+    stems = [path.removesuffix(VARIANCES) for path in indices_by_path if path.endswith(VARIANCES)]
     return [
-        FactorPlaces(places_by_path[stem + LOWER], places_by_path[stem + VARIANCES])
+        FactorIndices(indices_by_path[stem + LOWER], indices_by_path[stem + VARIANCES])
         for stem in stems
-        if stem + LOWER in places_by_path
+        if stem + LOWER in indices_by_path
     ]
 
 
 def convert_to_covariances(
-    rows: Float[np.ndarray, "row state"], places: Sequence[FactorPlaces]
+    rows: Float[np.ndarray, "row state"], factors: Sequence[FactorIndices]
 ) -> Float[np.ndarray, "row state"]:
     """Return rows in which entries of P = L D L' replace the factors: below the diagonal L's, and on it D's."""
     rows = rows.copy()
-    for lower, variances in places:
+    for lower, variances in factors:
         factor, diagonal = unit_lower(rows[:, lower]), rows[:, variances]  # L, and the diagonal of D
         covariance = (factor * diagonal[..., None, :]) @ np.swapaxes(factor, -1, -2)  # (L D) L'
         rows[:, lower] = covariance[..., *np.tril_indices(variances.shape[-1], -1)]
@@ -58,15 +58,15 @@ def convert_to_covariances(
 
 
 def convert_to_factors(
-    rows: Float[np.ndarray, "row state"], places: Sequence[FactorPlaces]
+    rows: Float[np.ndarray, "row state"], factors: Sequence[FactorIndices]
 ) -> Float[np.ndarray, "row state"]:
     """Return rows with the factors L and D of each covariance L D L' where the covariance stood.
 
-    The covariance stands in the places of its factors: entries below its diagonal in those of L (`lower`), and its
+    The covariance stands where its factors do: entries below its diagonal in those of L (`lower`), and its
     diagonal in those of D (`variances`).
     """
     rows = rows.copy()
-    for lower, variances in places:
+    for lower, variances in factors:
         n = variances.shape[-1]
         covariance = np.zeros((len(rows), *variances.shape, n))
         below = np.tril_indices(n, -1)  # entries (i, j) below the diagonal; (j, i) are equal
@@ -77,7 +77,7 @@ def convert_to_factors(
 
 
 def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[np.ndarray, " state"], at: int,
-                 count: int, places: Sequence[FactorPlaces] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
+                 count: int, factors: Sequence[FactorIndices] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
     """Return the state after `count` silent steps from one after step number `at`, in bounded work.
 
     A silent step g (one without a measurement) of a linear plant is affine in mean and covariance: x' = F x,
@@ -93,21 +93,21 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
         state: state before the gap.
         at: number of the step that led to it.
         count: number of steps, at least 0.
-        places: where a state holds factors L, D of a covariance. These are not affine, but P = L D L' is.
+        factors: where a state holds factors L, D of a covariance. These are not affine, but P = L D L' is.
     """
-    after = _pass_silent_steps(step, state, at, count, places)
+    after = _pass_silent_steps(step, state, at, count, factors)
     return after if np.isfinite(after[np.isfinite(state)]).all() else start
 
 
 def _pass_silent_steps(
-    step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[FactorPlaces]
+    step: Step, state: Float[np.ndarray, " state"], at: int, count: int, factors: Sequence[FactorIndices]
 ) -> Float[np.ndarray, " state"]:
     """Return the state after `count` steps of silence: a few probes, and the rest at once by what these show.
 
     Silence is a gap without data, in which a filter only predicts. It may last millions of steps, so a few are really
     computed. A probe is PROBED (256) real steps in a row. If a probe changes no number, the state stays. If an affine
     map of the state predicts a probe, the map is applied for all later steps. Else the probes are extrapolated. A state
-    holds factors L, D of covariances at `places`; states are compared and extrapolated with L D L' there, since
+    holds factors L, D of covariances at `factors`; states are compared and extrapolated with L D L' there, since
     P' = F P F' + Q is affine in P and not in its factors.
 
     Args:
@@ -115,17 +115,17 @@ def _pass_silent_steps(
         state: state before the gap: means, factors and all else of the filters, in one array.
         at: number of the step that led to `state`.
         count: number of steps of silence.
-        places: where the factors of covariances stand in a state.
+        factors: where the factors of covariances stand in a state.
     """
     after_probes = [state]  # the states after 0, 1, 2, ... probes
 
     def with_covariances(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
         """Return states with covariances in place of their factors."""
-        return list(convert_to_covariances(np.stack(states), places))
+        return list(convert_to_covariances(np.stack(states), factors))
 
     def step_covariances(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
         """Return states with covariances after the silent step with number k."""
-        return convert_to_covariances(step(convert_to_factors(states, places), k), places)
+        return convert_to_covariances(step(convert_to_factors(states, factors), k), factors)
 
     for i in range(min(PROBES, count // PROBED)):
         after_probes.append(_step_through(step, after_probes[-1], at + i * PROBED, PROBED))
@@ -139,16 +139,18 @@ def _pass_silent_steps(
             begin, left = at + i * PROBED, count - i * PROBED
             jumped = _jump_by_affine_map(step_covariances, probe, entries_moving, begin, left)
             if jumped is not None:
-                return _restore_factors(jumped, places)
+                return _restore_factors(jumped, factors)
     done = PROBED * (len(after_probes) - 1)
     if count - done < PROBED:  # few enough to be stepped one by one
         return _step_through(step, after_probes[-1], at + done, count - done)
-    return _restore_factors(_extrapolate_state(with_covariances(after_probes), count - done), places)
+    return _restore_factors(_extrapolate_state(with_covariances(after_probes), count - done), factors)
 
 
-def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[FactorPlaces]) -> Float[np.ndarray, " state"]:
-    """Return one state with factors in the places of covariances."""
-    alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], places)[0]
+def _restore_factors(
+    state: Float[np.ndarray, " state"], factors: Sequence[FactorIndices]
+) -> Float[np.ndarray, " state"]:
+    """Return one state with factors in place of covariances."""
+    alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], factors)[0]
     return alone
 
 

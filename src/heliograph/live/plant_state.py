@@ -8,54 +8,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from math import inf
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, CheckedEvent
 from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
-
-
-class WithdrawnEvent(NamedTuple):
-    """An event that was used until a later one showed that its clock is wrong."""
-
-    node_index: int
-    sequence: int
-    time: float
-
-
-# A row that took an event, with its numbers and events before; None if the row is new.
-Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
-
-
-class RowBeforeLeap(NamedTuple):
-    """The newest row before a leap in time, and the newest arrival before it."""
-
-    row: HeldRow
-    now: float
-
-
-class RowsOfLeap(NamedTuple):
-    """What taking back a leap removed from a plant, so that `PlantState.undo_changes` can restore it.
-
-    Attributes:
-        held: all rows held before.
-        kept: `PlantState.kept` before.
-        changes: how many changes had been recorded.
-        gone: rows that are not held any more.
-        rows: those of them whose estimates were not final.
-    """
-
-    held: list[HeldRow]
-    kept: RowBeforeLeap | None
-    changes: int
-    gone: list[HeldRow]
-    rows: list[HeldRow]
+from heliograph.live.undoable_changes import Change, RowBeforeLeap, UndoneLeap, WithdrawnEvent
 
 
 @dataclass
 class PlantState:
-    """State of one plant: its rows, of which those from `dirty` on have to be stepped again.
+    """State of one plant: its rows, of which those from `first_changed` on have to be stepped again.
 
     Attributes:
         name: name of the plant.
@@ -63,14 +27,15 @@ class PlantState:
         now: time of the newest arrival.
         origin: date from which times are counted; None if times are numbers.
         version: number of commits.
-        dirty: index of the first row to step again; None if all are up to date.
+        first_changed: index of the first row to step again; None if all are up to date.
         forced: number of rows that became final early, for lack of room.
         links: counts of the messages, by node.
         changes: changes since the last finalisation, for `undo_changes`.
         leap: a leap in time that no other clock has confirmed; None if there is none.
         silence: row of the newest step at which nothing came, which is no row of the history; None if there is none.
-        kept: row before a leap, after which all rows held are; None where that is among them, or there is no leap.
-        aside: what was taken back since the last finalisation, for `undo_changes`.
+        row_before_leap: row before a leap, after which all rows held are; None where that is among them, or there is no
+            leap.
+        undone_leaps: what was taken back since the last finalisation, for `undo_changes`.
         remarked: how often each filter's remark was said, by node and filter.
         begun: time of the message with which it began, from which on a node may be silent.
     """
@@ -80,14 +45,14 @@ class PlantState:
     now: float
     origin: datetime | None = None
     version: int = 0
-    dirty: int | None = None
+    first_changed: int | None = None
     forced: int = 0
     links: dict[str, LinkCounts] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
     leap: ClockLeap | None = None
     silence: HeldRow | None = None
-    kept: RowBeforeLeap | None = None
-    aside: list[RowsOfLeap] = field(default_factory=list)
+    row_before_leap: RowBeforeLeap | None = None
+    undone_leaps: list[UndoneLeap] = field(default_factory=list)
     remarked: dict[tuple[str, str], int] = field(default_factory=dict)
     begun: float = 0.0
 
@@ -191,22 +156,30 @@ class PlantState:
         held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
         # If all rows held are of the leap, only the row kept from before it is left.
         all_after = first_after == 0
-        if all_after and self.kept is None:
+        if all_after and self.row_before_leap is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.
         not_final = held[max(first_after, 1) :]
         self._count_withdrawn(not_final, leap, names)
-        gone = held[first_after:]
+        removed_rows = held[first_after:]
         # Remember what `undo_changes` needs to restore this.
-        self.aside.append(RowsOfLeap(held=held, kept=self.kept, changes=len(self.changes), gone=gone, rows=not_final))
-        if all_after and self.kept is not None:
-            self.rows.replace_rows([self.kept.row])  # the base again
-            self.kept = None
+        self.undone_leaps.append(
+            UndoneLeap(
+                held=held,
+                row_before_leap=self.row_before_leap,
+                changes=len(self.changes),
+                removed_rows=removed_rows,
+                rows=not_final,
+            )
+        )
+        if all_after and self.row_before_leap is not None:
+            self.rows.replace_rows([self.row_before_leap.row])  # the base again
+            self.row_before_leap = None
         else:
             self.rows.replace_rows(held[:first_after])
-        # Rows from `dirty` on were to be stepped again: nothing is to be done if all of them are gone.
-        if self.dirty is not None and self.dirty >= len(self.rows.held):
-            self.dirty = None
+        # Rows from `first_changed` on were to be stepped again: nothing is to be done if all of them are gone.
+        if self.first_changed is not None and self.first_changed >= len(self.rows.held):
+            self.first_changed = None
         self.now, self.leap = leap.now, leap.earlier
         return True
 
@@ -232,9 +205,9 @@ class PlantState:
 
         An event is withdrawn if a later message showed that its clock was wrong: its leap (gap in time) was undone.
         """
-        leaps, self.aside = self.aside, []
+        leaps, self.undone_leaps = self.undone_leaps, []
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
-        return events, [row.slot for leap in leaps for row in leap.gone]
+        return events, [row.slot for leap in leaps for row in leap.removed_rows]
 
     def add_event(
         self, event: CheckedEvent, key: Key, take_slot: Callable[[], int], width: int, losses: tuple[str, int] | None
@@ -261,8 +234,8 @@ class PlantState:
         if losses is not None:
             self._write_lost(index, row, event, *losses)
         self.changes.append(change)  # last: that of the event itself
-        # Rows from `dirty` on are to be stepped again.
-        self.dirty = index if self.dirty is None else min(self.dirty, index)
+        # Rows from `first_changed` on are to be stepped again.
+        self.first_changed = index if self.first_changed is None else min(self.first_changed, index)
 
     def _write_lost(self, index: int, row: HeldRow, event: CheckedEvent, node: str, column: int) -> None:
         """Write how many messages were lost before an event, by the running count, unless the message says it itself.
@@ -288,20 +261,20 @@ class PlantState:
         """Undo all changes since the last finalisation, as if the batch had not come; return the slots that are free.
 
         Changes are events that were added to rows (`changes`), and rows that were removed with an undone leap, a gap in
-        time by one clock (`aside`). A slot is a row of the table of estimates. The base, the first held row, is final
-        and never changes. Rows from `dirty` on have to be stepped again.
+        time by one clock (`undone_leaps`). A slot is a row of the table of estimates. The base, the first held row, is
+        final and never changes. Rows from `first_changed` on have to be stepped again.
         """
         slots, keys = list[int](), [row.key for row, _ in self.changes]
         # Backwards: undo the changes that came after a leap was undone, and then bring the leap's rows back.
-        for leap in reversed(self.aside):
+        for leap in reversed(self.undone_leaps):
             slots += self._undo_since(leap.changes)
             self.rows.replace_rows(leap.held)
-            self.kept = leap.kept
+            self.row_before_leap = leap.row_before_leap
         slots += self._undo_since(0)
-        self.aside = []
+        self.undone_leaps = []
         # Step again from the first row that was changed, which is never the base.
         index = max(min(map(self.rows.find_index, keys), default=len(self.rows.held)), 1)
-        self.dirty = index if index < len(self.rows.held) else None
+        self.first_changed = index if index < len(self.rows.held) else None
         return slots
 
     def _undo_since(self, count: int) -> list[int]:
@@ -326,13 +299,13 @@ class PlantState:
             link = self.links[node] = LinkCounts()
         return link
 
-    def take_dirty_rows(self) -> list[HeldRow]:
+    def take_changed_rows(self) -> list[HeldRow]:
         """Return the row before the first one to step again, and all rows after it; [] if all are up to date.
 
-        `dirty`, the index of the first held row to step again (never 0, the base) or None, becomes None.
+        `first_changed`, the index of the first held row to step again (never 0, the base) or None, becomes None.
         """
-        chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
-        self.dirty = None
+        chain = [] if self.first_changed is None else self.rows.held[self.first_changed - 1 :]
+        self.first_changed = None
         return chain
 
     def finalise_rows(self, watermark: float, longest_gap: float) -> tuple[list[HeldRow], list[int]]:
@@ -354,20 +327,22 @@ class PlantState:
         """Choose the row to keep in case a leap is undone; return the slots of all other rows that are not held.
 
         A leap is a gap in time of more than `longest_gap` that one clock alone showed. As long as it may be undone, the
-        newest row before its gap is kept in `kept`: the plant then goes on from there. `left`: rows that are not held
-        any more, in order of time.
+        newest row before its gap is kept in `row_before_leap`: the plant then goes on from there. `left`: rows that are
+        not held any more, in order of time.
         """
         # The oldest leap that may be undone. That with which the plant began has no row before it.
         leaps = [] if self.leap is None else [leap for leap in self.leap.list_with_earlier() if leap.now > -inf]
         leap = leaps[-1] if leaps else None
-        if self.kept is not None and (leap is None or leap.now != self.kept.now):  # it was of another leap
-            left, self.kept = [*left, self.kept.row], None
-        if leap is not None and self.kept is None:
+        if self.row_before_leap is not None and (
+            leap is None or leap.now != self.row_before_leap.now
+        ):  # it was of another leap
+            left, self.row_before_leap = [*left, self.row_before_leap.row], None
+        if leap is not None and self.row_before_leap is None:
             far_side = leap.time - longest_gap  # rows from then on are after the leap
             rows_before_leap = [row for row in left if row.key[0] < far_side]
             if rows_before_leap and self.rows.held[0].key[0] >= far_side:
                 newest = rows_before_leap[-1]
-                self.kept = RowBeforeLeap(newest, leap.now)
+                self.row_before_leap = RowBeforeLeap(newest, leap.now)
                 left = [row for row in left if row is not newest]
         return [row.slot for row in left]
 
@@ -377,9 +352,9 @@ class PlantState:
 
         They are those of rows held, of the row kept from before a leap, and of rows removed with an undone leap.
         """
-        kept = [] if self.kept is None else [self.kept.row]
-        gone = [row for leap in self.aside for row in leap.gone]
-        return [row.slot for row in (*self.rows.held, *kept, *gone)]
+        row_before_leap = [] if self.row_before_leap is None else [self.row_before_leap.row]
+        removed_rows = [row for leap in self.undone_leaps for row in leap.removed_rows]
+        return [row.slot for row in (*self.rows.held, *row_before_leap, *removed_rows)]
 
 
 class FinalisedPlant(NamedTuple):

@@ -1,4 +1,4 @@
-"""The table of the rows of all plants, and the steps between rows: due rows are stepped for all plants at once."""
+"""The states of all plants in one table, and the steps between rows: due rows are stepped for all plants at once."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.live.long_gap import LONG, TAIL, find_factor_places, pass_long_gap
+from heliograph.live.long_gap import LONG, TAIL, find_factor_indices, pass_long_gap
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.numerics.types import Float, PyTree
@@ -16,8 +16,8 @@ FEWEST = 1024  # rows of the table at first; it doubles when it is full
 SHORTEST = 64  # rows of a history
 
 
-class SlotTable:
-    """Table with one row per slot; slots are taken and given back.
+class StateTable:
+    """Table of states: a slot is a row of it, which is taken and given back.
 
     The columns are (state, outputs, inputs held, step number, received, inputs, time); `state`, `outputs`, `held` and
     `at` are the slices of the first four, `numbers` that of the last three, which a `HeldRow` has as well.
@@ -42,7 +42,7 @@ class SlotTable:
 
     @cached_property
     def _step_single_row(self) -> Callable[..., np.ndarray]:
-        """Return the step of one row at a time, with memory of this pool's own."""
+        """Return the step of one row at a time, with memory of this table's own."""
         return self.step_rows.for_one()
 
     @property
@@ -156,9 +156,9 @@ class SlotTable:
 
         state = self.step_rows.state
         column_numbers = np.arange(float(state.size))
-        places = find_factor_places(state.tree(column_numbers))  # of factors of covariances, which are not affine
+        factors = find_factor_indices(state.tree(column_numbers))  # of factors of covariances, which are not affine
         state_before = row[self.state].copy()
-        state_after = pass_long_gap(step, self.step_rows.start, state_before, at, count=to - at, places=places)
+        state_after = pass_long_gap(step, self.step_rows.start, state_before, at, count=to - at, factors=factors)
         self.table[slot, self.state], self.table[slot, self.at.start] = state_after, to
 
     def gather_history(self, slots: Sequence[int]) -> PyTree:

@@ -2,14 +2,14 @@
 
 import warnings
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.forecast_start_of_row import estimates_by_name, judged_estimates_by_name, make_forecast_origin
 from heliograph.live.health.fleet_warnings import FleetRepeatWatch, RemarkWatch
 from heliograph.live.health.implausible_events import AngleWatch, CandidateEvent, JudgementReader
@@ -17,7 +17,8 @@ from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.health.sender_status import SenderStatus
 from heliograph.live.network_step_program import shared_program
 from heliograph.live.sorted_rows import BEFORE, HeldRow
-from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
+from heliograph.live.stored.migration import PlantMigration, describe_network
+from heliograph.live.stored.network_changes import DESCRIPTION, SAME
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
 from heliograph.model.checks.refusal_reasons import SCREENED, Reason
@@ -91,7 +92,7 @@ class Timeline:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot (row of its table of states) to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
-        self._plant, self._spare = self._fleet.begin_plant("", start, origin=None), self._fleet.pool.take_slot()
+        self._plant, self._spare = self._fleet.begin_plant("", start, origin=None), self._fleet.state_table.take_slot()
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
@@ -206,7 +207,9 @@ class Timeline:
         fleet.step([plant])
         why = self._judges.find_implausible([CandidateEvent(0, plant, event, row)]).get(0)
         if why is None and event.is_inputs and self._program.dt is not None:
-            after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)
+            after = fleet.state_table.predict_outputs(
+                np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf
+            )
             why = self._judges.explain_inputs(after[0])
         return why
 
@@ -249,8 +252,8 @@ class Timeline:
 
     def _outputs_after(self, slots: int | list[int]) -> np.ndarray:
         """Return the outputs of the row in a slot of the fleet's table, or of several: estimates after its events."""
-        pool = self._fleet.pool
-        return pool.table[slots, pool.outputs].copy()
+        state_table = self._fleet.state_table
+        return state_table.table[slots, state_table.outputs].copy()
 
     def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
         """Return smoothed estimates at `now` - `lag` given all events held, by node and filter."""
@@ -268,7 +271,7 @@ class Timeline:
         if not has_row:
             self._fleet.predict_into(rows.held[after - 1], time, self._spare)
             slots.insert(1, self._spare)
-        return self._program.smoother.estimates(self._fleet.pool.gather_history(slots), 1, len(slots))
+        return self._program.smoother.estimates(self._fleet.state_table.gather_history(slots), 1, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
@@ -276,17 +279,13 @@ class Timeline:
         They are filtered estimates after each row, in order of time. Without calls only the last 2 * `capacity` stay.
         """
         time, outputs = self._finals.take_all()
-        return Record(time, self.network.states, truth=None, measurements={}, estimates=self._arrange_outputs(outputs))
+        estimates = estimates_by_name(self._program, outputs)
+        return Record(time, self.network.states, truth=None, measurements={}, estimates=estimates)
 
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
         head, arrays = self._pack_state()
-        return pack_snapshot(head | {"of": self._program.identity, DESCRIPTION: self._describe_network}, arrays)
-
-    @cached_property
-    def _describe_network(self) -> str:
-        """Return the network's numbers and columns as JSON, by which a later version or network reads the state."""
-        return describe_network(self._fleet)
+        return pack_snapshot(head | {"of": self._program.identity, DESCRIPTION: describe_network(self._fleet)}, arrays)
 
     def _pack_state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
         """Return the whole state as a head and arrays: options, the plant, and the final rows."""
@@ -353,7 +352,7 @@ class Timeline:
         if final is None:
             said = f"timeline, snapshot: {len(time)} final rows are estimates of other filters, and not carried on"
             warnings.warn(said, stacklevel=4)
-            time, final = np.zeros(0), np.zeros((0, fleet.pool.step_rows.outputs.size))
+            time, final = np.zeros(0), np.zeros((0, fleet.state_table.step_rows.outputs.size))
         return {"plant": plant, "final.time": time, "final": final}
 
     @classmethod
@@ -394,7 +393,3 @@ class Timeline:
             self._finals.add(np.array([row.key[0] for row in with_data]), outputs)
             self._gates.count_weights_of_zero(outputs)
         self._fleet.free_slots(results)
-
-    def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-        """Return the estimates in the outputs of a row, or of rows, by node and filter."""
-        return estimates_by_name(self._program, outputs)

@@ -11,13 +11,15 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.design_problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.error_objective import Error
 from heliograph.planning.free_numbers.design import design_numbers
-from heliograph.planning.multihop_paths.design import design_paths, make_power_task
+from heliograph.planning.multihop_paths.design import design_paths
 from heliograph.planning.multihop_paths.model import Paths
 from heliograph.planning.multihop_paths.network_to_paths import paths_of
+from heliograph.planning.multihop_paths.path_problem import make_power_task
 from heliograph.planning.network_from_design import BEST, COVERED
+from heliograph.planning.network_to_sum_of_links import is_sum_of_links
 from heliograph.planning.plant_moments import measured_moment_with_one, steady_moment_with_one
 from heliograph.planning.power_budget import make_budget, make_power_limits, make_unlimited
-from heliograph.planning.sum_of_links_design import design_sum_of_links, is_sum_of_links
+from heliograph.planning.sum_of_links_design import design_sum_of_links
 from heliograph.planning.transmitters import find_free_transmitters
 from heliograph.relays.design import given_design, relay_schedules
 from heliograph.relays.periodic_steady_state import (

@@ -13,7 +13,8 @@ from heliograph.live.event import INPUTS, CheckedEvent, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.health.implausible_events import CandidateEvent, JudgementReader
 from heliograph.live.health.link_counts import LinkCounts
-from heliograph.live.plant_state import PlantState, WithdrawnEvent
+from heliograph.live.plant_state import PlantState
+from heliograph.live.undoable_changes import WithdrawnEvent
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
 

@@ -14,15 +14,15 @@ class DeviceStatusService:
 
     Args:
         service: the service.
-        words: the last statuses that devices sent; stored ones are restored into it.
+        statuses: the last statuses that devices sent; stored ones are restored into it.
         store: where they are stored.
     """
 
-    def __init__(self, service: BatchService, words: DeviceStatuses, store: StoreProtocol):
+    def __init__(self, service: BatchService, statuses: DeviceStatuses, store: StoreProtocol):
         """Hold the service, the statuses of its devices (online or offline) and the store, and restore stored ones."""
-        self._service, self._words, self._store = service, words, store
+        self._service, self._statuses, self._store = service, statuses, store
         self._unkept = dict[str, int]()  # statuses that the store does not have yet, as numbers by topic
-        words.restore(store.words())
+        statuses.restore(store.words())
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
@@ -30,7 +30,7 @@ class DeviceStatusService:
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Store the statuses that came before these messages, use the messages, and return the outputs to publish."""
-        self._keep_words()
+        self._keep_statuses()
         return self._service.take(payloads)
 
     def published(self, outputs: Sequence[Output]) -> None:
@@ -39,13 +39,13 @@ class DeviceStatusService:
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything, also statuses of devices; return the last outputs. `ended`: no more messages can come."""
-        self._keep_words()
+        self._keep_statuses()
         return self._service.finish(ended)
 
-    def _keep_words(self) -> None:
+    def _keep_statuses(self) -> None:
         """Store the statuses (online or offline) that devices have sent since the last call, the last of each topic."""
         # If the store cannot be reached, it raises, and the statuses stay in `_unkept` for the next call.
-        self._unkept |= self._words.pop_changed_words()
+        self._unkept |= self._statuses.pop_changed_statuses()
         if self._unkept:
             self._store.keep_words(self._unkept)
             self._unkept = {}

@@ -56,26 +56,26 @@ class EstimateWriter:
     def _make_template(self, size: int) -> tuple[bytes, list[int], list[int]]:
         """Return a template of the line of a row with `size` outputs, and two lists that say what fills it.
 
-        The template has %b for each real number and %d for each integer. The lists hold the column of each place in
-        the line, and the places of integers. To find them, a line is written from a row with FIRST + its column number
+        The template has %b for each real number and %d for each integer. The lists hold the column of each gap in the
+        template, and the gaps of integers. To find them, a line is written from a row with FIRST + its column number
         in each column. A number in this line (found by COLUMN) tells its column; without a point it is an integer.
         """
         column_numbers = FIRST + np.arange(float(size))
         column_numbers[self._reasons] = 0.0  # 0 means that nothing is refused
         line = encode_line(self._write_estimates(column_numbers.tolist()))
-        places = COLUMN.findall(line)  # (digits, ".0" or nothing)
+        gaps = COLUMN.findall(line)  # (digits, ".0" or nothing)
         template = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", line.replace(b"%", b"%%"))
-        column_of_place = [int(digits) - FIRST for digits, _ in places]
-        places_of_integers = [i for i, (_, point) in enumerate(places) if not point]
-        return HEAD + template + b"}", column_of_place, places_of_integers
+        column_of_gap = [int(digits) - FIRST for digits, _ in gaps]
+        integer_gaps = [i for i, (_, point) in enumerate(gaps) if not point]
+        return HEAD + template + b"}", column_of_gap, integer_gaps
 
     def write_lines(
         self, kind: bytes, rows: Sequence[tuple[str, float | str]], outputs: Float[np.ndarray, "row outputs"]
     ) -> list[bytes]:
         """Return a line with the estimates of all filters for each row.
 
-        Most lines differ in numbers only, so they fill a template (text with places for numbers), which is faster than
-        writing JSON. A place is the number of a template's gap, and `self._order` has the column of `outputs` for each.
+        Most lines differ in numbers only, so they fill a template (text with gaps for numbers), which is faster than
+        writing JSON. `self._order` has the column of `outputs` for each gap.
 
         Args:
             kind: "final" or "provisional".
@@ -89,15 +89,15 @@ class EstimateWriter:
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
         # The texts of all numbers at once, row after row, in the order in which a line has them.
-        place_count, texts = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
-        # By place in a line, what each row has there: every `place_count`-th text. Whole numbers have no point.
-        by_place: list[Sequence[bytes | int]] = [texts[place::place_count] for place in range(place_count)]
-        for place in self._whole:
-            by_place[place] = outputs[:, self._order[place]].astype(int).tolist()
-        # Each line begins with the kind, plant and time of its row; then the template takes the texts of its places.
+        gap_count, texts = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
+        # By gap of the template, what each row has there: every `gap_count`-th text. Whole numbers have no point.
+        by_gap: list[Sequence[bytes | int]] = [texts[gap::gap_count] for gap in range(gap_count)]
+        for gap in self._whole:
+            by_gap[gap] = outputs[:, self._order[gap]].astype(int).tolist()
+        # Each line begins with the kind, plant and time of its row; then the template takes the texts of its gaps.
         names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
         head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
-        lines = [self._template % of_row for of_row in zip(*head, *by_place, strict=True)]
+        lines = [self._template % of_row for of_row in zip(*head, *by_gap, strict=True)]
         # Rows that the template does not fit are written anew, filter by filter.
         for i in np.flatnonzero(~fits).tolist():
             estimates = self._write_estimates(outputs[i].tolist())
@@ -110,8 +110,8 @@ class EstimateWriter:
         `_nodes` maps a node to the columns of its filters among these numbers.
         """
         return {
-            node: {columns.filter: self._tabulate_estimate(columns, outputs) for columns in places}
-            for node, places in self._nodes.items()
+            node: {columns.filter: self._tabulate_estimate(columns, outputs) for columns in filters}
+            for node, filters in self._nodes.items()
         }
 
     def _tabulate_estimate(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
@@ -148,7 +148,7 @@ class EstimateWriter:
         results: dict[str, object] = {}
         if columns.weighed is not None:
             parts = columns.weighed._asdict().items()
-            results["outputs"] = {name: [outputs[i] for i in places] for name, places in parts}
+            results["outputs"] = {name: [outputs[i] for i in indices] for name, indices in parts}
         if outputs[judged.reason] > 0:
             why = Judgement.describe(outputs[judged.reason], outputs[judged.distance])
             return results | {"nis": None, "received": 0, "implausible": why}

@@ -86,8 +86,8 @@ class NeighbourMessenger:
     def _make_row_messages(self, plant: PlantState, row: HeldRow) -> list[Output]:
         """Return a row's message to each neighbour: the estimate and covariance before the row, and its measurement."""
         assert self._node is not None
-        pool, network = self.fleet.pool, self.fleet.network
-        _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])
+        state_table, network = self.fleet.state_table, self.fleet.network
+        _, central, *_ = state_table.step_rows.state.tree(state_table.table[row.slot, state_table.state])
         mean, covariance = self._node.sent(central[self._name].before)
         measurement = row.numbers[: self._node.measured[0]]
         values = np.concatenate([mean, np.ravel(covariance), measurement]).tolist()

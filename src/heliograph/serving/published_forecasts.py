@@ -102,12 +102,12 @@ class ForecastPublisher:
             node: {name: _write_forecasts(forecast) for name, forecast in filters.items()}
             for node, filters in forecasts.items()
         }
-        # For each covered row (`i` its index in `rows`, `place` its index in the forecasts) add the probabilities of
+        # For each covered row (`i` its index in `rows`, `index` its index in the forecasts) add the probabilities of
         # crossing thresholds, and sort by horizon.
-        for place, i in enumerate(covered):
+        for index, i in enumerate(covered):
             if self._thresholds:
-                self._add_crossings(rows[i], forecasts, bodies, place)
-            results[i] = self._arrange_by_horizon(times[i], bodies, place)
+                self._add_crossings(rows[i], forecasts, bodies, index)
+            results[i] = self._arrange_by_horizon(times[i], bodies, index)
         return results
 
     def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], number: int) -> list[Ahead]:
@@ -154,16 +154,20 @@ class ForecastPublisher:
                     body["thresholds"] = {level: by_horizon[i] for level, by_horizon in crossings.items()}
 
     def _find_all_crossings(
-        self, start: ForecastStart, place: tuple[str, str], forecast: "heliograph.forecasting.Forecast"
+        self, start: ForecastStart, node_and_filter: tuple[str, str], forecast: "heliograph.forecasting.Forecast"
     ) -> dict[str, list[dict[str, float]]]:
         """Return {threshold: probabilities that it is crossed, by horizon}, for the states and outputs of a filter.
 
-        It is {} if the filter claims no covariance. `place` is the filter's node and name.
+        It is {} if the filter claims no covariance. `node_and_filter`: names of the filter's node and of the filter.
         """
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
         passed = tuple(threshold for threshold in self._thresholds if threshold.name in known)
-        return find_crossing_probabilities(start, place, passed, self.horizons, not self._continuous) if passed else {}
+        return (
+            find_crossing_probabilities(start, node_and_filter, passed, self.horizons, not self._continuous)
+            if passed
+            else {}
+        )
 
 
 def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:

@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet as Fleet
-from heliograph.live.fleet import Options as Options
+from heliograph.live.fleet_options import Options as Options
 from heliograph.live.health.fleet_warnings import FleetRepeatWatch, RemarkWatch
 from heliograph.live.health.implausible_events import AngleWatch
 from heliograph.live.network_step_program import NetworkProgram as NetworkProgram
-from heliograph.live.plant_state import FinalisedPlant, PlantState, WithdrawnEvent
+from heliograph.live.plant_state import FinalisedPlant, PlantState
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
+from heliograph.live.undoable_changes import WithdrawnEvent
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.process.garbage_collector import pause_collector
 from heliograph.serving.batch_intake import BatchIntake, MessageOutcome, find_plant_name
@@ -118,7 +119,7 @@ class Service:
         if (self.fleet.deciding and self.fleet.options.step is not None) or self.fleet.shortest_timeout < inf:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
-                if self.fleet.pool.used < ROWS:
+                if self.fleet.state_table.used < ROWS:
                     self._load_plants(names[i : i + LARGE])
             self._silence.resume(self.plants)
 
@@ -335,9 +336,8 @@ class Service:
         for name, plant in touched.items():
             plant.version += 1
             self.plants.move_to_end(name)
-        while self.store.keeps and self.fleet.pool.used > ROWS:
-            oldest = next(iter(self.plants))
-            self._forget_plant(oldest)
+        while self.store.keeps and self.fleet.state_table.used > ROWS:
+            self._forget_plant(next(iter(self.plants)))  # the one with the oldest messages
         return outputs
 
     def _forget_plant(self, name: str) -> None:

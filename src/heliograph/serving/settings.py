@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from heliograph.files.sources.source_description import Source
 from heliograph.live.event import INPUTS
-from heliograph.live.fleet import Options
+from heliograph.live.fleet_options import Options
 from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.serving.brokers.broker_address import Address
 from heliograph.serving.brokers.transport import encode_name

@@ -71,7 +71,7 @@ def check_threshold_names(network: Network, thresholds: Thresholds) -> None:
 
 
 def find_crossing_probabilities(
-    source: HasOrigin, place: tuple[str, str], thresholds: Thresholds, horizons: list[float], whole: bool
+    source: HasOrigin, node_and_filter: tuple[str, str], thresholds: Thresholds, horizons: list[float], whole: bool
 ) -> dict[str, list[dict[str, float]]]:
     """Return by threshold the probabilities that it is crossed at each horizon, and by then, as they are published.
 
@@ -81,12 +81,12 @@ def find_crossing_probabilities(
 
     Args:
         source: where the forecast starts: the last state, such as that of a live network.
-        place: names of the node and its filter.
+        node_and_filter: names of the node and its filter.
         thresholds: (name of a state or output, level, whether beyond is above it); at least one.
         horizons: how far ahead, in steps or in the unit of dt.
         whole: whether horizons are steps; every step up to the last is then looked at, else the horizons alone.
     """
-    node, filter_name = place
+    node, filter_name = node_and_filter
     ahead = int(horizons[-1]) if whole else horizons
     paths = heliograph.forecasting.draw_paths(source, ahead, "held", DRAWS, node=node, filter=filter_name)
     # Row of each horizon in the paths, which have every step, or the horizons alone.

@@ -296,7 +296,7 @@ class FunctionWriter:
         self.line(f"br label %{name}")
         self.start_basic_block(name)
         index_of_phis = len(self.lines)
-        self.scopes.append({})  # names that hold within a turn
+        self.scopes.append({})  # names that hold within an iteration
         counter = f"%{name}.counter"
         self._name_parameters(loop, name, counter, carried)
         if loop is self.prefetching_loop:
@@ -341,8 +341,8 @@ class FunctionWriter:
         self.line(f"br label %{name}.latch")
         self.start_basic_block(f"{name}.latch")
         self.line(f"{counter}.next = add i64 {counter}, 1")
-        turns = "%runs" if loop.length == ANY_LENGTH else loop.length  # a scan gets its rows where others get runs
-        self.line(f"%{name}.more = icmp slt i64 {counter}.next, {turns}")
+        iterations = "%runs" if loop.length == ANY_LENGTH else loop.length  # a scan gets its rows where others get runs
+        self.line(f"%{name}.more = icmp slt i64 {counter}.next, {iterations}")
         self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
         return following
 
@@ -351,13 +351,13 @@ class FunctionWriter:
 
         Return the names of the carried numbers in the next iteration, and those of the same numbers after the loop.
         """
-        # The body up to the loop's check, and what follows it in a turn.
+        # The body up to the loop's check, and what follows it in an iteration.
         check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, LoopExit) and s.loop is loop)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
         self.write_block(head)
         assert loop.condition is not None
-        # Another turn if some lane needs it.
+        # Another iteration if some lane needs it.
         any_lane = self._write_any_lane(loop.condition)
         self.line(f"br i1 {any_lane}, label %{name}.turn, label %{name}.end")
         self.start_basic_block(f"{name}.turn")

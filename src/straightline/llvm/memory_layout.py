@@ -187,7 +187,7 @@ def _place_buffers(
     start, offsets = 0, dict[Buffer, int]()
     for buffer in buffers:
         offsets[buffer] = start
-        copies = buffer.block.count_turns() if buffer in per_iteration else 1
+        copies = buffer.block.count_iterations() if buffer in per_iteration else 1
         bits = buffer.size * copies * width * BITS[buffer.type]
         start += divide_rounded_up(bits, 8 * LINE) * LINE  # up to the next cache line
     return start, offsets

@@ -21,7 +21,7 @@ from straightline.llvm.memory_layout import (
 )
 from straightline.llvm.operations import BITS
 from straightline.llvm.output_buffers import choose_output_buffers
-from straightline.llvm.prefetch import PrefetchedRows, count_cache_lines_per_turn, find_longest_loop
+from straightline.llvm.prefetch import PrefetchedRows, count_cache_lines_per_iteration, find_longest_loop
 from straightline.llvm.shared_slots import SharedSlots
 from straightline.llvm.transposition import FEW, MoverOptions, write_mover
 from straightline.llvm.vector_types_and_gathers import (
@@ -55,7 +55,7 @@ class FunctionSource(NamedTuple):
 
     compressed: the text, to a tenth, since it is needed again only if the program turns out to be executed often.
     helpers: write the functions that it calls, for a count of lanes. operations: how many it has; work: how many it
-    executes for a block of runs, each in a loop once a turn.
+    executes for a block of runs, each in a loop once an iteration.
     """
 
     compressed: bytes
@@ -188,7 +188,7 @@ def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[
         others: write further functions that it calls, for a number of lanes.
     """
     operations_by_block = Counter([x.block for x in writer.items if isinstance(x, Node)])
-    executed = sum(count * block.count_turns() for block, count in operations_by_block.items())
+    executed = sum(count * block.count_iterations() for block, count in operations_by_block.items())
     helpers: list[Callable[[int], str]] = [*others, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
         helpers.append(write_subnormal_flush)
@@ -311,7 +311,7 @@ def _locate_rows(
         bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in outputs
         offset = writer.add(f"mul i64 {'%first' if writes else first_of_next}, {bytes_of_run}")
         start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {offset}")
-        lines = count_cache_lines_per_turn(bytes_of_run, width, loop)
+        lines = count_cache_lines_per_iteration(bytes_of_run, width, loop)
         prefetched.append(PrefetchedRows(start=start, bytes=bytes_of_run, lines=lines, writes=writes))
     return prefetched
 

@@ -1,8 +1,9 @@
 """Memory asked for before it is needed, as text of LLVM IR: its time passes beside the arithmetic of a loop.
 
 Numbers of runs come from memory and go back to it, and a block of runs is computed sooner than these lines arrive. So
-its longest loop asks, a share in each turn, for the inputs of the next block and for the memory of its own outputs. A
-Kalman step with four numbers in and four out: 26.7 ns of one core without, 16.6 with, 14.5 with nothing in or out.
+its longest loop asks, a share in each iteration, for the inputs of the next block and for the memory of its own
+outputs. A Kalman step with four numbers in and four out: 26.7 ns of one core without, 16.6 with, 14.5 with nothing in
+or out.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,8 +19,8 @@ PATIENCE = 8  # operations of vectors, of 0.3 ns, that take as long as a line: a
 class PrefetchedRows(NamedTuple):
     """Rows of a block of runs, one after another in memory: what a loop asks for.
 
-    `start` names the address of the first one; a row has `bytes`, a turn's share of all so many `lines`; `writes` says
-    whether the block fills them.
+    `start` names the address of the first one; a row has `bytes`, an iteration's share of all so many `lines`; `writes`
+    says whether the block fills them.
     """
 
     start: str
@@ -29,16 +30,16 @@ class PrefetchedRows(NamedTuple):
 
 
 def find_longest_loop(items: Iterable[Any]) -> Loop | None:
-    """Return the loop of known length that has most turns, None if there is none."""
+    """Return the loop of known length that has most iterations, None if there is none."""
     loops = [x for x in items if isinstance(x, Loop) and x.length]
     return max(loops, key=lambda loop: loop.length or 0) if loops else None
 
 
-def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
-    """Return how many cache lines a loop prefetches each turn, so that all turns fetch the rows of `width` runs.
+def count_cache_lines_per_iteration(bytes: int, width: int, loop: Loop) -> int:
+    """Return how many cache lines a loop prefetches in an iteration: all together fetch the rows of `width` runs.
 
     `bytes` is the size of a row, one run's numbers. A prefetched line takes as long as PATIENCE operations. Return 0
-    if the lines would take longer than the turn's operations, which could then not hide them.
+    if the lines would take longer than the iteration's operations, which could then not hide them.
     """
     lines = divide_rounded_up(bytes * width, (loop.length or 1) * LINE)
     operations = sum(isinstance(x, Node) and x.op != "load" for x in loop.body.items)
@@ -46,21 +47,21 @@ def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
 
 
 def write_prefetch_requests(
-    rows: PrefetchedRows, turns: int, counter: str, lanes: str, add: Callable[[str], str]
+    rows: PrefetchedRows, iterations: int, counter: str, lanes: str, add: Callable[[str], str]
 ) -> list[str]:
-    """Return the lines of LLVM IR by which one turn of a loop prefetches its share of the memory of some rows.
+    """Return the lines of LLVM IR by which one iteration of a loop prefetches its share of the memory of some rows.
 
     Args:
-        rows: where the rows lie, their size in bytes, and how many lines a turn prefetches.
-        turns: how many turns the loop has.
-        counter: name of the number of this turn, from 0.
+        rows: where the rows lie, their size in bytes, and how many lines an iteration prefetches.
+        iterations: how many iterations the loop has.
+        counter: name of the number of this iteration, from 0.
         lanes: LLVM's text of the number of rows.
         add: appends an operation, and returns the name of its result.
     """
-    # This turn's share begins at byte counter * bytes * lanes / turns.
+    # This iteration's share begins at byte counter * bytes * lanes / iterations.
     product = add(f"mul i64 {counter}, {rows.bytes}")
     product = add(f"mul i64 {product}, {lanes}")
-    first_byte = add(f"udiv i64 {product}, {turns}")
+    first_byte = add(f"udiv i64 {product}, {iterations}")
     start = add(f"getelementptr i8, ptr {rows.start}, i64 {first_byte}")
     lines = [add(f"getelementptr i8, ptr {start}, i64 {LINE * k}") for k in range(rows.lines)]
     # The arguments after the address: 0 to read or 1 to write, moderate locality (2), the data cache (1).

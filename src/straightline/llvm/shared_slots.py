@@ -38,7 +38,7 @@ class SharedSlots:
         """Return the offset in bytes of a shared number, assigned at its first use, with 8 for each iteration."""
         if node not in self.offsets:
             self.offsets[node] = self.size
-            self.size += 8 * node.block.count_turns()
+            self.size += 8 * node.block.count_iterations()
         return self.offsets[node]
 
     def load(self, writer: InstructionWriter, node: Node) -> str:

@@ -28,8 +28,8 @@ class TextLines:
         self.lines.append(f"  %x{self.count} = {text}")
         return f"%x{self.count}"
 
-    def write_loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
-        """Write the loop for (i = begin; i + step <= end; i += step) body(i).
+    def write_loop(self, name: str, begin: str, step: int, body: Callable[[str], None]) -> None:
+        """Write the loop for (i = begin; i + step <= size; i += step) body(i).
 
         `body` gets the LLVM name of i. `name` begins the loop's labels.
         """
@@ -37,7 +37,7 @@ class TextLines:
         self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{head}", f"{head}:"]
         self.lines.append(f"  %{name}.i = phi i64 [{begin}, %{before}], [%{name}.next, %{inside}]")
         self.lines.append(f"  %{name}.next = add i64 %{name}.i, {step}")
-        self.lines.append(f"  %{name}.more = icmp sle i64 %{name}.next, {end}")
+        self.lines.append(f"  %{name}.more = icmp sle i64 %{name}.next, %size")
         self.lines += [f"  br i1 %{name}.more, label %{inside}, label %{after}", f"{inside}:"]
         body(f"%{name}.i")
         self.lines += [f"  br label %{head}", f"{after}:"]
@@ -90,9 +90,9 @@ def write_mover(move: MoverOptions, width: int) -> str:
         first_entry = "0"
         # Squares of as many entries as the group has runs, then the remaining entries one by one.
         if move.in_squares and not move.few_entries:
-            text.write_loop(f"g{first_lane}", "0", "%size", group_size, group.write_square)
+            text.write_loop(f"g{first_lane}", "0", group_size, group.write_square)
             first_entry = text.add(f"and i64 %size, {-group_size}")  # size rounded down to a multiple of group_size
-        text.write_loop(f"h{first_lane}", first_entry, "%size", 1, group.write_entry)
+        text.write_loop(f"h{first_lane}", first_entry, 1, group.write_entry)
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
     return f"define internal void @{move.name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}}\n"

@@ -25,7 +25,7 @@ from straightline.lowering import (
 )
 from straightline.nodes import Node, Type
 from straightline.rules.elementwise import ELEMENTWISE
-from straightline.rules.loops import Turn, put_in_memory, repeat_turns
+from straightline.rules.loops import LoopBody, make_counted_loop, put_in_memory
 from straightline.rules.matrices import combine_nodes, write_product
 from straightline.size_limits import LOADED, MANY_TERMS, TABLE, WRITTEN_OUT
 from straightline.strided_arrays import StridedArray
@@ -88,12 +88,12 @@ def _make_row_by_row_rule(name: str) -> Rule:
         items = [x if len(x.shape) < ndim or x.shape[0] == 1 else put_in_memory(lowering, x) for x in inputs]
         row_equation = make_row_equation(equation)
 
-        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        def body(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             """Return no carry, and the operation's result for one row."""
             rows = [take_row_of_argument(lowering, x, row, ndim) for x in items]
             return [], list(lowering.lower_equation(row_equation, rows))
 
-        return list(repeat_turns(lowering, shape[0], [], lambda p, c: load_as_nodes(lowering, turn(p, c)))[1])
+        return list(make_counted_loop(lowering, shape[0], [], lambda p, c: load_as_nodes(lowering, body(p, c)))[1])
 
     return lower_row_by_row
 
@@ -101,7 +101,7 @@ def _make_row_by_row_rule(name: str) -> Rule:
 def load_as_nodes(
     lowering: Lowering, results: tuple[list[Value], list[Value]]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the carried and the stacked arrays of a loop's turn as nodes; arrays in memory are loaded."""
+    """Return the carried and the stacked arrays of a loop's iteration as nodes; arrays in memory are loaded."""
     carried, stacked = results
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
@@ -154,8 +154,8 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
     The product (JAX's `dot_general`) becomes a loop in the graph of operations, since written out it would be too long.
     As JAX calls them, batch axes are common to both arguments and the result, contracted axes are summed over, and free
     axes belong to one argument and the result. The loop is over the first batch axis, else over the first free axis of
-    a, else of b: each turn computes a row of the result. Where there is no such axis, the loop is over the first
-    contracted one, and turns are summed.
+    a, else of b: each iteration computes a row of the result. Where there is no such axis, the loop is over the first
+    contracted one, and iterations are summed.
 
     Args:
         lowering: translates JAX's operations to nodes of a graph.
@@ -164,7 +164,7 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
         b: the second.
     """
     (a_contracted, b_contracted), (a_batch, b_batch) = equation.params["dimension_numbers"]
-    # The axis of each argument that is looped over, None where an argument is used whole in every turn.
+    # The axis of each argument that is looped over, None where an argument is used whole in every iteration.
     if a_batch:
         a_axis, b_axis = a_batch[0], b_batch[0]
     else:
@@ -184,11 +184,11 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
         rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
         return load_as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
 
-    # As many turns as the axis of the loop is long; the turns' rows are stacked, or summed.
+    # As many iterations as the axis of the loop is long; the iterations' rows are stacked, or summed.
     count = next(x.shape[0] for x, axis in by_row if axis is not None)
     if is_summed:
-        return _accumulate_turns(lowering, equation, count, multiply_row)
-    _carry, stacked = repeat_turns(lowering, count, [], multiply_row)
+        return _sum_iterations(lowering, equation, count, multiply_row)
+    _carry, stacked = make_counted_loop(lowering, count, [], multiply_row)
     return list(stacked)
 
 
@@ -228,18 +228,18 @@ def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
     return counts
 
 
-def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
-    """Return the sum of the numbers that `turn` returns to be stacked, over the `count` iterations of a loop."""
+def _sum_iterations(lowering: Lowering, equation: JaxprEqn, count: int, body: LoopBody) -> list[Value]:
+    """Return the sum of the numbers that `body` returns to be stacked, over the `count` iterations of a loop."""
     sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the sum so far plus the number that `turn` would stack, as the carry; nothing is stacked."""
-        _no_carry, stacked = turn(row, [])
+        """Return the sum so far plus the number that `body` would stack, as the carry; nothing is stacked."""
+        _no_carry, stacked = body(row, [])
         pair = np.stack([carry[0], *stacked])
         return [np.asarray(RULES["reduce_sum"](lowering, sum_along_first, [pair])[0])], []
 
     zero = RULES["reduce_sum"](lowering, sum_along_first, [np.empty(0, dtype=object)])[0]  # the sum of no numbers
-    total, _stacked = repeat_turns(lowering, count, [zero], add_number)
+    total, _stacked = make_counted_loop(lowering, count, [zero], add_number)
     return list(total)
 
 
@@ -317,7 +317,7 @@ def _make_reduction_rule(name: str) -> Rule:
 
 
 def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) -> list[Value]:
-    """Lower the reduction of a long array in a loop: each turn reduces one row along its own axes.
+    """Lower the reduction of a long array in a loop: each iteration reduces one row along its own axes.
 
     Lowering translates an operation of JAX (`equation`, such as reduce_sum, of this `name`) to nodes, one for each
     number of its result. A long array would need too many nodes, so a loop over its rows (axis 0) computes it: row by
@@ -346,11 +346,11 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
         return [np.asarray(RULES[name](lowering, of_two_rows, [pair])[0])], []
 
     if 0 not in axes:
-        _carry, stacked = repeat_turns(lowering, x.shape[0], [], stack_row)
+        _carry, stacked = make_counted_loop(lowering, x.shape[0], [], stack_row)
         return list(stacked)
     # Accumulate from the neutral element on, which is the reduction of no rows.
     start = RULES[name](lowering, of_two_rows, [np.empty((0, *shape), dtype=object)])[0]
-    total_of_rows, _stacked = repeat_turns(lowering, x.shape[0], [start], accumulate_row)
+    total_of_rows, _stacked = make_counted_loop(lowering, x.shape[0], [start], accumulate_row)
     return list(total_of_rows)
 
 

@@ -15,28 +15,28 @@ from straightline.rules.elementwise import select
 from straightline.size_limits import WRITTEN_OUT
 from straightline.strided_arrays import StridedArray
 
-Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
+LoopBody = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
-def repeat_turns(
-    lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
+def make_counted_loop(
+    lowering: Lowering, length: int, carry: Sequence[np.ndarray], body: LoopBody, backwards: bool = False
 ) -> tuple[list[np.ndarray], list[StridedArray]]:
-    """Make a loop of `length` iterations of `turn`; return the carry after it, and the stacked results in memory.
+    """Make a loop of `length` iterations of `body`; return the carry after it, and the stacked results in memory.
 
-    turn(row, carry) lowers one iteration, and returns the next carry and what is stored in this row of the stacked
+    body(row, carry) lowers one iteration, and returns the next carry and what is stored in this row of the stacked
     results. Rows run from 0 up, or `backwards` down to 0. `carry` has the arrays of nodes before the first iteration.
     """
     graph, outer = lowering.graph, lowering.graph.current
 
     def lower_body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
-        """Lower the body of a loop by `turn`; return the next carry and the stacked arrays.
+        """Lower the body of a loop by `body`; return the next carry and the stacked arrays.
 
         A stacked array (length, ...) lies in memory of the block `outer` around the loop. Each iteration stores one
         row; if `backwards`, the first one stores the last row.
         """
         loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
-        following, stacked = turn(row, carry)
+        following, stacked = body(row, carry)
         return following, [_store_row(lowering, length, x, counter, backwards, outer) for x in stacked]
 
     return _lower_loop(lowering, length, carry, lower_body)
@@ -167,7 +167,7 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     (consts, carried), length = _count_scan_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
-    if size <= lowering.written_out or length <= 1:  # a loop of one turn would be no shorter
+    if size <= lowering.written_out or length <= 1:  # a loop of one iteration would be no shorter
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     return _lower_long_scan(lowering, equation, fixed, carry, rows)
 
@@ -190,7 +190,9 @@ def _lower_long_scan(
         lowering, program, fixed, carry, as_numbers, in_memory, rows=[put_in_memory(lowering, x) for x in rows]
     )
     start = [lowering.nodes(carry[k]) for k in as_numbers]
-    finals, stacked = repeat_turns(lowering, params["length"], start, body.lower_turn, backwards=params["reverse"])
+    finals, stacked = make_counted_loop(
+        lowering, params["length"], start, body.lower_iteration, backwards=params["reverse"]
+    )
     after: dict[int, Value] = dict(zip(as_numbers, finals, strict=True))
     after |= {k: x.view_from_here() for k, x in in_memory.items()}
     return [*(after.get(k, initial) for k, initial in enumerate(carry)), *stacked]
@@ -202,11 +204,11 @@ class _ScanBody(NamedTuple):
     Args:
         lowering: the program that the loop is a part of.
         program: the body, of the fixed arguments, all carried arrays, and a row of each stacked array.
-        fixed: arguments that are the same in each turn.
+        fixed: arguments that are the same in each iteration.
         carry: all carried arrays as they begin; one that is in neither of the next two stays as it is.
         as_numbers: which of them are carried as nodes, one for each number.
         in_memory: the memory of the others, by their index in the carry.
-        rows: arrays in memory, of which a turn has one row.
+        rows: arrays in memory, of which an iteration has one row.
     """
 
     lowering: Lowering
@@ -217,14 +219,14 @@ class _ScanBody(NamedTuple):
     in_memory: "dict[int, CarriedMemory]"
     rows: list[StridedArray]
 
-    def lower_turn(self, row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def lower_iteration(self, row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Lower one iteration of the loop; return the carried nodes after it, and the results to stack, as nodes.
 
         `row` is the row of the stacked arguments that it reads. `numbers` are the arrays that the loop carries as nodes
         (`self.as_numbers`), before the iteration. Long arrays are carried in memory, which it reads and fills anew.
         """
         carried: dict[int, Value] = dict(zip(self.as_numbers, numbers, strict=True))
-        carried |= {k: memory.view_in_turn() for k, memory in self.in_memory.items()}
+        carried |= {k: memory.view_in_iteration() for k, memory in self.in_memory.items()}
         whole_carry = [carried.get(k, initial) for k, initial in enumerate(self.carry)]
         inputs = [*self.fixed, *whole_carry, *(array.row(row) for array in self.rows)]
         results = self.lowering.inline_program(self.program, inputs)  # the whole carry, then what is stacked
@@ -236,16 +238,16 @@ class _ScanBody(NamedTuple):
 class CarriedMemory:
     """Memory of an array that a loop carries and that is too long for numbers of its own.
 
-    A turn reads it, and fills it anew at its end; each run has its own, whatever it is computed from.
+    An iteration reads it, and fills it anew at its end; each run has its own, whatever it is computed from.
     """
 
     def __init__(self, lowering: Lowering, start: Value):
-        """Make memory for an array that a loop carries; `start` is copied into it before the first turn."""
+        """Make memory for an array that a loop carries; `start` is copied into it before the first iteration."""
         self._graph = lowering.graph
         self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
 
-    def view_in_turn(self) -> StridedArray:
+    def view_in_iteration(self) -> StridedArray:
         """Return the array as an iteration reads it; the loop's body must be the graph's open block."""
         self.memory.parts = []  # a body may be lowered twice: forget what filled the memory in the first try
         return self.view_from_here()
@@ -265,7 +267,7 @@ class CarriedMemory:
 
 
 def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
-    """Fill the memory of carried arrays at the end of a turn; `filled` pairs each with its next array.
+    """Fill the memory of carried arrays at the end of an iteration; `filled` pairs each with its next array.
 
     An array that lies in carried memory itself is copied first, since filling could overwrite it. This happens if two
     carried arrays are exchanged.
@@ -298,13 +300,13 @@ def _write_out_scan(
     """Lower a short `scan` as its iterations, one after another; return its carry, then the results that it stacks."""
     params = equation.params
     stacked: list[list[Value]] = []
-    turns = range(params["length"])
-    for turn in reversed(turns) if params["reverse"] else turns:
-        items = [x.row(turn) if isinstance(x, StridedArray) else _take_row(x, turn) for x in rows]
+    numbers = range(params["length"])
+    for i in reversed(numbers) if params["reverse"] else numbers:
+        items = [x.row(i) if isinstance(x, StridedArray) else _take_row(x, i) for x in rows]
         results = lowering.inline_program(params["jaxpr"], [*fixed, *carry, *items])
         carry = results[: len(carry)]
         stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
-    if not stacked:  # of no turns the results that are stacked have no rows
+    if not stacked:  # of no iterations the results that are stacked have no rows
         avals: list[Any] = [v.aval for v in equation.outvars[len(carry) :]]
         return [*carry, *(np.empty(a.shape, dtype=object) for a in avals)]
     if params["reverse"]:
@@ -312,9 +314,9 @@ def _write_out_scan(
     return [*carry, *(np.stack(leaves) for leaves in zip(*stacked, strict=True))]
 
 
-def _take_row(x: np.ndarray, turn: int) -> np.ndarray:
-    """Return x[turn] as an array, also for one axis."""
-    return x[turn : turn + 1].reshape(x.shape[1:])
+def _take_row(x: np.ndarray, i: int) -> np.ndarray:
+    """Return x[i] as an array, also for one axis."""
+    return x[i : i + 1].reshape(x.shape[1:])
 
 
 def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
@@ -335,7 +337,7 @@ def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
 
 def copy_in_memory(lowering: Lowering, x: StridedArray) -> StridedArray:
     """Copy a long array to new memory, row by row in a loop; return the copy."""
-    return repeat_turns(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
+    return make_counted_loop(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
 
 def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -375,15 +377,15 @@ def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old:
 def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
     """Return an estimate of how many numbers a traced program computes; `lowering.sizes` keeps the answers.
 
-    The body of a scan counts once for each turn, and that of a while loop counts once.
+    The body of a scan counts once for each iteration, and that of a while loop counts once.
     """
     if jaxpr in lowering.sizes:
         return lowering.sizes[jaxpr]
     total = 0
     for equation in jaxpr.eqns:
         inner = [estimate_size(lowering, getattr(p, "jaxpr", p)) for p in _list_inner_programs(equation.params)]
-        turns = equation.params["length"] if equation.primitive.name == "scan" else 1
-        total += turns * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
+        length = equation.params["length"] if equation.primitive.name == "scan" else 1
+        total += length * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
     lowering.sizes[jaxpr] = total
     return total
 

@@ -22,8 +22,8 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
         keys = rows[0]
         # Odd-even transposition: neighbours at even positions are exchanged if in the wrong order, then those at odd
         # ones.
-        for turn in range(count):
-            for i in range(turn % 2, count - 1, 2):
+        for pass_number in range(count):
+            for i in range(pass_number % 2, count - 1, 2):
                 is_wrong = _is_behind(graph, keys[i], keys[i + 1])
                 for row in rows:
                     a, b = row[i], row[i + 1]

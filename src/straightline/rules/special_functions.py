@@ -18,7 +18,7 @@ FAR = 30.0  # the argument of a Bessel function from which its asymptotic series
 BERNOULLI = [1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160]  # B_2n / (2 n)
 TINY = float(np.finfo(np.float64).tiny) / EPSILON
 LARGE, TERMS = 2000.0, 20  # the shape from which gamma masses are expanded, to a^-3, and the terms of a coefficient
-TURNS = 5000  # of a series or a fraction, several times as many as it takes
+MOST_TERMS = 5000  # of a series or a fraction, several times as many as it takes
 
 
 class SeriesState(NamedTuple):
@@ -30,9 +30,9 @@ class SeriesState(NamedTuple):
 
 
 class ContinuedFraction(NamedTuple):
-    """State of a continued fraction: the turn, Lentz's quotients C and D, the value, and its last relative change."""
+    """State of a continued fraction: how many terms, Lentz's quotients C and D, the value, its last relative change."""
 
-    turn: jax.Array
+    terms: jax.Array
     c: jax.Array
     d: jax.Array
     value: jax.Array
@@ -85,7 +85,7 @@ def _sum_lower_series(a: jax.Array, x: jax.Array, skipped: jax.Array) -> jax.Arr
 
     def has_more_terms(state: SeriesState) -> jax.Array:
         """Return whether the last term counts: a series that is skipped ends at once."""
-        return (state.term > EPSILON * state.total) & (state.step < a + TURNS)
+        return (state.term > EPSILON * state.total) & (state.step < a + MOST_TERMS)
 
     first = jnp.where(skipped, 0.0, 1 / a)
     return jax.lax.while_loop(has_more_terms, add_term, SeriesState(a, first, first)).total
@@ -114,11 +114,11 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
 
     def still_changes(state: ContinuedFraction) -> jax.Array:
         """Return whether the last level changed the value; a fraction that does not serve ends at once."""
-        return (state.change > EPSILON) & (state.turn < TURNS)
+        return (state.change > EPSILON) & (state.terms < MOST_TERMS)
 
     first = 1 / jnp.where(serves, x + 1 - a, 1.0)
     start = ContinuedFraction(
-        turn=jnp.ones_like(x), c=jnp.full_like(x, 1 / TINY), d=first, value=first, change=jnp.where(serves, 1.0, 0.0)
+        terms=jnp.ones_like(x), c=jnp.full_like(x, 1 / TINY), d=first, value=first, change=jnp.where(serves, 1.0, 0.0)
     )
     return jax.lax.while_loop(still_changes, continue_fraction, start).value
 

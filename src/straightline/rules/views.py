@@ -11,7 +11,7 @@ from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, arran
 from straightline.nodes import Buffer, Node, RandomKey
 from straightline.rules.elementwise import PASSED_ON, select
 from straightline.rules.index_bounds import clamp_start, convert_to_32_bits, fills_outside, is_inside, make_fill_value
-from straightline.rules.loops import copy_in_memory, put_in_memory, repeat_turns
+from straightline.rules.loops import copy_in_memory, make_counted_loop, put_in_memory
 from straightline.rules.shapes import select_array
 from straightline.size_limits import FEW, LOADED, TABLE
 from straightline.strided_arrays import StridedArray, contiguous_strides
@@ -208,7 +208,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
             """Return no carry, and one row of all arrays concatenated; a row lacks the first axis."""
             return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]
 
-        _carry, stacked = repeat_turns(lowering, shape[0], [], join_row)
+        _carry, stacked = make_counted_loop(lowering, shape[0], [], join_row)
         return list(stacked)
     return [join_arrays(lowering, inputs, shape)]
 

@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.live import LinkCounts
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.report.figures import BLUE, GREEN, VERMILION

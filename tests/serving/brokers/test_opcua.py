@@ -10,7 +10,8 @@ from asyncua import Server, ua
 
 import heliograph as hg
 from heliograph.files.source_suggestions import suggest_sources
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving import make_transport
 from heliograph.serving.brokers import listen

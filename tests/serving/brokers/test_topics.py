@@ -153,7 +153,7 @@ def test_lines_without_a_topic_are_of_the_only_one(file):
 
 
 def test_sources_and_parts_exclude_each_other():
-    from heliograph.live.fleet import Options
+    from heliograph.live.fleet_options import Options
     from heliograph.serving.brokers.broker_address import parse_address
     from heliograph.serving.settings import ServiceSettings
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored import PlantMigration, unpack_plant
 from heliograph.serving.service import Service
@@ -66,7 +67,7 @@ def base(place: str, item: hg.Network) -> np.ndarray:
     store = Store(place, identity(here))
     plant = unpack_plant("p", store.load(["p"])["p"].body, here)
     store.close()
-    return here.pool.table[plant.rows.held[0].slot, here.pool.state].reshape(4, -1)
+    return here.state_table.table[plant.rows.held[0].slot, here.state_table.state].reshape(4, -1)
 
 
 @pytest.mark.slow

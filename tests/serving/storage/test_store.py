@@ -115,7 +115,7 @@ def test_plants_leave_memory_and_come_back(tmp_path, monkeypatch):
     monkeypatch.setattr("heliograph.serving.service.ROWS", 20)
     for line in sent:
         two.take([line])
-        assert two.fleet.pool.used <= 20 + 40
+        assert two.fleet.state_table.used <= 20 + 40
     assert len(two.plants) < 4 and states(item) == states(two)
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
+from heliograph.live.fleet_options import Options
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored import PlantMigration
 from heliograph.serving.service import Service

@@ -182,11 +182,11 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
         except StopIteration:
             return
         except Exception as error:  # whatever damage makes a reader do
-            place = "before any message"
+            where = "before any message"
             if count:
-                place = f"after message {count} of its topics, logged at {format_moment(last_logged)}"
+                where = f"after message {count} of its topics, logged at {format_moment(last_logged)}"
             raise BagDamagedError(
-                str(fail(f"{path}, {place}", "a bag without damage", _format_reason(error)))
+                str(fail(f"{path}, {where}", "a bag without damage", _format_reason(error)))
             ) from None
         topic, kind, last_logged = message.connection.topic, message.connection.msgtype, message.logged
         if types.setdefault(topic, kind) != kind:

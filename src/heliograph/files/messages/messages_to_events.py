@@ -275,7 +275,7 @@ def _append_message(
         topic = path.topic if isinstance(path, StoreTable) else find_topic_of_file(path, sources)
     try:
         # The status of a device, online or offline, is no event.
-        if sources.take_device_word(topic, message.content, message.where):
+        if sources.device_statuses.take_status_message(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
         content = decode_message_content(message) if sources.of(topic) else None

@@ -138,19 +138,6 @@ class TopicReader:
             self._sources_of_topic[topic] = [source for items in matching for source in items]
         return self._sources_of_topic[topic]
 
-    def take_device_word(self, topic: str, payload: object, where: str) -> bool:
-        """Note the status that a device sends, online or offline; return whether the message is such a status.
-
-        Args:
-            topic: the topic of the message.
-            payload: its payload, as text or decoded.
-            where: place of the message, for errors.
-
-        Raises:
-            ValueError: a status that is neither online nor offline; one line.
-        """
-        return self.device_statuses.take_status_message(topic, payload, where)
-
     def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
         """Return a reading of a message for each source of its topic; an unknown topic has none and is counted.
 

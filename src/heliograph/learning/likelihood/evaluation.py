@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array, Float
 
 
 class Evaluation(NamedTuple):
-    """Log-likelihoods and scores of blocks of rows at points of the line, and the Gauss-Newton information of halves.
+    """Log-likelihoods and scores of blocks of rows at unconstrained points, and the Gauss-Newton information of halves.
 
     A block is a row, or all rows of a long recording.
 
@@ -60,7 +60,7 @@ def evaluate_at_points(
 
     Args:
         objective: makes the filter from the free numbers.
-        x: the points (points, p): free numbers as coordinates on the line, where each is unbounded.
+        x: the points (points, p): free numbers as unconstrained coordinates.
         data: the recordings: measurements (recordings, steps, received), inputs and lengths.
         by_row: whether densities and scores of each row are needed; else there may be sums over all rows.
     """
@@ -139,7 +139,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
 
     Args:
         objective: makes the filter from the free numbers.
-        x: the free numbers as coordinates on the line (p,).
+        x: the free numbers as unconstrained coordinates (p,).
         z: measurements (steps, received), NaN where nothing arrived.
         u: inputs of the plant (steps, inputs).
         truth: true states (steps, n), NaN where unknown; None for the likelihood of the measurements.

@@ -1,6 +1,6 @@
 """Search for the maximum of a likelihood: climbs from several starts, ends of domains, and a proof by the Hessian.
 
-Free numbers are searched as coordinates on the line, where each is unbounded: an end of a number's domain, such as a
+Free numbers are searched as unconstrained coordinates: an end of a number's domain, such as a
 variance of 0, lies at minus infinity of its logarithm.
 """
 
@@ -35,7 +35,8 @@ class HighestPoint(NamedTuple):
     """The highest point that a search has found.
 
     Args:
-        x: the point on the line (p,); a number at the end of its domain is so near that nothing sees the difference.
+        x: the point in unconstrained coordinates (p,); a number at the end of its domain is so near that nothing sees
+            the difference.
         ends: at which end of its domain a number is: -1 or 1, where that is at minus infinity or infinity, else 0 (p,).
         total: log-likelihood there.
         converged: whether this is a maximum, by the Hessian.

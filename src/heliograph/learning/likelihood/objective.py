@@ -62,7 +62,7 @@ Form = Literal["linear", "conditional", "truth"]
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Filter of one form, as a function of numbers on the line. Equal ones share a compiled program.
+    """Filter of one form, as a function of unconstrained numbers. Equal ones share a compiled program.
 
     A function may read numbers that live outside of it; a change of these shows in the network that it returns at the
     start.
@@ -93,7 +93,7 @@ class Objective:
         )
 
     def filter(self, x: Array) -> AbstractFilter:
-        """Return the filter of this form at a point x (p,) of the line."""
+        """Return the filter of this form at unconstrained coordinates x (p,)."""
         return make_filter_of_form(self.description.at(self.description.parameters.values(x)), self.form)
 
     def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:

@@ -1,4 +1,4 @@
-"""Transforms of free numbers on their domains to unbounded coordinates (logarithms, logits), and back."""
+"""Transforms of free numbers on their domains to unconstrained coordinates (logarithms, logits), and back."""
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, PyTree
 
 
-def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
-    """Return the start `value` of the free number `name` as unbounded coordinates (size,).
+def map_to_unconstrained(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
+    """Return the start `value` of the free number `name` as unconstrained coordinates (size,).
 
     A number of an interval becomes v, its logarithm log(v - low) or its logit, as the interval has ends. A simplex
     becomes log(p_i / p_last). A covariance becomes the entries of its Cholesky factor, row after row, with logarithms
@@ -32,14 +32,14 @@ def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> F
         return np.asarray(factor[np.tril_indices(len(value))])
     if np.any(value <= domain.low) or np.any(value >= domain.high):
         raise fail(f"start of {name}", f"a start {_describe_domain(domain)}", value.tolist())
-    return np.asarray(to_line(domain, value)).reshape(-1)
+    return np.asarray(to_unconstrained(domain, value)).reshape(-1)
 
 
-def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
-    """Return the number, of this shape, whose unbounded coordinates are x (size,): the inverse of `map_to_line`.
+def map_from_unconstrained(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
+    """Return the number of this shape whose unconstrained coordinates are x (size,), inverting `map_to_unconstrained`.
 
-    A fit searches over unbounded coordinates, so that every step of it gives a number inside its domain. JAX can trace
-    x; plain coordinates of an interval give a plain number.
+    A fit searches over unconstrained coordinates, so that every step of it gives a number inside its domain. JAX can
+    trace x; plain coordinates of an interval give a plain number.
 
     Args:
         domain: probabilities that sum to 1 ("simplex"), a covariance, or an interval from `low` to `high`.
@@ -80,8 +80,8 @@ def _map_to_simplex(shape: tuple[int, ...], x: Array) -> Array:
     return weights / jnp.sum(weights, axis=-1, keepdims=True)
 
 
-def to_line(domain: Domain, value: PyTree) -> PyTree:
-    """Return a number of an interval on the unbounded line: its logit if the interval has two ends, else its logarithm.
+def to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
+    """Return an unconstrained number for one of an interval: its logit if that has two ends, else its logarithm.
 
     The logarithm is of the distance from the only end. Without ends the number stays as it is.
     """
@@ -92,8 +92,8 @@ def to_line(domain: Domain, value: PyTree) -> PyTree:
     return np.log(domain.high - value) if np.isfinite(domain.high) else value
 
 
-def from_line(domain: Domain, value: PyTree) -> PyTree:
-    """Return the number of the interval that `to_line` maps to this value; infinite values give an end of it."""
+def from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
+    """Return the number of the interval that `to_unconstrained` maps to this value; an infinite value gives an end."""
     with np.errstate(over="ignore"):
         if np.isfinite(domain.low) and np.isfinite(domain.high):
             return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -102,8 +102,8 @@ def from_line(domain: Domain, value: PyTree) -> PyTree:
         return domain.high - np.exp(value) if np.isfinite(domain.high) else value
 
 
-def slope_from_line(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative of `from_line` at a value of the line."""
+def slope_from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
+    """Return the derivative of `from_unconstrained` at an unconstrained value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
     if np.isfinite(domain.low):
@@ -111,8 +111,8 @@ def slope_from_line(domain: Domain, value: PyTree) -> PyTree:
     return -np.exp(value) if np.isfinite(domain.high) else np.ones_like(value)
 
 
-def slope_to_line(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative of `to_line` at a number of the interval."""
+def slope_to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
+    """Return the derivative of `to_unconstrained` at a number of the interval."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
     if np.isfinite(domain.low):
@@ -121,7 +121,7 @@ def slope_to_line(domain: Domain, value: PyTree) -> PyTree:
 
 
 def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
-    """Return how many unbounded coordinates a number of this domain and shape has."""
+    """Return how many unconstrained coordinates a number of this domain and shape has."""
     entries = int(np.prod(shape))
     if domain.kind == "simplex":
         # The probabilities of each distribution (last axis) sum to 1: one of them is not free.

@@ -1,6 +1,6 @@
 """Likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top.
 
-A point is a vector of coordinates on the line, where each free number is unbounded; l is the log-likelihood there.
+A point is a vector of unconstrained coordinates; l is the log-likelihood there.
 """
 
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class LeastCurvature(NamedTuple):
 class LikelihoodSurface:
     """The log-likelihood l of all recordings as a function of the free numbers; the last evaluation is cached.
 
-    A point is a vector x (p,) of the free numbers as coordinates on the line, where each is unbounded.
+    A point is a vector x (p,) of the free numbers as unconstrained coordinates.
     """
 
     objective: Objective

@@ -1,6 +1,6 @@
 """Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side.
 
-A climb is one of these searches. Coordinates are those of the line, where each free number is unbounded: logarithms and
+A climb is one of these searches. Coordinates are unconstrained: logarithms and
 logits, or plain real numbers, which are called free of a scale. A point is a vector of them (p,).
 """
 

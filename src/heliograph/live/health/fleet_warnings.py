@@ -19,7 +19,7 @@ class RemarkWatch:
 
     def __init__(self, fleet: Fleet):
         """Begin with counts of zero for each filter of the fleet that can remark on its state."""
-        self._pool, self._steps = fleet.pool, fleet.program.step_rows
+        self._state_table, self._steps = fleet.state_table, fleet.program.step_rows
         self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
 
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
@@ -48,7 +48,7 @@ class RemarkWatch:
         """
         if not self.counts:
             return {}
-        return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])
+        return self._steps.read_remarks(self._state_table.table[row.slot, self._state_table.state])
 
 
 class FleetRepeatWatch:

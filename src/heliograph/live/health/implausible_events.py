@@ -114,15 +114,15 @@ class JudgementReader:
         FLAGS says which numbers of a judgement are flags: they are above 0 if it objects to a measurement or to inputs.
         A slot is the number of a row in the table.
         """
-        pool, slots = self.fleet.pool, np.array([candidate.row.slot for candidate in taken])
-        flags = pool.outputs.start + self._all_columns[:, FLAGS].ravel()
-        flagged: list[int] = np.flatnonzero((pool.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
+        state_table, slots = self.fleet.state_table, np.array([candidate.row.slot for candidate in taken])
+        flags = state_table.outputs.start + self._all_columns[:, FLAGS].ravel()
+        flagged: list[int] = np.flatnonzero((state_table.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
         return flagged
 
     def _explain_event(self, candidate: CandidateEvent) -> str | None:
         """Return why a candidate is implausible by its row's judgements, or None if it is not or holds no number."""
-        event, pool = candidate.event, self.fleet.pool
-        outputs = pool.table[candidate.row.slot, pool.outputs]
+        event, state_table = candidate.event, self.fleet.state_table
+        outputs = state_table.table[candidate.row.slot, state_table.outputs]
         if event.is_inputs:
             return self.explain_inputs(outputs)
         # Without any number, nothing can be implausible.
@@ -140,7 +140,10 @@ class JudgementReader:
         `columns` says where the outputs of a filter stand in such a row: among them its judgement of the measurements.
         """
         event, row = candidate.event, candidate.row
-        row_before, outputs = self._find_row_before(candidate), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
+        row_before, outputs = (
+            self._find_row_before(candidate),
+            self.fleet.state_table.table[row.slot, self.fleet.state_table.outputs],
+        )
         # Filters that take the event: of its node, or of all nodes. Inputs concern every filter.
         concerned = None if event.is_inputs else (Network.FUSED, self.fleet.network.names[event.node_index])
         for columns in self.fleet.program.filter_columns:
@@ -153,7 +156,7 @@ class JudgementReader:
             # Call the filter's functions from its estimate before the row: which of them returns no number?
             tries, sentence = self._faults.get((columns.node, columns.filter), (0, ""))
             if not sentence and tries < TRIES:
-                inputs, step = self.fleet.pool.inputs_between(row_before.slot, row.slot)
+                inputs, step = self.fleet.state_table.inputs_between(row_before.slot, row.slot)
                 estimate = self._estimate_after(row_before, filter, columns)
                 sentence = describe_non_finite_function(filter, estimate, inputs, step)
                 self._faults[columns.node, columns.filter] = tries + 1, sentence
@@ -174,7 +177,7 @@ class JudgementReader:
         """
         if row.key[1] == BEFORE:  # no estimate was computed there
             return filter.estimate(filter.init())
-        n, outputs = len(filter.states), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
+        n, outputs = len(filter.states), self.fleet.state_table.table[row.slot, self.fleet.state_table.outputs]
         covariance = outputs[columns.covariance : columns.covariance + n * n].reshape(n, n)
         return Estimate(outputs[columns.mean : columns.mean + n], covariance, columns.claim)
 
@@ -203,16 +206,16 @@ class JudgementReader:
         """Return whether the candidate's row is plausible without the numbers of the candidate's node."""
         # Copy the row to a slot of its own, with NaN for the node's numbers.
         event, row = candidate.event, candidate.row
-        pool, rows = self.fleet.pool, candidate.plant.rows
-        trial = HeldRow(row.key, pool.take_slot(), self.fleet.width)
+        state_table, rows = self.fleet.state_table, candidate.plant.rows
+        trial = HeldRow(row.key, state_table.take_slot(), self.fleet.width)
         trial.numbers = row.numbers.copy()
         columns = rows.columns_by_node[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
         # Step from the previous row to the copy, read its judgement, and free its slot.
         self.fleet.step_row(self._find_row_before(candidate), trial)
-        outputs = pool.table[trial.slot, pool.outputs]
+        outputs = state_table.table[trial.slot, state_table.outputs]
         judgements = outputs[self._judgement_columns[event.node_index]]
-        pool.free_slots([trial.slot])
+        state_table.free_slots([trial.slot])
         return Judgement.why_values(judgements) is None
 
 
@@ -246,7 +249,7 @@ class AngleWatch:
 
     def __init__(self, fleet: Fleet):
         """List the angles that the fleet's filters estimate and that its nodes receive."""
-        self._pool = fleet.pool
+        self._state_table = fleet.state_table
         self._states = _watch_states(fleet)
         self._received = _watch_received(fleet)
 
@@ -261,12 +264,12 @@ class AngleWatch:
         wide = [
             (plants[row].name, f"{name}: {line}")
             for name, columns, angles in self._states
-            for row, line in angles.said_of(self._pool.table[slots[:, None], columns])
+            for row, line in angles.said_of(self._state_table.table[slots[:, None], columns])
         ]
         return wide + [
             (plants[row].name, f"{name}: {line}")
             for name, columns, angles in self._received
-            for row, line in angles.doubt_unit(self._pool.table[slots[:, None], columns])
+            for row, line in angles.doubt_unit(self._state_table.table[slots[:, None], columns])
         ]
 
 
@@ -281,7 +284,7 @@ def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
         if angles.states:
             # The covariance (n, n) stands row by row, so that entries of the diagonal are n + 1 columns apart.
             n = len(filter.states)
-            variance_columns = fleet.pool.outputs.start + columns.covariance + np.arange(n) * (n + 1)
+            variance_columns = fleet.state_table.outputs.start + columns.covariance + np.arange(n) * (n + 1)
             watched.append(WatchedAngles(f"{columns.node}/{columns.filter}", variance_columns, angles))
     return watched
 
@@ -302,7 +305,7 @@ def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
             if column in seen:
                 angles.received.pop(i, None)
         seen |= set(names)
-        watched.append(WatchedAngles(columns.node, fleet.pool.numbers.start + np.array(list(names)), angles))
+        watched.append(WatchedAngles(columns.node, fleet.state_table.numbers.start + np.array(list(names)), angles))
     return watched
 
 

@@ -1,11 +1,11 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .migration import DESCRIPTION as DESCRIPTION
-from .migration import LISTED as LISTED
 from .migration import PlantMigration as PlantMigration
-from .migration import SAME as SAME
 from .migration import describe_network as describe_network
-from .migration import list_changes as list_changes
+from .network_changes import DESCRIPTION as DESCRIPTION
+from .network_changes import LISTED as LISTED
+from .network_changes import SAME as SAME
+from .network_changes import list_changes as list_changes
 from .old_layout import LOWER as LOWER
 from .old_layout import VARIANCES as VARIANCES
 from .old_layout import can_read_layout as can_read_layout

@@ -11,6 +11,7 @@ import numpy as np
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet
 from heliograph.live.sorted_rows import BEFORE
+from heliograph.live.stored.network_changes import DESCRIPTION, SAME, list_changes
 from heliograph.live.stored.old_layout import (
     can_read_layout,
     describe_old_layout,
@@ -24,10 +25,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, PyTree
 from heliograph.simulation.network import Network
 
-DESCRIPTION = "description"  # key of an identity: its numbers and the layout of its rows, as JSON
 MOST = 64  # numbers of an array that are stored; of a longer one only a hash is
-LISTED = 4  # entries of an array that are named
-SAME = ("precision", "states", "inputs")  # what the rows of a plant mean
 
 
 def describe_network(fleet: Fleet, covariances: bool = False) -> str:
@@ -43,7 +41,9 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     filters, size = _number_state_columns(fleet, covariances)
     # Before 0.3.0 no probabilities of modes were among the outputs.
-    outputs = fleet.pool.step_rows.outputs.size - (np.count_nonzero(_find_mode_columns(fleet)) if covariances else 0)
+    outputs = fleet.state_table.step_rows.outputs.size - (
+        np.count_nonzero(_find_mode_columns(fleet)) if covariances else 0
+    )
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.program.given,
@@ -56,7 +56,7 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
 
 def _find_mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
     """Return the mask of a network's outputs that is true where an output is the probability of a mode."""
-    results = np.zeros(fleet.pool.step_rows.outputs.size, bool)
+    results = np.zeros(fleet.state_table.step_rows.outputs.size, bool)
     for columns in fleet.program.filter_columns:
         results[slice(*(columns.modes or (0, 0)))] = True
     return results
@@ -111,7 +111,7 @@ def _number_state_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, di
 
     `covariances`: as before version 0.3.0, when states held covariances. A part is one array of a filter's state.
     """
-    network, flat, counter = fleet.network, fleet.pool.step_rows.state, _ColumnCounter(covariances)
+    network, flat, counter = fleet.network, fleet.state_table.step_rows.state, _ColumnCounter(covariances)
     # A row's state has the filters of nodes by kind, the central ones by name, then what fusions remember.
     states_by_stack, central, *memory = flat.tree(np.zeros(flat.size))
     # Filters of one kind stand side by side: the leading axis of each part is (filter x node).
@@ -182,7 +182,7 @@ class PlantMigration:
         plants = {name: unpack_plant(name, self._translate_plant(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped again, with the network as it is now.
         for plant in plants.values():
-            plant.dirty = 1 if len(plant.rows.held) > 1 else None
+            plant.first_changed = 1 if len(plant.rows.held) > 1 else None
         self.fleet.step(plants.values())
         results = {name: pack_plant(plant, self.fleet) for name, plant in plants.items()}
         for plant in plants.values():
@@ -219,7 +219,7 @@ class PlantMigration:
         parts = PlantParts.from_bytes(stored, self._count_columns_before())
         rows = self._select_rows(parts, index_here)
         table = self._translate_table(parts.table[[row.number_before for row in rows]], index_here)
-        assert table.shape[1] == self.fleet.pool.table.shape[1]  # rows as this network has them
+        assert table.shape[1] == self.fleet.state_table.table.shape[1]  # rows as this network has them
         events, times, values = self._translate_events(parts, rows, index_here)
         links = {name: link for name, link in parts.head["links"].items() if name in (*kept, INPUTS)}
         return PlantParts(
@@ -281,15 +281,15 @@ class PlantMigration:
             table: rows of the other network, (row, column there).
             index_here: maps a node's index in the other network to its index in this one; -1 for the inputs.
         """
-        old, pool = self._old, self.fleet.pool
-        translated = np.zeros((len(table), pool.table.shape[1]))
-        translated[:, pool.state] = self._translate_states(table)
+        old, state_table = self._old, self.fleet.state_table
+        translated = np.zeros((len(table), state_table.table.shape[1]))
+        translated[:, state_table.state] = self._translate_states(table)
         # The first columns there of the inputs that hold, of the step number, and of the measurements.
         held = old["state"] + old["outputs"]
         step = held + old["given"]
         measured = step + 1
-        translated[:, pool.held], translated[:, pool.at] = table[:, held:step], table[:, step:measured]
-        translated[:, pool.numbers] = self._translate_numbers(table[:, measured:], index_here)
+        translated[:, state_table.held], translated[:, state_table.at] = table[:, held:step], table[:, step:measured]
+        translated[:, state_table.numbers] = self._translate_numbers(table[:, measured:], index_here)
         return translated
 
     def _translate_states(self, table: np.ndarray) -> np.ndarray:
@@ -297,7 +297,7 @@ class PlantMigration:
 
         A filter that the old network had too keeps its state; any other begins with the initial law.
         """
-        states = np.tile(self.fleet.pool.step_rows.start, (len(table), 1))
+        states = np.tile(self.fleet.state_table.step_rows.start, (len(table), 1))
         filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
         for name, parts_here in filters.items():
             if not self._has_counterpart(name, filters):
@@ -337,63 +337,3 @@ class _MovedRow(NamedTuple):
     node: int
     sequence: int
     number_before: int
-
-
-def list_changes(mine: Identity, other: Identity) -> list[str]:
-    """Return a line for each thing that has changed from the identity `other` to `mine`.
-
-    `other` describes the network by which a state was stored, `mine` the present one: options, versions, nodes and
-    filters, numbers of the parts. A change of functions is listed only where nothing else has changed.
-    """
-    not_words = (DESCRIPTION, "what is computed", "layout of the store")
-    # First the entries that are words, shown as they stand: options, versions, nodes, filters.
-    lines = [
-        f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"
-        for name in {**mine, **other}
-        if mine.get(name) != other.get(name) and not name.startswith("numbers of ") and name not in not_words
-    ]
-    # Numbers of the parts (plant, nodes, fusions) that are in both networks.
-    here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
-    same_version = mine.get("heliograph") == other.get("heliograph")
-    for name in here:
-        if name in there:
-            lines += _list_changed_numbers(name, there[name], here[name], same_version)
-            # A long array (more than MOST numbers) is known only by a hash.
-            if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
-                lines.append(f"{name}: numbers of a long array")
-    # Of a function only the program that it is compiled to is known, which other changes change too: it is named where
-    # there is none of these.
-    if not lines and mine.get("what is computed") != other.get("what is computed"):
-        lines.append("functions of the network")
-    return lines
-
-
-def _list_changed_numbers(
-    name: str, before: Mapping[str, object], after: Mapping[str, object], same_version: bool
-) -> list[str]:
-    """Return a line for each number of the part `name` of a network that has changed.
-
-    `before` and `after` are {path of an attribute: its numbers}. A path in only one of two versions is passed over.
-    """
-    return [
-        f"{name}{path}: {line}"
-        for path in {**before, **after}
-        if not path.endswith(".factor")  # the factor of a covariance that is also there
-        and (same_version or (path in before and path in after))
-        for line in _describe_changes(before.get(path), after.get(path))
-    ]
-
-
-def _describe_changes(before: object, after: object) -> list[str]:
-    """Return lines on the change of a number or array, entry by entry if the shape is the same; [] if it is equal."""
-    if before == after:
-        return []
-    try:
-        a, b = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
-    except (TypeError, ValueError):
-        return [f"{before} -> {after}"]
-    if a.shape != b.shape or before is None or after is None:
-        return [" -> ".join("none" if side is None else f"{side}" for side in (before, after))]
-    indices = [tuple(map(int, index)) for index in np.argwhere(a != b)]
-    lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in indices]
-    return [*lines[:LISTED], f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else lines

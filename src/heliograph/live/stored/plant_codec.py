@@ -12,8 +12,9 @@ import numpy as np
 from heliograph.live.clock_leap import ClockLeap
 from heliograph.live.fleet import Fleet
 from heliograph.live.health.link_counts import LinkCounts
-from heliograph.live.plant_state import PlantState, RowBeforeLeap
+from heliograph.live.plant_state import PlantState
 from heliograph.live.sorted_rows import HeldRow
+from heliograph.live.undoable_changes import RowBeforeLeap
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
 TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head
@@ -87,16 +88,17 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
         "origin": None if plant.origin is None else plant.origin.isoformat(),
         "links": {node: list(vars(link).values()) for node, link in plant.links.items()},
         "leap": None if plant.leap is None else _pack_leap(plant.leap),
-        BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
+        BEFORE_LEAP: None if plant.row_before_leap is None else plant.row_before_leap.now,
     }
-    # First the row from before a leap, where one is held in case the leap is undone (`kept`); then all others.
-    rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
+    # First the row from before a leap, where one is held in case the leap is undone (`row_before_leap`); then all
+    # others.
+    rows = [*([] if plant.row_before_leap is None else [plant.row_before_leap.row]), *plant.rows.held]
     # Whole numbers, one after another: (node, sequence) of each row, and (number of the row, node, sequence) of each
     # event. Their times are no whole numbers, and stand apart; the time of a row is in the table.
     keys = [number for row in rows for number in row.key[1:]]
     events_by_row = [(i, *event) for i, row in enumerate(rows) for event in row.events]
     events = [number for i, node, sequence, _ in events_by_row for number in (i, node, sequence)]
-    table = fleet.pool.table[[row.slot for row in rows]].ravel()
+    table = fleet.state_table.table[[row.slot for row in rows]].ravel()
     times = [time for *_, time in events_by_row]
     values = [value for row in rows for values in row.events.values() for value in values]
     return _pack_parts(head, keys, events, table, times, values)
@@ -124,15 +126,15 @@ def _pack_parts(head: dict[str, Any], *flat_arrays: Sequence[float] | np.ndarray
     return b"".join([HEAD.pack(len(json_head), *counts), json_head, *packed])
 
 
-def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
+def _unpack_table(data: bytes, at: int, size: int, stored: int) -> tuple[np.ndarray, int]:
     """Read a table of `size` numbers, most of them 0, from byte `at` of `data`; return it and the byte after it.
 
-    First there is a bit for each number, 1 if it is stored, and then the `kept` numbers that are stored.
+    First there is a bit for each number, 1 if it is stored, and then the `stored` numbers that are.
     """
     byte_count = (size + 7) // 8  # bytes that hold `size` bits
     values_begin = at + byte_count
     bits = np.frombuffer(data, np.uint8, byte_count, at)
-    values = np.frombuffer(data, "<f8", kept, values_begin)
+    values = np.frombuffer(data, "<f8", stored, values_begin)
     table = np.zeros(size)
     table[np.unpackbits(bits, count=size).astype(bool)] = values
     return table, values_begin + values.nbytes
@@ -145,12 +147,12 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     head: times, counts of messages and what is known of clocks. The base, the first row, is the newest one that is
     final; later rows are stepped from it. A slot is a row of the fleet's table of filter states.
     """
-    parts = PlantParts.from_bytes(data, fleet.pool.table.shape[1])
+    parts = PlantParts.from_bytes(data, fleet.state_table.table.shape[1])
     head, rows = parts.head, _make_rows_with_events(parts, fleet)
     # If the plant was stored after a leap (a jump of a clock) that may still be undone, its first row is the one before
     # the leap, and the head has the newest arrival before it.
     moment_before = head.get(BEFORE_LEAP)
-    kept = None if moment_before is None else RowBeforeLeap(rows.pop(0), moment_before)
+    row_before_leap = None if moment_before is None else RowBeforeLeap(rows.pop(0), moment_before)
     base = rows[0]
     sorted_rows = fleet.make_rows(base)
     sorted_rows.replace_rows(rows)
@@ -162,7 +164,7 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
         forced=head["forced"],
         links={node: LinkCounts(*numbers) for node, numbers in head["links"].items()},
         leap=None if head["leap"] is None else _unpack_leap(head["leap"]),
-        kept=kept,
+        row_before_leap=row_before_leap,
         begun=head.get(BEGUN, max(base.key[0], 0.0)),  # of an older version, the time of the base; no step is below 0
     )
 
@@ -204,8 +206,8 @@ def _unpack_leap(packed: Any) -> ClockLeap:
 
 def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
     """Return a row with the key (time, node, sequence), whose numbers stand in a new slot of the fleet's table."""
-    slot = fleet.pool.take_slot()
-    fleet.pool.table[slot] = numbers
+    slot = fleet.state_table.take_slot()
+    fleet.state_table.table[slot] = numbers
     row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)
-    row.numbers = numbers[fleet.pool.numbers].tolist()
+    row.numbers = numbers[fleet.state_table.numbers].tolist()
     return row

@@ -240,24 +240,24 @@ def _read_hop_numbers(
 
 def compute_path_kappas(paths: Paths) -> PathValues:
     """Return K (time, path), the product of kappa = E g^2 / (E g)^2 of the hops along each path."""
-    return np.asarray(_arrange_by_place(paths, paths.kappa)[0].prod(axis=-1))
+    return np.asarray(_arrange_by_position(paths, paths.kappa)[0].prod(axis=-1))
 
 
-def _arrange_by_place(
+def _arrange_by_position(
     paths: Paths, values: Powers
-) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
-    """Return the values of hops as (time, path, place along the path), and the place of each hop on its path.
+) -> tuple[Float[np.ndarray, "time path position"], Int[np.ndarray, "hop"]]:
+    """Return the values of hops as (time, path, position along the path), and the position of each hop on its path.
 
     Where a path is shorter than the longest, the value is 1.
     """
     order = np.argsort(paths.path, kind="stable")
     hop_counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     first_hops = np.cumsum(hop_counts) - hop_counts  # of each path, in the order by paths
-    places = np.empty_like(paths.path)
-    places[order] = np.arange(len(order)) - np.repeat(first_hops, hop_counts)
+    positions = np.empty_like(paths.path)
+    positions[order] = np.arange(len(order)) - np.repeat(first_hops, hop_counts)
     arranged = np.ones((len(values), len(hop_counts), max(1, int(hop_counts.max(initial=1)))))
-    arranged[:, paths.path, places] = values
-    return arranged, places
+    arranged[:, paths.path, positions] = values
+    return arranged, positions
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
@@ -274,13 +274,13 @@ def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     a path, with alpha = (noise variance) / E g^2 and g a hop's gain; K is the product of kappa = E g^2 / (E g)^2.
     s = E y^2 (`paths.second`) is the power of the measurement, and t (`paths.signal`) is s less its noise variance.
     """
-    # places: a hop's number along its path.
-    factors, places = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # factors (time, path, place)
+    shares = share_of_signal(powers, paths.alpha)
+    factors, positions = _arrange_by_position(paths, shares)  # factors (time, path, position)
     F, sK = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)
     denominator = sK - paths.signal * F
     # dF/dp_h is the product of the other hops' factors times alpha / (p + alpha)^2.
-    products_of_others = [np.delete(factors, place, axis=-1).prod(axis=-1) for place in range(factors.shape[-1])]
-    product_of_others = np.stack(products_of_others, axis=-1)[:, paths.path, places]
+    products_of_others = [np.delete(factors, k, axis=-1).prod(axis=-1) for k in range(factors.shape[-1])]
+    product_of_others = np.stack(products_of_others, axis=-1)[:, paths.path, positions]
     total = powers + paths.alpha
     slope_of_factor = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
     slope = (sK / denominator**2)[:, paths.path] * product_of_others * slope_of_factor

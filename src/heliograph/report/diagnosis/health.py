@@ -87,32 +87,36 @@ class Health:
     forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
     predicted: Forecasts = field(default_factory=dict)  # of each row, by node and filter, where it was asked for
     residuals: Residuals = field(default_factory=dict)  # of what was predicted, likewise
-    off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
-    apart: ConstantError | None = None  # of one node against the others, which filter by themselves
-    possible: tuple[str, ...] = ()  # of estimates where no sensor shows a state any more, or at a limit
+    constant_errors: Mapping[tuple[str, str], ConstantError] = field(
+        default_factory=dict
+    )  # by node and filter, where it says most
+    error_between_nodes: ConstantError | None = None  # of one node against the others, which filter by themselves
+    doubtful_estimates: tuple[str, ...] = ()  # of estimates where no sensor shows a state any more, or at a limit
     silences: Mapping[str, LongSilences] = field(default_factory=dict)  # by node that was silent past its timeout
     refused_messages: Mapping[str, Mapping[Reason, int]] = field(default_factory=dict)  # by node: for flag or counter
     time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
-        lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.possible]
+        lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.doubtful_estimates]
         lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
+        lines += self._describe_losses()
+        lines += [] if self.error_between_nodes is None else [say_node_differs(self.error_between_nodes)]
+        lines += [self.time_unit] if self.time_unit else []
+        return lines + [line for filter in self.list_doubted_filters() for line in self._describe_doubts(filter)]
+
+    def _describe_losses(self) -> Iterator[str]:
+        """Yield a line for each link that never delivers, or that loses more or less than the network says."""
         for link in self.links:
             name = f"{link.node}: {link.component}"
             if not link.arrived.any():
-                lines.append(f"{name} never arrived")
+                yield f"{name} never arrived"
             elif link.refuses:  # what it refused is missing
                 continue
             elif not link.may_be_lost and link.share < 1:
-                lines.append(
-                    f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
-                )
+                yield f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
             elif link.contradicts(FALSE / len(self.links)):
-                lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
-        lines += [] if self.apart is None else [say_node_differs(self.apart)]
-        lines += [self.time_unit] if self.time_unit else []
-        return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
+                yield f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do"
 
     def describe_stuck_outputs(self) -> dict[tuple[str, str], str]:
         """Return {(node, output): line} for each output that repeats one value for longer than its noise allows.
@@ -135,7 +139,7 @@ class Health:
             for name, (node, output, held) in held_outputs.items()
         }
 
-    def doubted(self) -> list[FilterHealth]:
+    def list_doubted_filters(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts.
 
         Filters that use a stuck output are left out: their innovations show only that.
@@ -163,10 +167,10 @@ class Health:
         """
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
-        off = self.off.get((health.node, health.filter))
-        if off is not None:
-            yield say_constant_error(name, off)
-            if off.nothing_else:  # a constant error explains all other doubts too
+        error = self.constant_errors.get((health.node, health.filter))
+        if error is not None:
+            yield say_constant_error(name, error)
+            if error.nothing_else:  # a constant error explains all other doubts too
                 return
         said = say_declared_variances_are_off(health.declared, health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)

@@ -75,16 +75,33 @@ def examine(
     beliefs = tuple(belief.words for belief in network.beliefs())
     timeouts = {node: network.nodes[node].timeout for node in network.names}
     silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
-    links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
-    health = Health(record, links, filters, outputs, network.shared, beliefs, possible=possible, silences=silences)
-    # What may explain the doubts: a constant error of one output or node (unless one is stuck), another unit of time.
-    off = {
-        (doubted.node, doubted.filter): _find_constant_error(network, health, doubted, u)
-        for doubted in health.doubted()
+    health = Health(
+        record,
+        list_arrivals(network, record.time, record.measurements),
+        filters,
+        outputs,
+        network.shared,
+        beliefs,
+        doubtful_estimates=doubt_estimates(network, record),
+        silences=silences,
+    )
+    return _explain_doubts(network, health, u)
+
+
+def _explain_doubts(network: Network, health: Health, inputs: np.ndarray) -> Health:
+    """Return the diagnosis with what may explain doubts: a constant error of an output or node, another unit of time.
+
+    Where an output is stuck, no constant error between nodes is looked for.
+    """
+    errors = {
+        (filter.node, filter.filter): _find_constant_error(network, health, filter, inputs)
+        for filter in health.list_doubted_filters()
     }
-    apart = None if health.describe_stuck_outputs() else find_constant_error_between_nodes(network, record, u, FALSE)
-    health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
-    return replace(health, time_unit=_doubt_time_unit(network, health, u))
+    is_stuck = bool(health.describe_stuck_outputs())
+    between = None if is_stuck else find_constant_error_between_nodes(network, health.record, inputs, FALSE)
+    known = {name: error for name, error in errors.items() if error is not None}
+    health = replace(health, constant_errors=known, error_between_nodes=between)
+    return replace(health, time_unit=_doubt_time_unit(network, health, inputs))
 
 
 def _examine_filter(
@@ -124,7 +141,7 @@ def _examine_filter(
 
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
     """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or ""."""
-    tested = [judged for judged in health.doubted() if judged.test is not None]
+    tested = [judged for judged in health.list_doubted_filters() if judged.test is not None]
     if not tested:
         return ""
     first = _find_judged_filter(network, health.record, tested[0])

@@ -152,7 +152,7 @@ class Translator:
         results: list[Message | UnreadMessage | str] = []
         try:
             # A message that only says that a sender is online or offline has no readings: the sources note it.
-            if self.sources.take_device_word(topic, payload, where):
+            if self.sources.device_statuses.take_status_message(topic, payload, where):
                 return []
             # Messages of unknown topics are counted, whatever they carry.
             if not self.sources.of(topic):

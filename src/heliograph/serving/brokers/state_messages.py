@@ -61,12 +61,17 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
     moment = estimate["time"]
     time = parse_instant(moment).timestamp() if isinstance(moment, str) else moment
     dead = _read_dead_senders(estimate)
-    for place, i, message in _iterate_states(topic, states, estimate):
+    for published, i, message in _iterate_states(topic, states, estimate):
         covariance = message["covariance"]
         variance = None if covariance is None else covariance[i][i]
         deviation = None if variance is None or variance < 0 else math.sqrt(variance)
-        content = {"value": message["mean"][i], "deviation": deviation, "dead": dead.get(place.node, 0), "time": time}
-        yield StateMessage(place.topic, json.dumps(content).encode())
+        content = {
+            "value": message["mean"][i],
+            "deviation": deviation,
+            "dead": dead.get(published.node, 0),
+            "time": time,
+        }
+        yield StateMessage(published.topic, json.dumps(content).encode())
 
 
 def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, prefix: str) -> Iterator[StateMessage]:
@@ -83,10 +88,10 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
     device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
               "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
     nodes_with_senders = _read_dead_senders(estimate).keys()
-    for place, i, _ in _iterate_states(topic, states, estimate):
-        common = {"state_topic": place.topic, "availability_topic": availability_topic(topic), "device": device}
-        for sensor in _list_sensors(place, unit_of(states[i]), place.node in nodes_with_senders):
-            identity = f"{place.identity}-{sensor.key}"
+    for published, i, _ in _iterate_states(topic, states, estimate):
+        common = {"state_topic": published.topic, "availability_topic": availability_topic(topic), "device": device}
+        for sensor in _list_sensors(published, unit_of(states[i]), published.node in nodes_with_senders):
+            identity = f"{published.identity}-{sensor.key}"
             named = {"name": sensor.name, "unique_id": identity, "value_template": f"{{{{ value_json.{sensor.key} }}}}"}
             content = json.dumps(named | common | sensor.settings).encode()
             yield StateMessage(f"{prefix}/{sensor.kind}/{identity}/config", content)
@@ -101,21 +106,21 @@ class _DiscoveredSensor(NamedTuple):
     settings: dict[str, Any]
 
 
-def _list_sensors(place: _PublishedState, unit: str | None, has_sender: bool) -> list[_DiscoveredSensor]:
+def _list_sensors(published: _PublishedState, unit: str | None, has_sender: bool) -> list[_DiscoveredSensor]:
     """Return the sensors of a state for Home Assistant: its value, its deviation, and whether its sender is dead.
 
     There is the last one only if the node has a sender that may be found dead (`has_sender`).
     """
     number = {"state_class": "measurement"} | ({"unit_of_measurement": unit} if unit else {})
     sensors = [
-        _DiscoveredSensor("sensor", "value", place.label, number),
+        _DiscoveredSensor("sensor", "value", published.label, number),
         _DiscoveredSensor(
-            "sensor", "deviation", f"{place.label} deviation", number | {"entity_category": "diagnostic"}
+            "sensor", "deviation", f"{published.label} deviation", number | {"entity_category": "diagnostic"}
         ),
     ]
     if has_sender:
         dead = {"payload_on": "1", "payload_off": "0", "device_class": "problem"}
-        sensors.append(_DiscoveredSensor("binary_sensor", "dead", f"{place.label} sender dead", dead))
+        sensors.append(_DiscoveredSensor("binary_sensor", "dead", f"{published.label} sender dead", dead))
     return sensors
 
 

@@ -11,7 +11,8 @@ from sqlalchemy import Connection, Table, delete, func, inspect, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.stored.migration import DESCRIPTION, LISTED, PlantMigration, list_changes
+from heliograph.live.stored.migration import PlantMigration
+from heliograph.live.stored.network_changes import DESCRIPTION, LISTED, list_changes
 from heliograph.live.stored.snapshot import Identity, check_same_network, list_versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output, parse_output
@@ -320,8 +321,7 @@ class Store:
 
     def keep_words(self, words: Mapping[str, int]) -> None:
         """Store the last status of devices, as a number by topic; a topic longer than TOPIC is left out."""
-        rows = [add_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
-        if rows:
+        if rows := [add_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]:
             with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
                 self._upsert(connection, NUMBERS, rows)
 
@@ -349,8 +349,8 @@ class Store:
                 bodies = carrier.migrate({name: body for name, _, body, _ in rows})
                 after = [add_checksum(PLANTS, name, versions[name] + 1, body) for name, body in bodies.items()]
                 self._upsert(connection, PLANTS, after)
-            this = IDENTITY_TABLE.c.name == IDENTITY
-            connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
+            update_identity = update(IDENTITY_TABLE).where(IDENTITY_TABLE.c.name == IDENTITY)
+            connection.execute(update_identity.values(value=json.dumps(mine)))
         self.identity = mine
 
     def begin_from(self, location: str, mine: Identity, carrier: PlantMigration | None = None) -> None:

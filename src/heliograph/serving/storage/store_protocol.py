@@ -5,7 +5,8 @@ from shlex import quote
 from typing import NamedTuple, Protocol
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.stored.migration import DESCRIPTION, describe_network
+from heliograph.live.stored.migration import describe_network
+from heliograph.live.stored.network_changes import DESCRIPTION
 from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.numerics.check import InputError, instance
 from heliograph.serving.output import Kind, Output
