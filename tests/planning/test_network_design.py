@@ -236,18 +236,32 @@ def test_a_sensor_that_varies_sends_its_designed_power_at_every_step():
 
 @pytest.mark.parametrize(
     ("options", "got"),
-    [({"trigger": hg.Periodic(3)}, "a trigger"), ({"encoder": hg.Words(bits=2, low=-8.0, high=8.0)}, "words")],
+    [
+        ({"trigger": hg.Periodic(3)}, "a trigger"),
+        ({"encoder": hg.Words(bits=2, low=-8.0, high=8.0)}, "words"),
+        ({"filters": "fed back"}, "feedback"),
+    ],
 )
 def test_senders_that_decide_or_round_are_refused(options, got):
     """A design took them for senders of all that they measure: two bits of +-8 said as much as the number itself."""
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.05)
+    link = hg.perfect()
+    fed_back = {"f": hg.filters.fed_back_filter(plant, sensor, link)}
+    options = {"filters": fed_back} if "filters" in options else {"filters": {}, **options}
 
     def build(amplification):
         free = hg.Node(sensor, hg.hop(1.0, 0.2, amplification=amplification), {})
-        return hg.Network(plant, {"free": free, "b": hg.Node(sensor, hg.perfect(), {}, **options)})
+        return hg.Network(plant, {"free": free, "b": hg.Node(sensor, link, **options)})
 
     message = f"node 'b' of a design: expected a sensor that sends what it measures at each step, got {got}"
     with pytest.raises(hg.InputError, match=message):
         hg.design(build(1.0), budget=1.0)
     with pytest.raises(hg.InputError, match=message):
         hg.design(build, free={"amplification": (0.5, 0.01, 2.0)}, budget=0.3, starts=1)
+
+
+def test_a_plant_without_noise_has_a_steady_error_of_zero():
+    """The certificate divided by the error, 0: ZeroDivisionError."""
+    still = hg.LinearPlant([[0.9]], [[0.0]], [0.0], [[1.0]])
+    best = hg.design(hg.Network(still, {"a": hg.Node(hg.LinearSensor([[1.0]], 0.2), hg.hop(1.0, 0.1), {})}), budget=1.0)
+    assert best.error == best.certificate.gap == best.certificate.stationarity == 0.0

@@ -272,7 +272,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
     value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
     _, tangent_value, _ = problem.make_support(powers)
-    stationarity = max(tangent_value - bound, 0.0) / value
+    stationarity = max(tangent_value - bound, 0.0) / value if value > 0 else 0.0  # 0: nothing is left to gain
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
         relaxed = task.relax_to_whole_paths()
