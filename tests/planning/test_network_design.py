@@ -80,6 +80,30 @@ def test_the_price_is_the_slope_of_the_best_error(single):
     np.testing.assert_allclose(list(sending.values()), -middle.price, rtol=1e-9)  # all that send earn the same
 
 
+def test_the_price_is_that_of_the_total_where_a_peak_binds_as_well():
+    """It was the worth of a watt at the peak, .1166, which no watt of the total buys: .05465 by a difference."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.2)
+
+    def network(a=1.0, b=1.0):
+        links = {"a": hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.3, amplification=a),
+                 "b": hg.hop(1.0, 0.5, amplification=b)}  # fmt: skip
+        return hg.Network(plant, {name: hg.Node(sensor, link, {}) for name, link in links.items()})
+
+    def found(total, target=None, of=None, **free):
+        limits = Budget(total=total, peak={"a.hop1": 0.2})
+        return hg.design(of or network(), budget=limits, target_error=target, starts=1, **free)
+
+    less, more = found(1.999).error, found(2.001).error
+    assert found(2.0).price == pytest.approx((less - more) / 0.002, rel=1e-5)  # differences of second order
+    free = {"a": (0.3, 0.01, 2.0), "b": (0.8, 0.01, 2.0)}
+    assert found(2.0, of=network, free=free).price == pytest.approx(found(2.0).price, rel=1e-4)
+    for options in ({}, {"of": network, "free": free}):  # of a target it is the error for a watt of the least total
+        result = found(9.0, target=found(2.0).error, **options)
+        assert result.total == pytest.approx(2.0, rel=1e-5) and result.price == pytest.approx(
+            found(2.0).price, rel=1e-4
+        )
+
+
 def test_limits_of_each_and_peaks_hold(single):
     budget = Budget(total=6, per_transmitter={"a.hop1": 0.5}, peak=1.5)
     result = hg.design(single, budget=budget, error=Error(period=2))

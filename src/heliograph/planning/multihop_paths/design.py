@@ -393,8 +393,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
         present=present,
         covariance=task.problem.covariances(powers),
         sensitivity=dict(zip(paths.names, gradient.sum(axis=0).tolist(), strict=True)),
-        # A watt more at every step, sent at one step by one transmitter, is worth `steps` times a watt there.
-        price=float(np.max(-gradient[:, task.free] * len(gradient), initial=0.0)),
+        price=task.problem.limits.find_price(powers, -gradient[:, task.free], is_least_power=target is not None),
         numbers={},
         realised=None,
     )
