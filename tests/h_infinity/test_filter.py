@@ -144,3 +144,14 @@ def test_models_that_are_not_the_systems_are_refused():
         hg.InputError, match=r"sensor in row 0: expected C x \+ h\(x\) of the system's step 0, got 1 from it"
     ):
         make(0.05, shown=2.0)
+
+
+def test_models_that_are_not_0_at_0_are_refused():
+    """Behind a random gain a constant of 5 makes an error without any disturbance: it was taken."""
+    system = varying_system(transition=[[0.9]], growth=0.0)
+    design = hg.h_infinity.horizon_design(system)
+    drifting, level = hg.Plant(lambda x, u: 0.9 * x + 5.0, 1.0, [0.0], 1.0), hg.Sensor(lambda x: x + 5.0, 0.25)
+    plant, sensor = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.25)
+    for models, name in (((drifting, sensor), "plant in row 1"), ((plant, level), "sensor in row 0")):
+        with pytest.raises(hg.InputError, match=rf"{name}: expected .*, which is 0 at x = 0 .*, got \[5.0\]"):
+            hg.h_infinity.h_infinity_filter(*models, system, design)

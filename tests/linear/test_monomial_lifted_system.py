@@ -4,6 +4,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 
+import jax
 import numpy as np
 import pytest
 
@@ -222,3 +223,19 @@ def test_what_no_double_can_hold_is_refused():
     for degree in (32, 50, 10**9):
         with pytest.raises(ValueError, match=f"degree of the lift: expected at most 31, got {degree}"):
             hg.polynomial_filter(plant, sensor, hg.perfect(), 5, degree)
+
+
+def test_traced_numbers_are_refused_in_one_line():
+    """Moments are NumPy's: under jax.grad, JAX's own error came out."""
+    sensor, link = hg.LinearSensor([[1.0]], 0.2), hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.1)
+    for make in (
+        hg.polynomial_filter,
+        hg.filters.scheduled_polynomial_filter,
+        hg.filters.memory_filter,
+        lifted_system,
+    ):
+        more = (2,) if make is lifted_system else ()
+        with pytest.raises(ValueError, match="polynomial filter: expected known numbers") as error:
+            jax.grad(lambda q, make=make, more=more: make(
+                hg.LinearPlant([[0.9]], q * np.eye(1), [0.0], 1.0), sensor, link, *more, 4))(0.5)  # fmt: skip
+        assert "\n" not in str(error.value)

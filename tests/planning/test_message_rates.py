@@ -135,3 +135,17 @@ def test_a_plant_that_inputs_move_has_no_rate_of_send_on_delta():
             compute(driven, NOISY, 0.3)
     still = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0)  # both ends know what inputs do to a prediction
     assert prediction_error_rate(driven, NOISY, 1.0).rate == prediction_error_rate(still, NOISY, 1.0).rate
+
+
+def test_angles_and_what_never_changes_have_no_rate():
+    """Of an angle the rate was that of a number on a line; without noise, or with a sensor of 0, a division by 0."""
+    turning = hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0, circular=["x0"])
+    bearing = hg.LinearSensor([[1.0]], 0.5, circular=["y0"])
+    plant, still = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0), hg.LinearPlant([[0.9]], 0.0, [0.0], 1.0)
+    for compute in (send_on_delta_rate, delta_for_rate, prediction_error_rate, least_error):
+        for pair in ((turning, bearing), (plant, bearing)):
+            with pytest.raises(hg.InputError, match="rate before any data: expected no angles"):
+                compute(*pair, 0.3)
+        for pair in ((plant, hg.LinearSensor([[0.0]], 0.5)), (still, hg.LinearSensor([[1.0]], 0.0)), (still, NOISY)):
+            with pytest.raises(hg.InputError, match="rate before any data: expected a plant with noise, and a sensor"):
+                compute(*pair, 0.3)

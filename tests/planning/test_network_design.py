@@ -80,6 +80,30 @@ def test_the_price_is_the_slope_of_the_best_error(single):
     np.testing.assert_allclose(list(sending.values()), -middle.price, rtol=1e-9)  # all that send earn the same
 
 
+def test_the_price_is_that_of_the_total_where_a_peak_binds_as_well():
+    """It was the worth of a watt at the peak, .1166, which no watt of the total buys: .05465 by a difference."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.2)
+
+    def network(a=1.0, b=1.0):
+        links = {"a": hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.3, amplification=a),
+                 "b": hg.hop(1.0, 0.5, amplification=b)}  # fmt: skip
+        return hg.Network(plant, {name: hg.Node(sensor, link, {}) for name, link in links.items()})
+
+    def found(total, target=None, of=None, **free):
+        limits = Budget(total=total, peak={"a.hop1": 0.2})
+        return hg.design(of or network(), budget=limits, target_error=target, starts=1, **free)
+
+    less, more = found(1.999).error, found(2.001).error
+    assert found(2.0).price == pytest.approx((less - more) / 0.002, rel=1e-5)  # differences of second order
+    free = {"a": (0.3, 0.01, 2.0), "b": (0.8, 0.01, 2.0)}
+    assert found(2.0, of=network, free=free).price == pytest.approx(found(2.0).price, rel=1e-4)
+    for options in ({}, {"of": network, "free": free}):  # of a target it is the error for a watt of the least total
+        result = found(9.0, target=found(2.0).error, **options)
+        assert result.total == pytest.approx(2.0, rel=1e-5) and result.price == pytest.approx(
+            found(2.0).price, rel=1e-4
+        )
+
+
 def test_limits_of_each_and_peaks_hold(single):
     budget = Budget(total=6, per_transmitter={"a.hop1": 0.5}, peak=1.5)
     result = hg.design(single, budget=budget, error=Error(period=2))
@@ -236,18 +260,32 @@ def test_a_sensor_that_varies_sends_its_designed_power_at_every_step():
 
 @pytest.mark.parametrize(
     ("options", "got"),
-    [({"trigger": hg.Periodic(3)}, "a trigger"), ({"encoder": hg.Words(bits=2, low=-8.0, high=8.0)}, "words")],
+    [
+        ({"trigger": hg.Periodic(3)}, "a trigger"),
+        ({"encoder": hg.Words(bits=2, low=-8.0, high=8.0)}, "words"),
+        ({"filters": "fed back"}, "feedback"),
+    ],
 )
 def test_senders_that_decide_or_round_are_refused(options, got):
     """A design took them for senders of all that they measure: two bits of +-8 said as much as the number itself."""
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.05)
+    link = hg.perfect()
+    fed_back = {"f": hg.filters.fed_back_filter(plant, sensor, link)}
+    options = {"filters": fed_back} if "filters" in options else {"filters": {}, **options}
 
     def build(amplification):
         free = hg.Node(sensor, hg.hop(1.0, 0.2, amplification=amplification), {})
-        return hg.Network(plant, {"free": free, "b": hg.Node(sensor, hg.perfect(), {}, **options)})
+        return hg.Network(plant, {"free": free, "b": hg.Node(sensor, link, **options)})
 
     message = f"node 'b' of a design: expected a sensor that sends what it measures at each step, got {got}"
     with pytest.raises(hg.InputError, match=message):
         hg.design(build(1.0), budget=1.0)
     with pytest.raises(hg.InputError, match=message):
         hg.design(build, free={"amplification": (0.5, 0.01, 2.0)}, budget=0.3, starts=1)
+
+
+def test_a_plant_without_noise_has_a_steady_error_of_zero():
+    """The certificate divided by the error, 0: ZeroDivisionError."""
+    still = hg.LinearPlant([[0.9]], [[0.0]], [0.0], [[1.0]])
+    best = hg.design(hg.Network(still, {"a": hg.Node(hg.LinearSensor([[1.0]], 0.2), hg.hop(1.0, 0.1), {})}), budget=1.0)
+    assert best.error == best.certificate.gap == best.certificate.stationarity == 0.0

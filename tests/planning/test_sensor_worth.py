@@ -103,6 +103,10 @@ def test_what_cannot_be_asked_is_said_in_one_line(network):
     asking = hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.1), hg.perfect(1), {}, trigger=hg.SendOnDelta(0.5))
     with pytest.raises(ValueError, match="node 'a' of a comparison of sensors: expected a sensor that sends what it"):
         worth_of_sensors(hg.Network(network.plant, {"a": asking}))
+    link = hg.hop(hg.Rayleigh(1.0), 0.1)  # with feedback its randomness multiplies an error, without all of the state
+    heard = hg.Node(asking.sensor, link, {"f": hg.filters.fed_back_filter(network.plant, asking.sensor, link)})
+    with pytest.raises(ValueError, match=r"node 'a' of a comparison of sensors: expected .* step, got feedback"):
+        worth_of_sensors(hg.Network(network.plant, {"a": heard}))
     with pytest.raises(ValueError, match="node 'mast' of the additions: expected a sensor that sends what it measures"):
         worth_of_sensors(network, additions={"mast": asking})
     with pytest.raises(ValueError, match="runs: expected a whole number of at least 2, got 1"):

@@ -163,6 +163,14 @@ def test_one_sensor_with_feedback_does_not_hide_that_another_grows():
     np.testing.assert_array_equal(both.over_time["fed.hop1"], alone.over_time["fed.hop1"])
 
 
+def test_what_feedback_sends_after_losses_is_refused():
+    """As if all arrived, .898 was said to be exact: with half of it lost E (y - r)^2 = 0.81 E P + 0.7 is 1.328."""
+    plant, sensor, link = hg.LinearPlant([[0.9]], 0.5, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.2), hg.hop(1.0, 0.1)
+    fed = hg.Node(sensor, hg.erasure(link, 0.5), {"fed": hg.filters.fed_back_filter(plant, sensor, link)})
+    with pytest.raises(hg.InputError, match="power of 'a', a sensor with feedback: expected a link that loses nothing"):
+        hg.power(hg.Network(plant, {"a": fed}), horizon=2)
+
+
 def test_what_messages_tell_of_a_link_changes_nothing_of_what_is_sent():
     def sent(known, **horizon):
         fading = hg.hop(hg.Rayleigh(0.8), 0.2, known=known)

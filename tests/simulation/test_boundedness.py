@@ -277,9 +277,17 @@ def test_a_link_that_tells_its_gain_is_refused_in_words_that_fit():
         hg.simulation.certify_boundedness(hg.Network(plant, {"a": hg.Node(sensor, link, {})}))
 
 
-@pytest.mark.parametrize("chosen", [{"trigger": hg.Periodic(8)}, {"trigger": hg.SendOnDelta(3.0)}, {"limits": (-5, 5)}])
+HOLDS_BACK = [
+    {"trigger": hg.Periodic(8)},
+    {"trigger": hg.SendOnDelta(3.0)},
+    {"limits": (-5, 5)},
+    {"encoder": hg.Words(8, -5, 5)},
+]
+
+
+@pytest.mark.parametrize("chosen", HOLDS_BACK)
 def test_what_values_decide_to_hold_back_certifies_nothing(chosen):
-    """Such nodes were taken to deliver every value: a bound of 2.95 where all is refused once |y| > 5."""
+    """Such nodes were taken to deliver every value: a bound of 2.95 where all is refused, or cut, once |y| > 5."""
     sensor, silent = hg.LinearSensor([[1.0]], 2.5), hg.LinearSensor([[0.0]], 1.0)
     alone = hg.Node(sensor, hg.perfect(), {}, **chosen)
     beside = hg.Node(hg.LinearSensor([[1.0]], 10.0), hg.perfect(), {})
@@ -294,3 +302,14 @@ def test_what_values_decide_to_hold_back_certifies_nothing(chosen):
     assert found.verdict == "certified" and found.bound[0, 0] == pytest.approx((-b + np.sqrt(b * b + 40)) / 2)
     assert judge(0.9, a=alone).bound[0, 0] == pytest.approx(1 / (1 - 0.9**2))
     assert judge(1.2, a=hg.Node(silent, hg.perfect(), {}, **chosen)).verdict == "impossible"
+
+
+def test_a_sensor_with_feedback_is_refused_as_a_random_gain_multiplies_an_error_alone():
+    """It was said to be impossible, of a growth of 1.1, where the filter's mean square error stays at 0.28."""
+    unstable, sensor = plant([[1.05]], 0.5), hg.LinearSensor([[1.0]], 0.2)
+    link = hg.hop(hg.Discrete([0.5, 1.0, 1.5], [0.25, 0.5, 0.25]), 0.1)
+    node = hg.Node(sensor, link, {"f": hg.filters.fed_back_filter(unstable, sensor, link)})
+    network = hg.Network(unstable, {"a": node})
+    assert np.mean(hg.monte_carlo(network, 150, 20, 0).errors("a", "f")[:, -50:] ** 2) < 0.5  # 1000 steps of 0.28
+    with pytest.raises(ValueError, match="nodes: expected sensors without feedback"):
+        hg.simulation.certify_boundedness(network)

@@ -107,7 +107,7 @@ def h_infinity_filter(
 
     Raises:
         ValueError: a design that is not feasible, or a plant, sensor and system that do not fit: by their sizes, or, of
-            models without inputs, by a change of one state that the growth constants do not allow.
+            models without inputs, by a change of one state that the growth constants do not allow, or by a value at 0.
 
     Source: H-infinity fusion over amplify-and-forward relays, equation (6).
     """
@@ -154,8 +154,9 @@ def _check_sizes(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, desig
 def _check_models(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem) -> None:
     """Raise ValueError if plant or sensor is seen not to be the system's: no level holds of another one.
 
-    By each unit vector x: |f(x) - f(0) - A x| <= a |x| of the plant's transition into row k + 1, the system's A and
-    a of step k, and likewise of what is measured in row k. Models with inputs, which are not known, are passed over.
+    By x = 0 and each unit vector x: |f(x) - f(0) - A x| <= a |x| and f(0) = 0 of the plant's transition into row k + 1,
+    the system's A and a of step k, and likewise of what is measured in row k. Models with inputs, which are not known,
+    are passed over.
     """
     if first(plant).inputs or first(sensor).inputs:
         return
@@ -172,17 +173,18 @@ def _check_models(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem) -> N
 
 def _list_changes(
     model: AnyPlant | AnySensor, choose: Callable[[Any], Callable[[jax.Array], jax.Array]], n: int
-) -> Callable[[int], Float[np.ndarray, "_ n"]]:
-    """Return a function of a step that gives f(x) - f(0) of the model at all unit vectors x, one in each column.
+) -> Callable[[int], Float[np.ndarray, "_ points"]]:
+    """Return a function of a step that gives f(0) of the model, and f(x) - f(0) at all unit vectors x, as columns.
 
     `choose`: from the model of a step its function f. `n`: number of states.
     """
 
-    def compute(k: int) -> Float[np.ndarray, "_ n"]:
-        """Return the changes of the model of step k."""
+    def compute(k: int) -> Float[np.ndarray, "_ points"]:
+        """Return the value at 0 and the changes of the model of step k."""
         f = choose(at(model, k))
         with jax.enable_x64(True):
-            return np.asarray(jax.vmap(f)(jnp.eye(n)) - f(jnp.zeros(n))).T
+            at_zero = f(jnp.zeros(n))
+            return np.asarray(jnp.stack([at_zero, *(jax.vmap(f)(jnp.eye(n)) - at_zero)], axis=1))
 
     if isinstance(model, OverTime):
         return compute
@@ -191,12 +193,16 @@ def _list_changes(
 
 
 def _compare(
-    name: str, expected: str, changes: Float[np.ndarray, "_ n"], matrix: Float[np.ndarray, "_ n"], growth: float
+    name: str, expected: str, found: Float[np.ndarray, "_ points"], matrix: Float[np.ndarray, "_ n"], growth: float
 ) -> None:
     """Raise ValueError if a change of one state by 1 differs from the matrix's by more than the growth constant allows.
 
-    ROUNDING: the difference, relative to the change, that counts as rounding.
+    A value at 0 is refused too: behind a random gain it makes an error without any disturbance. ROUNDING: the
+    difference, relative to the change, that counts as rounding.
     """
+    at_zero, changes = found[:, 0], found[:, 1:]  # as of `_list_changes`
+    if np.linalg.norm(at_zero) > ROUNDING * max(1.0, float(np.linalg.norm(matrix))):
+        raise fail(name, f"{expected}, which is 0 at x = 0 (take a constant off)", at_zero.tolist())
     difference = np.linalg.norm(changes - matrix, axis=0)
     allowed = float(growth) * (1 + ROUNDING) + ROUNDING * np.linalg.norm(matrix, axis=0)
     if np.any(difference > allowed):

@@ -10,6 +10,7 @@ from heliograph.model.over_time import OverTime, first, list_models_by_step, ste
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import check_horizon, fail
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
@@ -30,7 +31,13 @@ class PlantAndMeasurementMaps(NamedTuple):
 
 
 def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
-    """Raise ValueError unless plant and sensor are linear, without inputs, fit the channel, and have noise laws."""
+    """Raise ValueError unless plant and sensor are linear, without inputs, fit the channel, and have noise laws.
+
+    Numbers that JAX traces are refused: NumPy computes the moments.
+    """
+    if is_traced(plant, sensor, channel):
+        expected = "known numbers (hg.linear_filter, of degree 1, takes traced ones)"
+        raise fail("polynomial filter", expected, "traced ones")
     first_plant = first(plant)
     check_linear("polynomial filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first_plant.states))

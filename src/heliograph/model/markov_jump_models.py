@@ -256,7 +256,8 @@ def markov_plant(
     only: a row that is inserted between two others is a step more.
 
     Args:
-        models: one plant for each mode, of the same states, inputs, angles and law of x_0.
+        models: one plant for each mode, of the same states, inputs, angles and law of x_0; the first one's law counts
+            where JAX traces all of them, as no trace can compare them.
         transition: P(next mode j | present mode i) (modes, modes), or a chain.
         initial: law (modes,) of the mode at the first step; the stationary law by default.
         name: links, sensors and plants of one name share the chain; by default it is the plant's own.
@@ -277,7 +278,9 @@ def markov_plant(
                 raise fail(f"{what} of model {i}", f"{list(getattr(plants[0], what))}, as those of model 0{remedy}",
                            list(getattr(plant, what)))  # fmt: skip
         for what in ("initial_mean", "initial_covariance", "deviation"):
-            if not are_same(getattr(plant, what), getattr(plants[0], what)):
+            own, of_first = getattr(plant, what), getattr(plants[0], what)
+            are_both_traced = is_traced(own) and is_traced(of_first)  # whose numbers nobody can compare
+            if not (are_both_traced or are_same(own, of_first)):
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:

@@ -34,7 +34,7 @@ class BitsDesign(NamedTuple):
     Args:
         bits: by node; 0 of one that sends nothing.
         error: trace of the steady covariance of the best linear filter of all words, with subtracted dither.
-        bound: that no bits of this total rate have less.
+        bound: that no bits of this total rate have less, in words of at most 24 bits, as all encoders have.
         encoders: of the nodes that send, with these bits and a dither that is taken off.
     """
 

@@ -1,6 +1,6 @@
 """Designs compared: over total powers, over places, and after each change of the network by a sensor or a relay."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -8,11 +8,13 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import amplify_and_forward
-from heliograph.numerics.check import array, fail, function, instance
+from heliograph.model.over_time import first
+from heliograph.numerics.check import InputError, array, fail, function, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.design_problem import DesignProblem, PowerDesign
 from heliograph.planning.network_design import design
+from heliograph.planning.power_budget import Budget, PerTransmitter, make_budget
 from heliograph.planning.transmitters import transmitter_names, visit_hops
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
@@ -154,7 +156,8 @@ def worth_of_changes(
     A design chooses the powers of transmitters for the least error, or the least power for a target error. It is made
     again with each sensor doubled, with each left out, and with a relay halfway in each hop. Such a relay makes two
     hops of one, each with 2^exponent times its power gain E g^2, as the distance is halved, and the same kappa and
-    noise. A change that cannot be designed, such as leaving out the only sensor, is not listed.
+    noise. A new transmitter has the limits of the one that it doubles or relieves. A change that cannot be designed,
+    such as one whose fixed powers exceed the budget, is not listed.
 
     Args:
         best: the design of the unchanged network.
@@ -174,7 +177,10 @@ def worth_of_changes(
     worths = []
     for name, changed in _list_changes(problem, network, exponent).items():
         advance(name)
-        value = design(changed).certificate.value
+        try:
+            value = design(changed).certificate.value
+        except InputError:  # such as one more sensor that is not free, whose power is above the budget
+            continue
         worths.append(ChangeWorth(name=name, value=value, saved=best.certificate.value - value))
     return sorted(worths, key=lambda change: -change.saved)
 
@@ -189,32 +195,81 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
     """
     senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     nodes = {name: Node(node.sensor, node.channel, {}) for name, node in senders.items()}  # without filters
-    free = None if problem.free is None else tuple(problem.free)  # names of transmitters or nodes; None: all are free
-
-    def with_nodes(nodes: dict[str, Node], free: tuple[str, ...] | None) -> DesignProblem:
-        return replace(problem, network=Network(network.plant, nodes), free=free)
-
+    free = _list_free_names(problem)
     problems = {}
     for name, node in nodes.items():
+        own = [f"{name}.{hop}" for hop in transmitter_names(first(node.channel))]
         # The sensor once more. If some powers are free by name, the new sensor's are too.
         twin = f"{name} again"
+        twice = {each: (each, twin + each.removeprefix(name)) for each in own}
         with_twin = None if free is None else (*free, twin)
-        problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)
+        problems[f"one more {name}"] = _change_nodes(problem, network, {**nodes, twin: node}, with_twin, twice)
         # The sensor left out, unless nothing is left or nothing is free then. With a target error it is not tried, as
         # that is one of all sensors.
         still_free = None if free is None else tuple(each for each in free if _find_node_of_transmitter(each) != name)
         if len(nodes) > 1 and still_free != () and problem.target_error is None:
             rest = {other: other_node for other, other_node in nodes.items() if other != name}
-            problems[f"without {name}"] = with_nodes(rest, still_free)
-        # A relay in each hop. It changes the numbers in the names of hops behind it, so that nodes are free as a whole.
+            none_left: dict[str, tuple[str, ...]] = dict.fromkeys(own, ())
+            problems[f"without {name}"] = _change_nodes(problem, network, rest, still_free, none_left)
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
-            free_nodes = (
-                None if free is None else tuple(dict.fromkeys(_find_node_of_transmitter(each) for each in free))
-            )
-            for hop in transmitter_names(node.channel):
-                with_relay = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
-                problems[f"a relay halfway of {name}.{hop}"] = with_nodes({**nodes, name: with_relay}, free_nodes)
+            problems |= _list_relays(problem, network, nodes, name, exponent)
     return problems
+
+
+def _list_free_names(problem: DesignProblem) -> tuple[str, ...] | None:
+    """Return the names of transmitters or nodes whose powers are free, None where all are."""
+    named = [problem.free] if isinstance(problem.free, str) else problem.free
+    return None if named is None else tuple(named)
+
+
+def _list_relays(
+    problem: DesignProblem, network: Network, nodes: dict[str, Node], name: str, exponent: float
+) -> dict[str, DesignProblem]:
+    """Return {name of a change: the design problem} with a relay in the middle of each hop of the node `name`.
+
+    `nodes`: all, without filters. A relay changes the numbers in the names of hops behind it, so that nodes are free as
+    a whole. It has the limits of the transmitter whose hop it halves.
+    """
+    node, problems, free = nodes[name], dict[str, DesignProblem](), _list_free_names(problem)
+    assert isinstance(node.channel, AbstractRandomAffine)
+    free_nodes = None if free is None else tuple(dict.fromkeys(_find_node_of_transmitter(each) for each in free))
+    hops = transmitter_names(node.channel)
+    for i, hop in enumerate(hops):
+        channel = _insert_relay(node.channel, hop, exponent)
+        now = [f"{name}.{each}" for each in transmitter_names(channel)]
+        renamed = {f"{name}.{each}": (now[j + (j > i)],) for j, each in enumerate(hops)}
+        renamed[f"{name}.{hop}"] = (now[i], now[i + 1])
+        with_relay = {**nodes, name: Node(node.sensor, channel, {})}
+        problems[f"a relay halfway of {name}.{hop}"] = _change_nodes(problem, network, with_relay, free_nodes, renamed)
+    return problems
+
+
+def _change_nodes(
+    problem: DesignProblem,
+    network: Network,
+    nodes: dict[str, Node],
+    free: tuple[str, ...] | None,
+    renamed: Mapping[str, tuple[str, ...]],
+) -> DesignProblem:
+    """Return the design problem of a network of other nodes, with limits by name moved to the transmitters there are.
+
+    Args:
+        problem: of the unchanged network.
+        network: the unchanged one, whose plant stays.
+        nodes: of the changed network.
+        free: names of its transmitters or nodes whose powers are free; None for all.
+        renamed: the names there of a transmitter of the unchanged network; one that is not listed keeps its name.
+    """
+
+    def rename(limit: PerTransmitter) -> PerTransmitter:
+        if not isinstance(limit, dict):
+            return limit
+        return {new: number for name, number in limit.items() for new in renamed.get(name, (name,))}
+
+    budget = None if problem.budget is None else make_budget(problem.budget)
+    if budget is not None:
+        budget = Budget(budget.total, rename(budget.per_transmitter), rename(budget.peak))
+    return replace(problem, network=Network(network.plant, nodes), free=free, budget=budget)
 
 
 def _find_node_of_transmitter(transmitter: str) -> str:

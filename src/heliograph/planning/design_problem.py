@@ -111,9 +111,10 @@ class PowerDesign(Module):
     problem: what was to be designed. powers: of every transmitter, {name: (steps,)}, steps of the error's period or
     horizon (one if steady). error: attained; present: that of the network as it is (NaN of independent paths, which
     have no powers yet). covariance: P after each step, (steps, n, n). sensitivity: the error's derivative by the mean
-    power of each transmitter; price: the error that one more watt of the budget takes away. Of free numbers both come
-    from Lagrange's multipliers: zero where no limit of power binds. numbers: the free numbers of a network that is a
-    function of them. realised: the network at these numbers, None where powers alone were designed.
+    power of each transmitter; price: the error that one more watt of the total takes away, sent where no other limit
+    binds; without a total, one more of the transmitter that it helps most, whose own limit rises. Of free numbers both
+    come from Lagrange's multipliers: zero where no limit of power binds. numbers: the free numbers of a network that is
+    a function of them. realised: the network at these numbers, None where powers alone were designed.
     """
 
     problem: "DesignProblem"

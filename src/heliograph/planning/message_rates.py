@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from heliograph.filters.event.factory import event_filter
 from heliograph.model.channel import Channel
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.numerics.module import readable
@@ -114,7 +114,7 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
         loss: probability that a transmission is lost (default 0).
 
     Raises:
-        ValueError: another plant or sensor; a loss of 1 or more.
+        ValueError: another plant or sensor, an angle; a loss of 1 or more.
     Source: Lipsa and Martins, Remote state estimation with communication costs for first-order LTI systems (2011).
     """
     system = _require_scalar_system(plant, sensor)
@@ -179,7 +179,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
         delta: a value is sent if it is further than this from the last value sent, in the unit of y.
 
     Raises:
-        ValueError: another plant or sensor; a plant that is not stable; a delta so large
+        ValueError: another plant or sensor, an angle; a plant that is not stable; a delta so large
             that less than one message in a million steps is sent; a grid that is too fine, or a rate that converges
             too slowly to be computed.
     """
@@ -239,7 +239,10 @@ def _find_threshold(
 
 
 def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: bool = False) -> ScalarSystem:
-    """Return a, q, c, r of a linear plant and sensor of one number and Gaussian noise each; ValueError for others."""
+    """Return a, q, c, r of a linear plant and sensor of one number and Gaussian noise each; ValueError for others.
+
+    Refused are angles too, a plant without noise and a sensor of nothing, behind which there is nothing to send.
+    """
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         raise fail("rate before any data", expected, f"{type(plant).__name__} and {type(sensor).__name__}")
@@ -252,12 +255,17 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
     if not (isinstance(plant.noise, Gaussian) and isinstance(sensor.noise, Gaussian)):
         laws = f"{type(plant.noise).__name__} and {type(sensor.noise).__name__}"
         raise fail("rate before any data", "Gaussian noises (simulate_rate takes any)", laws)
-    return ScalarSystem(
+    refuse_angles("rate before any data", plant, sensor)
+    system = ScalarSystem(
         a=float(np.asarray(plant.matrix)[0, 0]),
         q=float(np.asarray(plant.noise.covariance)[0, 0]),
         c=float(np.asarray(sensor.matrix)[0, 0]),
         r=float(np.asarray(sensor.noise.covariance)[0, 0]),
     )
+    if system.q == 0 or system.c == 0:
+        got = f"a variance of {system.q:g} and a matrix of {system.c:g}"
+        raise fail("rate before any data", "a plant with noise, and a sensor of its state", got)
+    return system
 
 
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
 MET = 1e-9  # relative excess over a limit that counts as met
+AT_LIMIT = 1e-6  # relative: a power so near to its limit has reached it
 
 Powers = Float[np.ndarray, "time free"]
 PerTransmitter = float | dict[str, float] | None
@@ -132,6 +133,22 @@ class PowerLimits(NamedTuple):
         powers = powers * factor
         total = powers.mean(axis=0).sum()
         return powers * (self.total / total) if total > self.total else powers
+
+    def find_price(self, powers: Powers, worth: Powers, is_least_power: bool) -> float:
+        """Return the error that one more watt of the total takes away, sent where it helps and no other limit binds.
+
+        Without a total it is one more watt of the transmitter that it helps most, whose own limit rises. A watt more at
+        every step, sent at one step by one transmitter, is worth as many times a watt there as there are steps.
+
+        Args:
+            powers: what the free transmitters send (time, free).
+            worth: the error that a watt more of each takes away at each step (time, free).
+            is_least_power: whether the total itself is what was made small.
+        """
+        has_room = (powers < self.peak * (1 - AT_LIMIT)) & (powers.mean(axis=0) < self.mean * (1 - AT_LIMIT))
+        if not is_least_power and not np.isfinite(self.total):
+            has_room[:] = True
+        return float(np.max(worth * len(worth), where=has_room, initial=0.0))
 
     def make_limit_rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
         """Return (rows, bounds): the finite limits of means and total as rows @ powers.ravel() <= bounds.

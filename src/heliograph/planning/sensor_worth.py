@@ -119,7 +119,7 @@ def worth_of_sensors(
 
     Raises:
         ValueError: a node that is not there, an outage longer than the run, an addition of a name that is taken, nodes
-            or additions with triggers or words, relays that filter, a single run.
+            or additions with triggers, words or feedback, relays that filter, a single run.
     """
     instance("network", network, Network, "a Network")
     nodes, added = _require_plain_nodes(network), table("additions", additions or {}, "nodes")
@@ -170,7 +170,7 @@ def _make_error_of_case(
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
     """Return the nodes; raise ValueError unless each receives one sensor over one link.
 
-    Relays that filter, nodes that share a channel, triggers and encoders are refused.
+    Relays that filter, nodes that share a channel, triggers, encoders and feedback are refused.
     """
     if network.relays is not None or network.common is not None:
         raise fail("network", "nodes that receive sensors through channels of their own", "relays that filter")

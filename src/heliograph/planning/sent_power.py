@@ -96,8 +96,8 @@ def power(
         moment grows at each step in the long run, NaN for other plants and where a sensor has feedback.
 
     Raises:
-        ValueError: no horizon for a plant that is not stable or not linear, or for a sensor with feedback; inputs of
-            another shape, or without a horizon; a sender that decides when to transmit.
+        ValueError: no horizon for a plant that is not stable or not linear, or for a sensor with feedback; one whose
+            link erases; inputs of another shape, or without a horizon; a sender that decides when to transmit.
     """
     instance("network", network, Network, "a Network").check_sends_each_step("power before any data")
     if horizon is None and inputs is not None:
@@ -187,9 +187,17 @@ def _list_sources(network: Network) -> Sources:
 
 
 def _find_feedback_filters(network: Network) -> dict[str, AbstractFilter]:
-    """Return by node the filter that sends its prediction back to the node's sensor, of nodes with one."""
+    """Return by node the filter that sends its prediction back to the node's sensor, of nodes with one.
+
+    Raises:
+        ValueError: a link that erases, after which a prediction is worse, and so more is sent.
+    """
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    return {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
+    informed = {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
+    for name in informed:
+        if not nodes[name].complete:
+            raise fail(f"power of {name!r}, a sensor with feedback", "a link that loses nothing", "one that erases")
+    return informed
 
 
 def _compute_innovation_moments(

@@ -29,17 +29,20 @@ UNCHANGED = 1e-12  # change of a law in a step that counts as none
 def require_plain_senders(what: str, nodes: Mapping[str, object]) -> None:
     """Raise ValueError unless all senders among the nodes transmit what they measure, at each step.
 
-    One with a trigger is silent at times, and one with an encoder sends words, which are rounded: what is designed for
-    numbers at each step is not true of them.
+    One with a trigger is silent at times, one with an encoder sends words, which are rounded, and one with feedback
+    sends a difference, whose power is that of an error: what is designed for what is measured is not true of them.
 
     Args:
         what: what needs such senders, for the message.
         nodes: nodes of a network by name.
     """
     for name, node in nodes.items():
-        if isinstance(node, Node) and (node.trigger is not None or node.encoder is not None):
-            got = "words" if node.trigger is None else "a trigger"
-            raise fail(f"node {name!r} of {what}", "a sensor that sends what it measures at each step", got)
+        if not isinstance(node, Node):
+            continue
+        differences = {"a trigger": node.trigger, "words": node.encoder, "feedback": node.informed_by}
+        for got, difference in differences.items():
+            if difference is not None:
+                raise fail(f"node {name!r} of {what}", "a sensor that sends what it measures at each step", got)
 
 
 def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment | None = None) -> AbstractRandomAffine:

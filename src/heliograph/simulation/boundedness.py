@@ -74,30 +74,32 @@ def certify_boundedness(network: Network) -> Boundedness:
     impossible.
     Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
     are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
-    Some nodes use a message only if a trigger, limits or `stuck` allow it. Certified is what holds without these nodes.
-    Impossible is what holds even if they send everything. All else is undecided.
+    Some nodes use a message only if a trigger, limits or `stuck` allow it, and some send words, which end at their
+    range. Certified is what holds without these nodes. Impossible is what holds even if they send everything. All else
+    is undecided.
 
     Args:
         network: linear, of nodes that receive their sensors over channels that do not vary.
 
     Raises:
         ValueError: a plant, sensor or channel that varies or is not linear, a channel that delivers late or tells its
-            gain, relays that filter, too many sets of losses.
+            gain, relays that filter, a sensor with feedback, too many sets of losses.
 
     Source: Sinopoli et al. (2004), Theorems 2 to 5; Xie and Xie, Stability of a random Riccati equation with Markovian
         binary switching (2008); Liu and Goldsmith, Kalman filtering with partial observation losses (2004).
     """
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
-    chosen = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.chosen_by_value]
+    senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    chosen = [name for name, node in senders.items() if node.disturbs_what_is_sent]
     found = _judge_links(network, a, q, find_joint_links(network, len(a), counts_all=False))
     if not chosen or found.verdict == "certified":
         return found
-    # Nodes that choose by value certify nothing. An error that grows even if they sent everything grows in any case.
+    # Such nodes certify nothing. An error that grows even if they sent everything grows in any case.
     complete = _judge_links(network, a, q, find_joint_links(network, len(a), counts_all=True))
     if complete.verdict == "impossible":
         return complete
-    unjudged = f"what nodes {chosen} show is not counted, as values decide what of it is used"
+    unjudged = f"what nodes {chosen} show is not counted, as values, or the range of words, decide what of it is used"
     return found._replace(verdict="undecided", reason=f"{found.reason}; {unjudged}")
 
 

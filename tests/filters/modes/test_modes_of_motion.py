@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -248,6 +249,23 @@ def test_what_does_not_fit_is_refused_in_one_line(build, said):
     with pytest.raises(ValueError, match=said) as error:
         build(*models())
     assert "\n" not in str(error.value)
+
+
+def test_the_law_of_the_start_has_derivatives_as_no_trace_can_compare_the_models():
+    def log_likelihood(start):
+        plants = [
+            hg.LinearPlant(f, q, start * jnp.ones(2), start * jnp.eye(2)) for f, q in zip(MATRICES, NOISES, strict=True)
+        ]
+        return hg.log_likelihood(hg.filters.imm_filter(hg.markov_plant(plants, ROWS, START), SENSOR, LINK), DATA)
+
+    with jax.enable_x64(True):
+        slope = jax.grad(log_likelihood)(0.7)
+        central = (log_likelihood(0.7 + 1e-4) - log_likelihood(0.7 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(slope, central, rtol=1e-6)  # the square of the step, and rounding over it
+    mixed = [hg.LinearPlant(MATRICES[0], NOISES[0], [0.0, 0.0], np.eye(2))]
+    with pytest.raises(ValueError, match="law of x_0 of model 1"):  # one of both is known: it is not the other
+        jax.grad(lambda p: hg.markov_plant([*mixed, hg.LinearPlant(MATRICES[1], NOISES[1], [0.0, 0.0], p * np.eye(2))],
+                                           ROWS).initial_covariance.sum())(1.0)  # fmt: skip
 
 
 def test_a_frozen_sensor_repeats_what_it_last_measured():

@@ -25,12 +25,14 @@ class LagrangeConditions(NamedTuple):
     """Lagrange's conditions at a point: the value, what they leave of it, and a watt's worth.
 
     residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
-    numbers' own size. worth: the error that one more watt takes away at each step of each transmitter.
+    numbers' own size. worth: the error that one more watt takes away at each step of each transmitter, where its own
+    limits rise too; price: that of a watt more of the total, or of one transmitter where no total limits.
     """
 
     value: float
     residual: float
     worth: Float[np.ndarray, "time hops"]
+    price: float
 
 
 def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
@@ -59,7 +61,8 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     present = problem.solve_at(problem.numbers.start)
     problem.check_ends()
     # The best of descents from the start, and from points that are drawn.
-    limits = _make_limit_rows(_limit_all_powers(problem, task.budget), target)
+    allowed = _limit_all_powers(problem, task.budget)
+    limits = _make_limit_rows(allowed, target)
     draws = np.random.default_rng(seed)
     points = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
     descent = problem.descent_problem()
@@ -68,14 +71,13 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         raise _make_unmet_limits_error(descent, limits, points)
     # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound. With a
     # target what was minimised is the power, else the error.
-    found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best)
+    has_total = bool(np.isfinite(allowed.total))
+    found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best, has_total)
     network, error = problem.network(best), problem.criterion.compute_exact_error(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
     )
-    # price: the error that a watt more at every step takes away, given to one transmitter: the largest worth, times
-    # the steps.
     return PowerDesign(
         problem=task,
         powers=dict(zip(problem.names, found.powers.T, strict=True)),
@@ -84,7 +86,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         present=problem.criterion.compute_exact_error(present.covariances),
         covariance=found.covariances,
         sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
-        price=float(np.max(conditions.worth, initial=0.0) * limits.steps),
+        price=conditions.price,
         numbers=problem.numbers.split_by_name(best),
         realised=repeat_network(network) if task.criterion.period > 1 else network,
     )
@@ -148,7 +150,9 @@ def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimit
     return fail("budget", expected, "none that is")
 
 
-def evaluate_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector) -> LagrangeConditions:
+def evaluate_lagrange_conditions(
+    problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector, has_total: bool
+) -> LagrangeConditions:
     """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
 
     The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
@@ -157,6 +161,7 @@ def evaluate_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorL
         problem: the function of the free numbers that is minimised, their ranges and units.
         limits: upper limits of powers, and the target error where there is one (then the power is minimised).
         x: values of the free numbers.
+        has_total: whether the last of the limits of powers is that of the total.
     """
     # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
     programme, z = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
@@ -170,15 +175,20 @@ def evaluate_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorL
     if normals:
         solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
         multipliers[reached] = solution[: int(reached.sum())]
-    # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power.
-    worth = limits.rows.T @ multipliers[: len(limits.most)] * programme.size
+    # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power; of the total's
+    # alone that of a watt more of the total. A watt at every step, sent at one step, is worth `steps` times as much.
+    worths = limits.rows * multipliers[: len(limits.most), None] * programme.size  # (limits, time and hops)
+    worth = worths.sum(axis=0)
+    price = np.max(worths[-1] if has_total else worth, initial=0.0) * limits.steps
     if limits.target is not None:
         # With a target the value is the mean power. A watt at one step costs 1 / steps of it, and what limits add
         # (`worth`). Divided by the target's multiplier, power per error, that is the error that the watt takes away.
         power_per_error = multipliers[-1] * programme.size / limits.target
         worth = (worth + 1 / limits.steps) / power_per_error if power_per_error > 0 else np.zeros_like(worth)
+        price = 1 / power_per_error if power_per_error > 0 else 0.0
     return LagrangeConditions(
         value=value * programme.size,
         residual=residual / max(value, 1e-300),
         worth=worth.reshape(limits.steps, -1),
+        price=float(price),
     )

@@ -104,8 +104,6 @@ def list_sources(network: Network) -> dict[str, SensorAndChannel]:
         if not isinstance(sensor, LinearSensor) or channel.past:
             got = "a channel with delays" if isinstance(sensor, LinearSensor) else type(sensor).__name__
             raise fail(f"node {name!r}", "a LinearSensor and a channel without delays", got)
-        if name in nodes and nodes[name].informed_by is not None:
-            raise fail(f"node {name!r}", "a sensor without feedback", "one that receives a filter's estimate")
         refuse_angles("design", sensor)
     return sources
 

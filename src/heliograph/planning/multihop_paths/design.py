@@ -33,7 +33,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
     value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
     _, tangent_value, _ = problem.make_support(powers)
-    stationarity = max(tangent_value - bound, 0.0) / value
+    stationarity = max(tangent_value - bound, 0.0) / value if value > 0 else 0.0  # 0: nothing is left to gain
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
         relaxed = task.relax_to_whole_paths()
@@ -154,8 +154,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
         present=present,
         covariance=task.problem.covariances(powers),
         sensitivity=dict(zip(paths.names, gradient.sum(axis=0).tolist(), strict=True)),
-        # A watt more at every step, sent at one step by one transmitter, is worth `steps` times a watt there.
-        price=float(np.max(-gradient[:, task.free] * len(gradient), initial=0.0)),
+        price=task.problem.limits.find_price(powers, -gradient[:, task.free], is_least_power=target is not None),
         numbers={},
         realised=None,
     )

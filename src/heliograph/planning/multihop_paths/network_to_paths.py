@@ -91,7 +91,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 
 
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, triggers or words."""
+    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders not plain."""
     if network.relays is not None:
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
@@ -241,8 +241,6 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
     # Lists, filled path by path and hop by hop.
     step = _PathsOfStep(rows=[], second=[], signal=[], kappa=[], alpha=[], powers=[], names=[], path=[])
     for name, node in nodes.items():
-        if node.informed_by is not None:
-            raise _make_no_paths_error("a sensor with feedback, whose power depends on the error")
         sensor, channel = at(node.sensor, k), at(node.channel, k)
         if not isinstance(sensor, LinearSensor):
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)

@@ -222,7 +222,8 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
     ]  # fmt: skip
     caption = (
         "**One more watt here**: by how much the error falls for one unit of mean power more at this transmitter; "
-        f"where a total binds, it is the same ({results.design.price:.3g}) for all that send, and less for the others."
+        f"where a total binds, it is the same ({results.design.price:.3g}) for all that send below limits of their "
+        "own, and less for those that do not send."
     )
     headers = ("transmitter", "as it is", "designed", "peak", "one more watt here")
     picture = Picture(drawings["powers"], "Bars of power by transmitter, with marks for what is sent now.")

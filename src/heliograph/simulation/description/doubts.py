@@ -166,13 +166,13 @@ def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[D
         return
     if boundedness.verdict == "impossible":
         yield Doubt(serious=serious, words=f"unbounded: {what} grows without end: {boundedness.reason}")
-    elif boundedness.verdict == "undecided" and not _is_chosen_by_value(network):
+    elif boundedness.verdict == "undecided" and not _has_undecided_senders(network):
         yield Doubt(serious=False, words=f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
-def _is_chosen_by_value(network: Network) -> bool:
-    """Return whether values decide what some node uses, by a trigger or by limits: then all else is undecided."""
-    return any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
+def _has_undecided_senders(network: Network) -> bool:
+    """Return whether values decide what some node uses, or words stand for it: then all else is undecided."""
+    return any(isinstance(node, Node) and node.disturbs_what_is_sent for node in network.nodes.values())
 
 
 def _doubt_useless_links(network: Network) -> Iterator[Doubt]:

@@ -44,12 +44,12 @@ def find_joint_links(network: Network, states: int, counts_all: bool) -> JointLi
     Args:
         network: the network.
         states: number of the plant's.
-        counts_all: False to take nodes of which values decide what is used for silent: what a trigger, limits or
-            `stuck` hold back is no loss of a known probability.
+        counts_all: False to take nodes for silent of which values decide what is used, or words stand for it: what a
+            trigger, limits, `stuck` or the range of words hold back is no loss of a known probability.
 
     Raises:
-        ValueError: no node that receives a sensor; relays that filter; channels that vary, deliver late or have
-            uncertain probabilities.
+        ValueError: no node that receives a sensor; relays that filter; a sensor with feedback; channels that vary,
+            deliver late or have uncertain probabilities.
     """
     if network.relays is not None:
         raise fail("nodes", "ones that receive the sensors over channels", "relays that filter")
@@ -57,12 +57,15 @@ def find_joint_links(network: Network, states: int, counts_all: bool) -> JointLi
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     if not nodes:
         raise fail("nodes", "at least one that receives a sensor", "none")
+    # A random gain multiplies what is sent, with feedback an error and not the state.
+    if any(node.informed_by is not None for node in nodes):
+        raise fail("nodes", "sensors without feedback", "one that a filter's prediction is fed back to")
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
     means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
     channels = [_read_constant_channel(node.channel) for node in nodes]
     if not counts_all:
         channels = [
-            erasure(redraw_modes_each_step(channel), 0.0) if node.chosen_by_value else channel
+            erasure(redraw_modes_each_step(channel), 0.0) if node.disturbs_what_is_sent else channel
             for node, channel in zip(nodes, channels, strict=True)
         ]
     # Channels in parallel, as one chain of modes.
