@@ -276,7 +276,8 @@ class Timeline:
         They are filtered estimates after each row, in order of time. Without calls only the last 2 * `capacity` stay.
         """
         time, outputs = self._finals.take_all()
-        return Record(time, self.network.states, truth=None, measurements={}, estimates=self._arrange_outputs(outputs))
+        estimates = estimates_by_name(self._program, outputs)
+        return Record(time, self.network.states, truth=None, measurements={}, estimates=estimates)
 
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
@@ -294,7 +295,8 @@ class Timeline:
         self._finals.add(time, outputs)
         plant = np.frombuffer(pack_plant(self._plant, self._fleet), np.uint8)
         arrays = {"plant": plant, "final.time": time, "final": outputs}
-        return {"options": [self.window, self.ahead, self.capacity], "gated": self._gates.pack()}, arrays
+        options = [self.window, self.ahead, self.capacity]
+        return {"options": options, "gated": self._gates.pack(), "reasons": self.reasons}, arrays
 
     @classmethod
     def restore(cls, network: Network, data: bytes, accept_changes: bool = False) -> "Timeline":
@@ -367,6 +369,7 @@ class Timeline:
         new._plant = unpack_plant("", arrays["plant"].tobytes(), new._fleet)
         new._remarks.note_said(new._plant)
         new._gates.unpack(head.get("gated", []))  # absent until version 0.4.0
+        new.reasons = dict(head.get("reasons", {}))  # absent until version 0.5.0
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 
@@ -394,7 +397,3 @@ class Timeline:
             self._finals.add(np.array([row.key[0] for row in with_data]), outputs)
             self._gates.count_weights_of_zero(outputs)
         self._fleet.free_slots(results)
-
-    def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-        """Return the estimates in the outputs of a row, or of rows, by node and filter."""
-        return estimates_by_name(self._program, outputs)
