@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.files.tables.table import read_table, write_table
 from heliograph.numerics import format_dates, parse_dates
+from heliograph.numerics.times.row_times import read_dates
 from heliograph.serving import Message
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
@@ -168,6 +169,43 @@ def test_a_column_of_dates_in_a_table_is_dates(tmp_path):
     np.testing.assert_array_equal(read_table(tmp_path / "u.parquet")["when"], result["when"])
 
 
+FIRST, LAST = "1678-01-01T00:00:00Z", "2262-04-11T23:47:16.854775807Z"  # the last one in 64 bits of nanoseconds
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_all_dates_that_are_written_are_read(tmp_path, ending):
+    dates = np.array([FIRST[:-1], "2262-01-01", "2262-04-11T23:47:16", LAST[:-1]], "datetime64[ns]")
+    write_table({"time": dates, "pos": np.arange(4.0)}, tmp_path / f"t{ending}")
+    np.testing.assert_array_equal(read_table(tmp_path / f"t{ending}")["time"], dates)
+
+
+@pytest.mark.parametrize("text", [FIRST, LAST, "2262-04-12T01:00:00+02:00", "1677-12-31T20:00:00-04:00", "2262-04-11"])
+def test_dates_up_to_the_ends_of_64_bits_are_read(text):
+    (moment,) = parse_dates([text], "time")
+    zone = text[-6:] if text[-6] in "+-" and text[-3] == ":" else "+00:00"
+    local = np.datetime64(text.removesuffix(zone).removesuffix("Z"), "us")
+    behind = np.timedelta64(int(zone[:3]) * 60, "m")
+    assert moment.astype("datetime64[us]") == local - behind
+    for unit in ("us", "ms", "s"):  # the same rule for arrays: dates in this unit within the ends
+        date = moment.astype(f"datetime64[{unit}]")
+        assert read_dates("time", np.array([date]))[0] == date
+
+
+@pytest.mark.parametrize("text", ["1677-12-31T23:59:59.999999999Z", "2262-04-11T23:47:16.854775808Z",
+                                  "2262-04-11T23:00:00-01:00", "1678-01-01T00:00:00+01:00", "2262-04-12"])  # fmt: skip
+def test_dates_beyond_64_bits_are_refused_at_every_door(text):
+    expected = "from 1678 to 2262-04-11"
+    with pytest.raises(ValueError, match=f"^time, row 1: expected a date as .*{expected}, to the nanosecond"):
+        parse_dates([text], "time")
+    if text.endswith("Z"):
+        with pytest.raises(ValueError):
+            Message(node="a", sequence=0, time=text)
+    for unit, beyond in (("Y", "1677"), ("M", "2262-05"), ("D", "2262-04-12"), ("us", "1677-12-31T23:59:59.999999"),
+                         ("us", "2262-04-11T23:47:16.854776"), ("W", "2262-04-17"), ("s", "1500-01-01"), ("ns", "1677-12-31")):  # fmt: skip
+        with pytest.raises(ValueError, match=f"^time: expected dates {expected}, got {beyond[:4]}"):
+            read_dates("time", np.array([beyond, "NaT"], f"datetime64[{unit}]"))
+
+
 @settings(max_examples=100, derandomize=True)
 @given(moment=MOMENTS, zone=ZONES, space=st.booleans())
 def test_an_instant_is_the_date_that_python_says(moment, zone, space):
@@ -206,7 +244,7 @@ def test_basic_dates_and_leap_seconds_are_read(text, same):
 
 @pytest.mark.parametrize("text", ["2016-12-31T22:59:60Z", "2016-12-30T23:59:60Z", "2016-12-31T23:59:60.1234567891Z"])
 def test_other_sixtieth_seconds_and_finer_than_nanoseconds_are_refused(text):
-    with pytest.raises(ValueError, match=r"^time, row 1: expected a date as .*, from 1678 to 2261, to the nanosecond"):
+    with pytest.raises(ValueError, match=r"^time, row 1: expected a date as .*, from 1678 to 2262-04-11, to the nanosecond"):
         parse_dates([text], "time")
 
 

@@ -83,6 +83,36 @@ def test_times_keep_every_nanosecond(value, unit, expected):
     assert convert_time(value, unit, "t") == expected
 
 
+SECONDS = "1700000000.123456789"  # doubles are 2.4e-7 apart there
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t.jsonl", f'{{"ts": {SECONDS}, "p": 1}}'),
+        ("t.jsonl", f'{{"ts": {SECONDS}, "p": nan}}'),
+        ("t.csv", f"ts,p\n{SECONDS},1"),
+        ("log.jsonl", f'{{"topic": "t.csv", "payload": {{"ts": {SECONDS}, "p": 1}}}}'),
+        ("log.jsonl", f'{{"topic": "t.csv", "payload": "{{\\"ts\\": {SECONDS}, \\"p\\": 1}}"}}'),
+        ("log.txt", f"{SECONDS} u {{\"p\": 1}}"),
+        ("log.csv", f"topic,timestamp,payload\nu,{SECONDS},\"{{\"\"p\"\": 1}}\""),
+    ],
+)
+def test_seconds_with_nine_decimals_keep_every_nanosecond(tmp_path, name, text):
+    (tmp_path / name).write_text(f"{text}\n")
+    sources = dict.fromkeys(("t.jsonl", "t.csv"), json_field("p", "garden", output="in", time="ts"))
+    sources["u"] = json_field("p", "garden", output="in")
+    events = hg.files.read_messages(tmp_path / name, NETWORK, sources)
+    assert len(events) == 1 and str(events.date) == "2023-11-14T22:13:20.123456789"
+
+
+def test_a_count_with_many_digits_keeps_them():
+    """2^53 + 1 is the first whole number that no double is."""
+    content = '{"ts": 1, "p": 1, "n": 9007199254740993.0}'
+    source = json_field("p", "garden", output="in", time="ts", sequence=hg.files.Count("n"))
+    assert read(source, decode_json(content, "t")).sequence == 2**53 + 1
+
+
 @pytest.mark.parametrize(
     "value", ["2023-11-14T22:13:20", "noon", True, None, np.nan, SimpleNamespace(sec=0, nanosec=0), 1e300]
 )

@@ -80,7 +80,7 @@ def test_values_beyond_limits_count_as_not_arrived():
     assert timeline.refused == {"a": {"limits": 1, "code": 3, "stuck": 0}}
     assert timeline.counts["a"]["implausible"] == 1
     again = hg.Timeline.restore(network, timeline.save())
-    assert again.refused == timeline.refused
+    assert again.refused == timeline.refused and again.reasons == timeline.reasons != {}
     with pytest.warns(UserWarning, match="node 'a': . of 10 values count as not arrived, by") as said:
         record = hg.run(network, {"a": z})
     assert [str(warning.message).partition(", by ")[2] for warning in said] == [

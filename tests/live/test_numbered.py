@@ -1,5 +1,7 @@
 """A sender whose transmissions are numbered: how many were lost before a value is what its running count says."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,41 @@ def test_a_count_of_messages_does_not_say_which_components_were_lost():
     with pytest.raises(ValueError, match="behind each value how many of its component were lost"):
         line.push("a", 0, 0, [0.2, 0.3])
     assert line.push("a", 0, 0, [0.2, np.nan, 0, np.nan]) == "used"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("losses", ["known", "numbered"])
+def test_a_value_that_is_refused_was_sent_and_is_no_silence(losses):
+    """Silence after 1.0 says that y stayed within 0.6 of it: the variance at the next value would be 0.053.
+
+    Where losses are known, a value that is refused is one that was lost. Where they are numbered, its number says that
+    it came, so that more is known than of a lost one, of which the next number tells too late.
+    """
+    plant, sensor = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5), hg.LinearSensor([[1.0]], 0.1)
+    link, rule = hg.erasure(hg.perfect(), 0.8), hg.SendOnDelta(0.6, heartbeat=6, losses=losses)
+    filters = {"event": hg.event_filter(plant, sensor, link, rule)}
+    network = hg.Network(plant, {"a": hg.Node(sensor, link, filters, trigger=rule, limits=(-50, 50), invalid=-999)})
+    nothing = 0.0 if losses == "known" else np.nan
+    z = np.array([[np.nan, nothing]] * 7)
+    z[[0, 3, 6]] = [1.0, 0.0], [-999.0, 0.0], [1.2, 0.0]
+    lost = z.copy()
+    lost[3] = [np.nan, 1.0] if losses == "known" else [np.nan, np.nan]
+    lost[6, 1] = 0.0 if losses == "known" else 1.0
+    timeline, stream = hg.Timeline(network, 20.0), hg.Stream(filters["event"], limits=(-50, 50), invalid=-999)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is refused is said
+        refused, implausible, told = (
+            hg.run(network, {"a": rows}).estimates["a"]["event"] for rows in (z, np.where(z == -999, 1e20, z), lost)
+        )
+        pushed = [stream.push(row) for row in z]
+    assert [timeline.push("a", k, k, z[k]) for k in (0, 3, 6)] == ["used"] * 3
+    assert (
+        refused.covariance[3, 0, 0] > 2 * refused.covariance[2, 0, 0]
+    )  # it left the interval: where it is now is open
+    np.testing.assert_array_equal(refused.covariance, implausible.covariance)
+    for other in (pushed[-1], timeline.estimates()["a"]["event"]):  # compiled apart: rounding only
+        np.testing.assert_allclose(other.covariance, refused.covariance[-1], rtol=1e-9)
+        np.testing.assert_allclose(other.mean, refused.mean[-1], rtol=1e-9)
+    if losses == "known":
+        np.testing.assert_array_equal(refused.covariance, told.covariance)
+    assert refused.covariance[-1, 0, 0] > 0.1 < told.covariance[-1, 0, 0]

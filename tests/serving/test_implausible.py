@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.serving.service import Service
-from heliograph.serving.storage import InMemoryStore
+from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 from tests.serving.test_service import finals, served
 from tests.serving.worlds import HOP, SENSOR, fleet, lines, messages, moving, stepping
 
@@ -67,6 +66,43 @@ def test_of_a_message_its_inputs_or_its_values_are_refused_alone():
         assert refused["reason"] == "implausible" and refused["sequence"] == 1
         assert ("; the rest is used" in refused["detail"]) == (which == "inputs")
         assert service.plants["p"].links["inputs" if which == "inputs" else "a"].implausible == 1
+
+
+def test_inputs_that_are_dropped_are_said_beside_a_measurement_that_is_used():
+    """Two nodes that say the same inputs of a step say nothing new; other inputs are a conflict, and the first stay."""
+    first = {"plant": "p", "node": "a", "sequence": 7, "time": 0, "values": [0.3], "inputs": [0.1]}
+    second = first | {"node": "b", "sequence": 3}
+    for inputs, reasons in (([0.1], []), ([None], []), ([0.2], ["conflict"])):
+        service, known = served(stepping(), lines([first, second | {"inputs": inputs}]), 1)
+        refused = [item for item in known if item["kind"] == "refused"]
+        assert [item["reason"] for item in refused] == reasons, inputs
+        counts = service.plants["p"].links
+        assert counts["b"].used == 1 and (counts["inputs"].conflict if reasons else 0) == len(reasons)
+    assert refused[0]["node"] == "b"
+    assert refused[0]["detail"] == "inputs [0.2]: held already with other values, which stay; the rest is used"
+    # In continuous time inputs stand before the measurements of their moment, of which one is final here.
+    late = [first, first | {"sequence": 8, "time": 9.0}, second | {"inputs": [0.4]}]
+    _, known = served(moving(), lines(late), 1)
+    refused = [item for item in known if item["kind"] == "refused"]
+    assert [(item["reason"], item["detail"][:12]) for item in refused] == [("late", "inputs [0.4]")]
+
+
+def test_what_is_late_is_late_whatever_its_value():
+    """As on a timeline: the first verdict that holds."""
+    plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5)
+    node = hg.Node(SENSOR, HOP, {"linear": hg.linear_filter(plant, SENSOR, HOP)}, limits=(-5, 5))
+    network = hg.Network(plant, {"a": node})
+    pushes = [(0, 0.0, 1.0), (1, 3.0, 1.0), (2, 20.0, 1.0), (3, 21.0, 7.0), (4, 1.0, 7.0), (2, 20.0, 7.0)]
+    timeline = hg.Timeline(network, 5.0)
+    verdicts = [timeline.push("a", sequence, time, [value]) for sequence, time, value in pushes]
+    assert verdicts == ["used", "used", "used", "implausible", "late", "conflict"]
+    service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore())
+    sent = [{"node": "a", "sequence": sequence, "time": time, "values": [value]} for sequence, time, value in pushes]
+    known = [json.loads(output.body) for output in service.take(lines(sent))]
+    assert [item["reason"] for item in known if item["kind"] == "refused"] == verdicts[3:]
+    assert {verdict: getattr(service.plants[""].links["a"], verdict) for verdict in verdicts} == {
+        verdict: timeline.counts["a"][verdict] for verdict in verdicts
+    }
 
 
 def test_limits_hold_here_too_and_it_is_said_once():

@@ -287,9 +287,9 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
         return check_dates("horizons", last + ahead)
     if np.isnan(spacing):
         return np.full((*end.shape[:-1], len(distances)), np.datetime64("NaT", "ns"))
-    # Whole seconds first, in which no date overflows, then what is left of one: nanoseconds end in 2262.
-    seconds = np.minimum(spacing * distances, FARTHEST)
+    # Whole seconds first, in which no date overflows, then the rest, less than two: nanoseconds end in 2262.
+    seconds, rounded_up = np.minimum(spacing * distances, FARTHEST), np.timedelta64(2, "s")
     last, whole = end.astype("datetime64[s]"), np.floor(seconds)
-    dates = check_dates("horizons", last + whole.astype(np.int64).astype("timedelta64[s]"))
+    dates = check_dates("horizons", last + whole.astype(np.int64).astype("timedelta64[s]") + rounded_up) - rounded_up
     rest = np.round(SECOND * (seconds - whole)).astype(np.int64).astype("timedelta64[ns]")
     return np.asarray(dates + (end.astype("datetime64[ns]") - last) + rest)

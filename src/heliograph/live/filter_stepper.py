@@ -21,6 +21,7 @@ from heliograph.live.stored.snapshot import Identity, list_versions
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import JudgedEstimate
 from heliograph.model.over_time import first
+from heliograph.model.readings.reading_limits import ScreenedReadings
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.float64 import understood
@@ -284,8 +285,8 @@ class CompiledFilter:
         # Sizes of z and u, and how many numbers of z are measured values.
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
-        self.values = 0
-        if sender := find_deciding_sender(filter):  # behind its values come the numbers of messages lost before each
+        self.values, self.sender = 0, find_deciding_sender(filter)
+        if sender := self.sender:  # behind its values come the numbers of messages lost before each
             self.values = filter.received - sender.trigger.side_information(sender.outputs)
         # The filter in double precision, as its arrays and all that is no array; its initial state.
         with jax.enable_x64(True):
@@ -310,6 +311,14 @@ class CompiledFilter:
         # The NIS (e' S^-1 e of the innovation) of a filter whose covariance is true is chi-square, with as many degrees
         # of freedom as numbers arrived. The values that it rarely exceeds, by that number; none if nothing arrived.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
+
+    def leave_out_refused(
+        self, z: Float[np.ndarray, " received"], screened: ScreenedReadings
+    ) -> Float[np.ndarray, " received"]:
+        """Return a measurement without the readings that were refused; a sender that decides sent them all the same."""
+        if self.sender is None:
+            return screened.values[0]
+        return self.sender.trigger.leave_out_refused(z, screened.refused[0] > 0, self.sender.outputs)
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
         """Return a new stepper whose state is the prior (`_start`).

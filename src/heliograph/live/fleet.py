@@ -214,9 +214,11 @@ class Fleet:
         if not screened.refused.any():
             return ScreenedEvent(event, repeats=screened.repeats)
         why = limits.describe_missing(values, screened.refused[0], self.network.nodes[node].received_names)
-        what_is_left = event._replace(values=screened.values[0].tolist())
+        left, trigger = screened.values[0], self.deciding.get(node)
+        if trigger is not None:
+            left = trigger.leave_out_refused(values, screened.refused[0] > 0, len(self.network.nodes[node].outputs))
         counts = {reason: int(count.sum()) for reason, count in count_by_reason(screened.refused).items()}
-        return ScreenedEvent(what_is_left, counts, why, screened.repeats)
+        return ScreenedEvent(event._replace(values=left.tolist()), counts, why, screened.repeats)
 
     def take_event(
         self, plant: PlantState, event: CheckedEvent, arrival_known: bool = False, wall: float | None = None,
@@ -357,8 +359,7 @@ class Fleet:
             if by_steps and last is not None:
                 last = int(last) if last >= 0 else None
             status = rule.find_status(last, plant.begun if rule.trigger is None else -1, final, now)
-            refused = {} if link is None else link.refused
-            statuses[name] = status._replace(refused=refused, unit=unit)
+            statuses[name] = status._replace(refused={} if link is None else link.refused, unit=unit)
         return statuses
 
     def count_event(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:

@@ -105,6 +105,12 @@ class SortedRows:
         would_overwrite = any(old == old and new == new for old, new in zip(numbers_held, event.values, strict=True))
         return "conflict" if would_overwrite else "used"
 
+    def holds_values(self, event: CheckedEvent) -> bool:
+        """Return whether the row of an event has all its values, that are not NaN, already."""
+        _, row = self.find_row(self.make_key(event))
+        held = [] if row is None else row.numbers[self.columns_by_node[event.node_index]]
+        return row is not None and all(new != new or new == old for old, new in zip(held, event.values, strict=True))
+
     def find_row(self, key: Key) -> tuple[int, HeldRow | None]:
         """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:

@@ -127,7 +127,7 @@ class Stream:
         # Values beyond the limits, or repeated for too long, count as not arrived.
         screened = None if self.limits is None else self.limits.screen(z[None], self._repeats)
         if screened is not None:
-            z = screened.values[0]
+            z = compiled.leave_out_refused(z, screened)
         if compiled.horizon is not None and k >= compiled.horizon:
             raise fail("step", f"one of the {compiled.horizon} that the filter covers, counted from 0", k)
         # The step itself; one that was flagged is either refused by an error or accepted.

@@ -293,7 +293,8 @@ class Timeline:
         self._finals.add(time, outputs)
         plant = np.frombuffer(pack_plant(self._plant, self._fleet), np.uint8)
         arrays = {"plant": plant, "final.time": time, "final": outputs}
-        return {"options": [self.window, self.ahead, self.capacity], "gated": self._gates.pack()}, arrays
+        options = [self.window, self.ahead, self.capacity]
+        return {"options": options, "gated": self._gates.pack(), "reasons": self.reasons}, arrays
 
     @classmethod
     def restore(cls, network: Network, data: bytes, accept_changes: bool = False) -> "Timeline":
@@ -366,6 +367,7 @@ class Timeline:
         new._plant = unpack_plant("", arrays["plant"].tobytes(), new._fleet)
         new._remarks.note_said(new._plant)
         new._gates.unpack(head.get("gated", []))  # absent until version 0.4.0
+        new.reasons = dict(head.get("reasons", {}))  # absent until version 0.5.0
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 

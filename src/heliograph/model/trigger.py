@@ -11,7 +11,7 @@ from heliograph.numerics.check import TINY, array, check_count, covariance, fail
 from heliograph.numerics.domains import POSITIVE, report_domain
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import is_traced
-from heliograph.numerics.types import Array, ArrayLike, Float, Int
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 Reference = Literal["sent", "acknowledged", "prediction", "zero"]
 Region = Literal["box", "ball", "each"]
@@ -72,6 +72,28 @@ class AbstractTrigger(Module):
         if self.losses == "unknown":
             return 0
         return outputs if self.region == "each" else 1
+
+    def leave_out_refused(
+        self, z: Float[np.ndarray, "*rows received"], refused: Bool[np.ndarray, "*rows received"], outputs: int
+    ) -> Float[np.ndarray, "*rows received"]:
+        """Return what was received without the readings that are refused, although they were sent.
+
+        A message of which no value is left counts as lost where losses are "known". Where they are "numbered" its
+        number stays, without a value: it came. Where they are "unknown" it cannot be told from silence.
+
+        Args:
+            z: what was received, the numbers about losses last.
+            refused: which of it is refused.
+            outputs: number of outputs of the sensor.
+        """
+        left = np.where(refused, np.nan, z)
+        if self.losses == "known":
+            count = z.shape[-1] - self.side_information(outputs)
+            came, stays = ~np.isnan(z[..., :count]), ~np.isnan(left[..., :count])
+            if self.region != "each":  # all values are one message
+                came, stays = came.any(axis=-1, keepdims=True), stays.any(axis=-1, keepdims=True)
+            left[..., count:] = np.where(came & ~stays, 1.0, left[..., count:])
+        return left
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
         """Decide for each component whether error = y - reference, (m,), makes it be sent at step k."""

@@ -17,6 +17,7 @@ from heliograph.live.plant_state import PlantState
 from heliograph.live.undoable_changes import WithdrawnEvent
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
+from heliograph.serving.refusals import WHY
 
 
 class MessageOutcome(NamedTuple):
@@ -26,13 +27,14 @@ class MessageOutcome(NamedTuple):
         plant: its plant; None if it began none.
         verdict: the verdict on it; None if it could not be read.
         why: the reason, where it was not used; else "".
-        notes: on parts that were left out of a used message.
+        notes: on parts that were left out of a message that was used, or for another reason: the verdict on each, and
+            why.
     """
 
     plant: PlantState | None = None
     verdict: Verdict | None = None
     why: str = ""
-    notes: Sequence[str] = ()
+    notes: Sequence[tuple[Verdict, str]] = ()
 
 
 class PlantBeforeBatch(NamedTuple):
@@ -195,29 +197,34 @@ class BatchIntake:
             plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
         plant = self._note_plant_before_batch(plant, timed.at)
         # Inputs and measurement are used or refused independently.
-        notes = self._use_inputs(number, plant, message, timed, why_inputs)
-        verdict: Verdict = "implausible"
-        if not why:
-            verdict = self._give_to_plant(number, plant, message, screened.event, timed.clock)
+        notes = list[tuple[Verdict, str]]()
+        verdict_on_inputs = self._use_inputs(number, plant, message, timed, why_inputs)
+        verdict = self._give_to_plant(number, plant, message, screened.event, timed.clock, why)
         self.fleet.count_event(plant, message.node, screened, verdict)
+        # Inputs that share the measurement's verdict need no word of their own, unless they are what is implausible.
+        if verdict_on_inputs == "implausible" or verdict_on_inputs not in ("used", "duplicate", verdict):
+            notes.append((verdict_on_inputs, f"inputs {message.inputs}: {why_inputs or WHY[verdict_on_inputs]}"))
         if screened.why and verdict == "used":
-            notes.append(f"{screened.why}; the rest is used")
-        return MessageOutcome(plant, verdict, why, notes)
+            notes.append(("implausible", screened.why))
+        ending = "; the rest is used" if verdict == "used" else ""
+        notes = [(verdict_on_part, note + ending) for verdict_on_part, note in notes]
+        return MessageOutcome(plant, verdict, "" if verdict != "implausible" else why, notes)
 
     def _use_inputs(
         self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None
-    ) -> list[str]:
-        """Give the inputs beside a measurement to its plant, if there are any; return a note if they are refused.
+    ) -> Verdict:
+        """Give the inputs beside a measurement to its plant; return the verdict, "used" where there are none.
 
         `why_refused`: the reason if the inputs are implausible, else None. `timed`: the message's events with times.
         """
         if timed.inputs is None:
-            return []
-        if why_refused is None:
-            self._give_to_plant(number, plant, message, timed.inputs, timed.clock)
-            return []
-        plant.link_counts(INPUTS).implausible += 1
-        return [f"inputs {message.inputs}: {why_refused}; the rest is used"]
+            return "used"
+        verdict = self._give_to_plant(number, plant, message, timed.inputs, timed.clock, why_refused)
+        if verdict == "conflict" and plant.rows.holds_values(timed.inputs):  # two nodes say the same inputs
+            return "duplicate"
+        if verdict not in ("used", "duplicate"):
+            plant.link_counts(INPUTS).count_verdict(verdict)
+        return verdict
 
     def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> TimedEvents:
         """Return the events of a message, its measurement and inputs, with times as numbers of its plant."""
@@ -329,9 +336,17 @@ class BatchIntake:
         return plant
 
     def _give_to_plant(
-        self, number: int, plant: PlantState, message: AnyMessage, event: CheckedEvent, wall: float | None
+        self,
+        number: int,
+        plant: PlantState,
+        message: AnyMessage,
+        event: CheckedEvent,
+        wall: float | None,
+        why_implausible: str | None,
     ) -> Verdict:
         """Let the plant judge an event and return the verdict; note the event as taken if it is used.
+
+        One that is implausible changes nothing, and is called so if nothing else is wrong with it, as by a `Timeline`.
 
         Args:
             number: number of its message in the batch.
@@ -339,7 +354,13 @@ class BatchIntake:
             message: its message; the clock of the message's node dates the event.
             event: the event, a measurement or inputs.
             wall: time by the clock on the wall, None if it is not known.
+            why_implausible: why it is implausible, as is known already; None or "" where it is not.
         """
+        if why_implausible:
+            watermark = max(plant.confirmed, event.arrival) - self.fleet.options.window
+            key, ahead = plant.rows.make_key(event), self.fleet.options.ahead
+            verdict = plant.rows.judge_event(event, key, watermark, ahead)
+            return "implausible" if verdict == "used" else verdict
         is_dated = message.arrival is not None
         verdict = self.fleet.take_event(plant, event, is_dated, wall, message.node)
         if verdict == "used":

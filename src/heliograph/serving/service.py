@@ -217,8 +217,7 @@ class Service:
 
     def published(self, outputs: Sequence[Output]) -> None:
         """Note the largest number of these outputs, which were published; the next commit records it."""
-        numbers = [output.number for output in outputs if output.number is not None]
-        self._published = max(numbers, default=self._published)
+        self._published = max([each.number for each in outputs if each.number is not None], default=self._published)
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything; if messages have `ended` and there is no store, all rows become final."""
@@ -296,14 +295,15 @@ class Service:
     def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return a refusal for a message that was not used, and one for each part of a message that was left out.
 
-        `outcome.notes`: why inputs or values were left out as implausible. The first such message causes a warning.
+        `outcome.notes`: why inputs or values were left out. The first implausible message causes a warning.
         """
-        entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
+        parts = list(outcome.notes)
         if outcome.verdict is not None and outcome.verdict != "used":
-            entries.insert(0, make_refusal_of_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
-        if outcome.verdict == "implausible" or outcome.notes:
-            self._warn_of_implausible(message, outcome.why or outcome.notes[0])
-        return entries
+            parts.insert(0, (outcome.verdict, outcome.why or WHY[outcome.verdict]))
+        for verdict, why in parts:
+            if verdict == "implausible":
+                self._warn_of_implausible(message, why)
+        return [make_refusal_of_message(message, verdict, why) for verdict, why in parts]
 
     def _warn_of_implausible(self, message: AnyMessage, why: str) -> None:
         """Report the first implausible message by `_say`; later ones are not reported."""

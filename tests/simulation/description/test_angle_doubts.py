@@ -102,16 +102,19 @@ def test_an_attitude_that_is_known_too_roughly_is_said():
     network = tumbling(1.0)
     lines = said_before_data(network)
     assert [line.split("; ")[0] for line in lines] == [
-        f"wide angle: 'f' of 'n' starts with {axis!r} known to +- 1 rad" for axis in ("rx", "ry", "rz")
+        "wide angle: 'f' of 'n' starts with 'rx', 'ry', 'rz' known to +- 1 rad"
     ]
     assert all("turns so wide are no Gaussian about one attitude any more" in line for line in lines)
     nothing = np.full((3, 6), np.nan)
     with pytest.warns(UserWarning) as said:
         hg.run(network, {"n": nothing})
-    expected = "n/f: 'rx' is known to +- 1 rad in 3 of 3 rows, first in row 1; turns so"
+    expected = "n/f: 'rx', 'ry', 'rz' are known to +- 1 rad in 3 of 3 rows, first in row 1; turns so"
     assert sum(str(warning.message).startswith(expected) for warning in said) == 1
     watch = hg.simulation.WideAngles(network.nodes["n"].filters["f"])
-    assert [row for row, _ in watch.said_of(np.ones((2, 3)))] == [0, 0, 0]
+    one_axis = np.array([[0.01, 0.01, 0.01], [0.01, 4.0, 0.01]])
+    assert watch.said_of(one_axis[:1]) == [] and list(watch.states.values()) == ["rx", "ry", "rz"]
+    ((row, line),) = watch.said_of(one_axis)
+    assert row == 1 and line.startswith("'ry' is known to +- 2 rad; turns so wide") and watch.states == {}
     assert watch.said_of(np.ones((2, 3))) == []  # each once
     known = tumbling(0.3)
     assert not said_before_data(known)

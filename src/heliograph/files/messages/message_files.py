@@ -1,6 +1,5 @@
 """Messages in files of tables and of lines: rows of CSV and Parquet, JSON lines, logs of MQTT clients; also packed."""
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -28,7 +27,7 @@ class FileMessage(NamedTuple):
     Attributes:
         where: its place, for errors.
         topic: its topic; None for that of its file.
-        content: the message, decoded; its payload as text where it is of a log.
+        content: the message, decoded; of a log its payload, as text where it is text there.
         arrival: when it arrived, as the file says it; None if it does not.
         stored: whether the broker had stored it for new subscribers.
     """
@@ -92,16 +91,14 @@ def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
     return None if match is None else (match["topic"], match["payload"], match["arrival"])
 
 
-def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
+def read_log_entry(content: object) -> tuple[str, Any, Any, bool] | None:
     """Return (topic, payload, arrival, was_stored) of a message that a log holds in JSON, or None for other content.
 
     `was_stored`: the broker had stored the message (MQTT's flag "retain").
     """
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
-    payload = content[PAYLOAD]
-    text, was_stored = payload if isinstance(payload, str) else json.dumps(payload), bool(content.get("retain"))
-    return content[TOPIC], text, find_arrival_time(content), was_stored
+    return content[TOPIC], content[PAYLOAD], find_arrival_time(content), bool(content.get("retain"))
 
 
 def find_arrival_time(logged: Mapping[str, Any]) -> Any:

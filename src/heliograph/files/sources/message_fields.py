@@ -23,11 +23,23 @@ STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "
 PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
 NUMBER = "a number, true or false, or null for what did not arrive"
 EXACT, DIGITS = 2**53, 20  # up to here doubles hold every whole number; as many digits at most have 64 bits
+SHORT = 16  # characters: a double tells apart any two numbers of 15 digits and a point
 # Bare words that C, C++ and JavaScript print for what is no number, outside of texts.
 NO_NUMBERS = re.compile(
     r'"(?:[^"\\]|\\.)*"|[-+]?\b(?:nan\([a-z0-9]*\)|(?:nan|inf(?:inity)?)\b|1\.#(?:q?nan|snan|ind|inf)\d*)',
     re.IGNORECASE,
 )
+
+
+class LongDecimal(float):
+    """The double nearest to a number that is written with more digits than doubles hold, and the number itself.
+
+    Seconds since 1970 with nine decimals are such numbers: doubles are 2.4e-7 apart there.
+    """
+
+    def __init__(self, text: str):
+        """Keep the decimal number that a text has, beside the double that this is."""
+        self.decimal = Decimal(text)
 
 
 class MissingFieldError(InputError):
@@ -37,7 +49,7 @@ class MissingFieldError(InputError):
 def decode_json(text: str | bytes, name: str) -> Any:
     """Return the content of JSON; a bare nan or inf, as printf writes them, counts as null.
 
-    `name` is the text's place, for errors.
+    A number of many digits is a `LongDecimal`. `name` is the text's place, for errors.
 
     Raises:
         ValueError: the text is not JSON, or a field occurs twice in an object.
@@ -84,7 +96,7 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
 
     # First as it is, which is fast; then once more with null for words such as nan outside of quoted texts.
     try:
-        return json.loads(text, object_pairs_hook=collect), doubled
+        return json.loads(text, object_pairs_hook=collect, parse_float=_parse_float), doubled
     except ValueError:
         doubled.clear()
     except RecursionError:
@@ -92,7 +104,7 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
     try:
         decoded = text.decode() if isinstance(text, bytes) else text
         repaired = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", decoded)
-        return json.loads(repaired, object_pairs_hook=collect), doubled
+        return json.loads(repaired, object_pairs_hook=collect, parse_float=_parse_float), doubled
     except (ValueError, RecursionError):  # also bytes that are no text
         raise fail(name, "JSON", show_value(text)) from None
 
@@ -189,7 +201,8 @@ def convert_number(value: Any, name: str, quoted: bool = False) -> float:
 def parse_number(text: str) -> int | float | str:
     """Return the number that a text holds, or the text itself if it is not a number.
 
-    Integers keep every digit. An integer that ends in .0 becomes a double, unless this would lose digits.
+    Integers keep every digit, and a number of many digits is a `LongDecimal`. An integer that ends in .0 becomes a
+    double, unless this would lose digits.
     """
     digits = text.strip()
     if "_" in digits:  # only Python accepts such numbers
@@ -199,9 +212,14 @@ def parse_number(text: str) -> int | float | str:
     if is_whole and abs(int(whole)) >= EXACT:
         digits = whole
     try:
-        return int(digits) if digits.lstrip("+-").isdecimal() else float(digits)
+        return int(digits) if digits.lstrip("+-").isdecimal() else _parse_float(digits)
     except ValueError:
         return text
+
+
+def _parse_float(text: str) -> float:
+    """Return the number in a text that is no integer, with all digits if these may be too many for a double."""
+    return float(text) if len(text) <= SHORT else LongDecimal(text)
 
 
 def is_stamp(value: object) -> bool:
@@ -267,8 +285,8 @@ def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "n
     UNITS maps each unit to its nanoseconds. The error suggests a unit in which the number would be a time.
     """
     # Compute with the decimal number that was meant: a double of seconds times 10^9 is off by up to 128 ns.
-    if isinstance(value, Decimal):
-        decimal: Decimal | int = value
+    if isinstance(value, Decimal | LongDecimal):
+        decimal: Decimal | int = value if isinstance(value, Decimal) else value.decimal
     else:
         decimal = int(value) if float(value).is_integer() else Decimal(repr(float(value)))
     stamp = round(decimal * UNITS[unit])
@@ -301,6 +319,7 @@ def convert_count(value: Any, name: str, quoted: bool = False) -> int:
     """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text."""
     if quoted and isinstance(value, str):
         value = parse_number(value)
+    value = value.decimal if isinstance(value, LongDecimal) else value
     if isinstance(value, float | Decimal) and isfinite(value) and value == int(value):
         value = int(value)
     return check_63_bits(name, value)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.times.dates import MISSING, round_to_nanoseconds
+from heliograph.numerics.times.dates import MISSING, REACH, round_to_nanoseconds
 
 EXACT = 2**53  # up to here doubles hold every whole number
 
@@ -103,5 +103,5 @@ def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.
     wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise fail(f"{name}, row {first + row}", "a date in whole nanoseconds, from 1678 to 2261", column[row])
+        raise fail(f"{name}, row {first + row}", f"a date in whole nanoseconds, {REACH}", column[row])
     return moments

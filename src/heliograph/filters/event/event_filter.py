@@ -33,7 +33,9 @@ from heliograph.filters.event.joint_gaussian import (
 )
 from heliograph.filters.event.sender_status_probabilities import (
     SilenceByCause,
+    agrees_with_number,
     append_losses,
+    split_by_cause,
     split_by_obligation,
     status_after_sending,
 )
@@ -238,22 +240,15 @@ class EventFilter(AbstractSizedFilter):
 
         `xry`: K Gaussians of the state x, and the senders' references r and signals y; one sends if |y - r| > delta.
         """
-        # Probabilities (K, M, A, C) of Gaussian, link mode, steps since sent and number of losses, for each cause:
-        #   unsent: y was not sent;  dropped: y was sent by the rule |y - r| > delta, and lost;
-        #   forced: y had to be sent wherever it lay (first value or heartbeat), and was lost.
+        # Probabilities (K, M, A, C) of Gaussian, link mode, steps since sent and number of losses, for each cause.
         s, losses = message.sender, message.losses
         unsent, must_send = split_by_obligation(xry.label[:, s], message.has_sent, self.trigger.heartbeat)
         loss_probability = self._loss_probability(channel, s)[:, None, None]
-        dropped, forced = (
-            status_after_sending(status * loss_probability, is_lost=True) for status in (unsent, must_send)
-        )
-        if self.trigger.losses == "known":  # a reported loss says that y was sent, and no loss that it was not
-            unsent = jnp.where(losses > 0, 0.0, unsent)
-            dropped, forced = (jnp.where(losses > 0, status, 0.0) for status in (dropped, forced))
+        by_cause = split_by_cause(unsent, must_send, loss_probability, losses, self.trigger.losses)
         truncate = (
             self._truncate_with_lost_references if self.reference_may_be_lost else self._truncate_with_known_reference
         )
-        return restore_if_impossible(truncate(xry, s, SilenceByCause(unsent, dropped, forced)), xry)
+        return restore_if_impossible(truncate(xry, s, by_cause), xry)
 
     def _truncate_with_known_reference(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, where its reference r is known.
@@ -320,8 +315,7 @@ class EventFilter(AbstractSizedFilter):
         arrival_probability = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
         status = xry.label[:, s] * arrival_probability[:, None, None]
         if self.trigger.losses == "numbered":  # the sender's counter says how many were lost before
-            number = jnp.clip(jnp.where(jnp.isnan(losses), 0.0, losses).astype(int), 0, COUNTED - 1)
-            status = status * (jnp.isnan(losses) | (jnp.arange(COUNTED) == number))
+            status = status * agrees_with_number(losses, COUNTED)
         # The Gaussians before z and updated by z, for each mode, or once if all modes have the same law.
         updated, prior, links = [], [], []
         for j in range(1 if self.same_law_in_modes else status.shape[1]):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from heliograph.model.trigger import Losses
 from heliograph.numerics.types import Array, Int
 
 
@@ -16,6 +17,7 @@ class SilenceByCause(NamedTuple):
 
     unsent: nothing was sent, given |y - r| <= delta for the signal y and the reference r; dropped: y was sent and lost,
     given |y - r| > delta; forced: y had to be sent wherever it lay (as its first value or a heartbeat), and was lost.
+    A value that came and counts as not arrived is as one that was lost.
     """
 
     unsent: jax.Array
@@ -52,6 +54,40 @@ def status_after_sending(status: jax.Array, is_lost: bool) -> jax.Array:
     # One more loss moves each entry of C up by one. The last one keeps its probability too.
     one_more = jnp.concatenate([jnp.zeros_like(status[..., :1]), status[..., :-1]], axis=-1)
     return one_more.at[..., -1].add(status[..., -1])
+
+
+def split_by_cause(
+    unsent: jax.Array, must_send: jax.Array, loss_probability: jax.Array, losses: jax.Array, told: Losses
+) -> SilenceByCause:
+    """Split probabilities of a sender's status (K, M, A, C), from which no value came, by the causes of its silence.
+
+    Args:
+        unsent: where the sender's rule decides whether it sends.
+        must_send: where it must send.
+        loss_probability: that what it sends is lost, for each mode (M, 1, 1).
+        losses: what is reported: where losses are known, 1 if its value was lost, 0 if not; where they are numbered,
+            how many were lost before a value that came and counts as not arrived; NaN where nothing is reported.
+        told: what is known of losses.
+    """
+    dropped, forced = (status_after_sending(status * loss_probability, is_lost=True) for status in (unsent, must_send))
+    if told == "known":  # a reported loss says that y was sent, and no loss that it was not
+        unsent = jnp.where(losses > 0, 0.0, unsent)
+        dropped, forced = (jnp.where(losses > 0, status, 0.0) for status in (dropped, forced))
+    if told == "numbered":  # a number without a value says that y was sent, and came
+        arrival = (1.0 - loss_probability) * agrees_with_number(losses, unsent.shape[-1])
+        refused = [status_after_sending(status * arrival, is_lost=False) for status in (unsent, must_send)]
+        causes = zip((unsent, dropped, forced), (jnp.zeros_like(unsent), *refused), strict=True)
+        unsent, dropped, forced = (jnp.where(jnp.isnan(losses), silent, came) for silent, came in causes)
+    return SilenceByCause(unsent, dropped, forced)
+
+
+def agrees_with_number(losses: jax.Array, counted: int) -> jax.Array:
+    """Return which of the counts 0 to `counted` - 1 of lost transmissions agree with a number that came; all with NaN.
+
+    The last count stands for all larger numbers too.
+    """
+    number = jnp.clip(jnp.where(jnp.isnan(losses), 0.0, losses).astype(int), 0, counted - 1)
+    return jnp.isnan(losses) | (jnp.arange(counted) == number)
 
 
 def append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -104,9 +104,13 @@ class LinkCounts:
 
         `period`: after how many messages the running count begins again at 0; 0 if it never does.
         """
+        self.count_verdict(verdict)
+        self._follow_sequence(verdict, sequence, time, period)
+
+    def count_verdict(self, verdict: Verdict) -> None:
+        """Count one verdict alone, as of inputs beside a measurement, whose running count is the measurement's."""
         # Each verdict has a count of the same name.
         setattr(self, verdict, getattr(self, verdict) + 1)
-        self._follow_sequence(verdict, sequence, time, period)
 
     def count_unread(self, sequence: int, time: float, period: int = 0) -> None:
         """Count a message of which only count and time could be read: it has no verdict, and fills a gap."""

@@ -20,18 +20,24 @@ YEAR = re.compile(r"\d{4}")  # where a date is expected; anywhere else it is a n
 UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MISSING = np.iinfo(np.int64).min  # NumPy's NaT
 CALENDARS = ("standard", "gregorian", "proleptic_gregorian")  # of CF, which are ours from 1678 on
-YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
+# Nanoseconds since 1970 of the dates that are read: 64 bits hold some of 1677 too, where NumPy's conversions overflow.
+FIRST, LAST = int(np.datetime64("1678-01-01", "ns").astype(np.int64)), np.iinfo(np.int64).max
+REACH = "from 1678 to 2262-04-11"
 
 
 def round_to_nanoseconds(dates: np.ndarray) -> np.ndarray:
-    """Return dates of any unit as datetime64[ns], with NaT for dates of years outside YEARS.
+    """Return dates of any unit as datetime64[ns], with NaT for those before FIRST and after LAST.
 
     NumPy before 2.5 lets these overflow silently into other centuries; later versions raise, whichever row it is.
     """
-    if np.datetime_data(dates.dtype)[0] in {"ns", "ps", "fs", "as"}:  # years around 1970
+    unit, count = np.datetime_data(dates.dtype)
+    if unit in {"ps", "fs", "as"}:  # years around 1970
         return dates.astype("datetime64[ns]")
-    years = 1970 + dates.astype("datetime64[Y]").astype(np.int64)
-    within = (years >= YEARS[0]) & (years <= YEARS[-1])  # NaT is none of these
+    if unit in {"Y", "M", "generic"}:  # of no fixed length
+        dates, unit, count = dates.astype("datetime64[D]"), "D", 1
+    size = int(np.timedelta64(count, unit).astype("timedelta64[ns]").astype(np.int64))
+    numbers = dates.astype(np.int64)
+    within = (numbers >= -(-FIRST // size)) & (numbers <= LAST // size)  # NaT is none of these
     return np.asarray(np.where(within, dates, np.array("NaT", dates.dtype)).astype("datetime64[ns]"))
 
 
@@ -85,7 +91,7 @@ def parse_moment(text: str, name: str) -> tuple[int, bool]:
         match, leap = _match_date(text)
         return _convert_to_nanoseconds(match, leap), match["zone"] is not None
     except ValueError:
-        expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261, to the nanosecond"
+        expected = f"a date as 2026-11-21T23:25:00+01:00, {REACH}, to the nanosecond"
         raise fail(name, expected, show_value(text)) from None
 
 
@@ -95,7 +101,7 @@ def _match_date(text: str) -> tuple[re.Match[str], bool]:
     A leap second is read as the second before it. A date without marks between its numbers (BASIC) gets them first.
 
     Raises:
-        ValueError: no date of ISO 8601, or one of a year that nanoseconds cannot express.
+        ValueError: no date of ISO 8601.
     """
     text = text.upper()
     basic = BASIC.fullmatch(text)
@@ -104,27 +110,31 @@ def _match_date(text: str) -> tuple[re.Match[str], bool]:
         text = f"{year}-{month}-{day}T{hour}:{minute}{second and ':'}{second}{fraction}{zone}"
     leap = LEAP_SECOND.search(text) is not None
     match = DATE.fullmatch(LEAP_SECOND.sub(r"\g<1>59", text) if leap else text)
-    if match is None or int(match["day"][:4]) not in YEARS:
+    if match is None:
         raise ValueError
     return match, leap
 
 
 def _convert_to_nanoseconds(match: re.Match[str], leap: bool) -> int:
-    """Return the nanoseconds since 1970 in UTC."""
-    nanoseconds, zone = int(np.datetime64(_format_local(match), "ns").astype(np.int64)), _format_offset(match["zone"])
+    """Return the nanoseconds since 1970 in UTC; raise ValueError before FIRST and after LAST."""
+    # The whole seconds first, since those of a zone may lead into or out of what nanoseconds can say.
+    local, _, fraction = _format_local(match).partition(".")
+    seconds, zone = int(np.datetime64(local, "s").astype(np.int64)), _format_offset(match["zone"])
     if zone != "Z":
         hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
         if hours > 23 or minutes > 59:
             raise ValueError
-        ahead = (60 * hours + minutes) * 60 * 10**9
-        nanoseconds += -ahead if zone[0] == "+" else ahead
-    if not leap:
-        return nanoseconds
-    after = nanoseconds + 10**9
-    second = np.datetime64(after, "ns").astype("datetime64[s]")
-    if second != second.astype("datetime64[M]"):  # leap seconds end a month in UTC
+        ahead = (60 * hours + minutes) * 60
+        seconds += -ahead if zone[0] == "+" else ahead
+    if leap:
+        seconds += 1
+        second = np.datetime64(seconds, "s")
+        if second != second.astype("datetime64[M]"):  # leap seconds end a month in UTC
+            raise ValueError
+    nanoseconds = seconds * UNITS["s"] + int(fraction.ljust(9, "0"))
+    if not FIRST <= nanoseconds <= LAST:
         raise ValueError
-    return after
+    return nanoseconds
 
 
 def _format_local(match: re.Match[str]) -> str:
@@ -145,8 +155,8 @@ def parse_instant(text: str) -> datetime:
     match, leap = _match_date(text)
     if match["zone"] is None:
         raise ValueError
+    nanoseconds = _convert_to_nanoseconds(match, leap)
     if leap:
-        nanoseconds = _convert_to_nanoseconds(match, leap)
         return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=nanoseconds // 1000)
     zone = _format_offset(match["zone"]).replace("Z", "+00:00")
     return datetime.fromisoformat(f"{_format_local(match)}{zone}")

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.masked_arrays import fill_masked, find_packing
 from heliograph.numerics.numpy_or_jax import is_traced
-from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates, round_to_nanoseconds
+from heliograph.numerics.times.dates import REACH, looks_like_date, parse_dates, round_to_nanoseconds
 from heliograph.numerics.types import ArrayLike
 
 NANOSECONDS = np.dtype("datetime64[ns]")
@@ -111,13 +111,13 @@ def _convert_to_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> n
     """Return datetime64 of any unit in nanoseconds, with NaT for missing ones.
 
     Raises:
-        ValueError: a year that 64 bits of nanoseconds since 1970 cannot express; `name` is for the message.
+        ValueError: a date that 64 bits of nanoseconds since 1970 cannot express; `name` is for the message.
     """
     given = np.asarray(moments)
     converted = round_to_nanoseconds(given)
     is_too_far = np.isnat(converted) & ~np.isnat(given)
     if is_too_far.any():
-        raise fail(name, f"dates from {YEARS[0]} to {YEARS[-1]}", str(given[is_too_far][0]))
+        raise fail(name, f"dates {REACH}", str(given[is_too_far][0]))
     return converted
 
 

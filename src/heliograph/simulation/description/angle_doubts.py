@@ -48,58 +48,89 @@ def find_largest_usable_deviation(filter: AbstractFilter) -> float:
     return WIDE
 
 
-class _Usable(NamedTuple):
-    """Largest deviation (rad) of an angle or attitude at which a filter can use it, and what to do beyond it."""
+class _Direction(NamedTuple):
+    """An angle, or the three axes of an attitude: its states, the largest usable deviation (rad), what to do beyond."""
 
-    deviation: float
+    states: tuple[int, ...]
+    usable: float
     remedy: str
 
 
-def _list_usable_deviations(filter: AbstractFilter) -> dict[int, _Usable]:
-    """Return by its place each state of a filter that is an angle or part of an attitude, and what the filter can use.
+def _list_directions(filter: AbstractFilter) -> list[_Direction]:
+    """Return the angles and attitudes among a filter's states, with the deviation at which the filter can use each.
 
     There is none where the filter claims no covariance, or does not say which states are angles.
     """
     used = filter.angles_used()
     if used is None or filter.claim == "none":
-        return {}
-    angle = _Usable(find_largest_usable_deviation(filter), REMEDY) if used.states else None
-    attitude = _Usable(WIDE_ATTITUDE, REMEDY_OF_ATTITUDE)
-    return {**({i: angle for i in used.states} if angle else {}), **{i: attitude for i in filter.attitude}}
+        return []
+    angles = [_Direction((i,), find_largest_usable_deviation(filter), REMEDY) for i in used.states]
+    axes = tuple(filter.attitude)
+    bodies = [axes[i : i + 3] for i in range(0, len(axes), 3)]
+    return angles + [_Direction(body, WIDE_ATTITUDE, REMEDY_OF_ATTITUDE) for body in bodies]
+
+
+def _find_wide(direction: _Direction, deviation: Float[np.ndarray, "rows n"]) -> tuple[np.ndarray, list[int]]:
+    """Return the rows in which an angle, or an axis of an attitude, is too wide, and the states that are, in any row.
+
+    `deviation`: standard deviations of all states in each row.
+    """
+    wide = deviation[:, direction.states] > direction.usable
+    which = np.flatnonzero(wide.any(axis=0))
+    return np.flatnonzero(wide.any(axis=1)), [direction.states[i] for i in which]
+
+
+def _join_names(states: Sequence[int], names: Sequence[str]) -> str:
+    """Return the names of states in quotes, with commas."""
+    return ", ".join(repr(names[i]) for i in states)
 
 
 def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
-    """Yield a line for each angle, and each axis of an attitude, that starts wider than the filter can use."""
+    """Yield a line for each angle, and each attitude, that starts wider than the filter can use."""
     nodes_by_angle: dict[tuple[str, str, float, str], list[str]] = {}
     for node, label, filter in _yield_filters_with_angles(network):
-        covariance = np.asarray(filter.estimate(filter.init()).covariance)
-        for name, deviation, usable in _yield_deviations(network, filter, covariance):
-            if deviation > usable.deviation:
-                nodes_by_angle.setdefault((name, label, float(deviation), usable.remedy), []).append(node)
-    for (name, label, deviation_at_start, remedy), nodes in nodes_by_angle.items():
+        deviation = _find_deviations(np.asarray(filter.estimate(filter.init()).covariance)[None])
+        for direction in _list_directions(filter):
+            rows, states = _find_wide(direction, deviation)
+            if rows.size:
+                known = float(deviation[0, states].max())
+                key = _join_names(states, network.states), label, known, direction.remedy
+                nodes_by_angle.setdefault(key, []).append(node)
+    for (names, label, deviation_at_start, remedy), nodes in nodes_by_angle.items():
         first_nodes = ", ".join(map(repr, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
-        known = f"{name!r} known to +- {deviation_at_start:.2g} rad"
+        known = f"{names} known to +- {deviation_at_start:.2g} rad"
         yield f"wide angle: {label!r} of {first_nodes} starts with {known}; {remedy}"
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each filter and angle, or axis of an attitude, that was too wide in some row for the filter."""
+    """Yield a line for each filter and angle, or attitude, that was too wide in some row for the filter."""
     for node, label, filter in _yield_filters_with_angles(network):
-        covariance = np.asarray(record.estimates[node][label].covariance)
-        for name, deviation, usable in _yield_deviations(network, filter, covariance):
-            wide = np.flatnonzero(deviation > usable.deviation)
+        deviation = _find_deviations(np.asarray(record.estimates[node][label].covariance))
+        for direction in _list_directions(filter):
+            wide, states = _find_wide(direction, deviation)
             if wide.size:
-                finding = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
+                finding = _describe_width(states, network.states, deviation[:, states].max())
                 rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
-                yield f"{node}/{label}: {finding} {rows}; {usable.remedy}"
+                yield f"{node}/{label}: {finding} {rows}; {direction.remedy}"
+
+
+def _describe_width(states: Sequence[int], names: Sequence[str], deviation: float) -> str:
+    """Return in words how well an angle is known, or those axes of an attitude."""
+    return f"{_join_names(states, names)} {'is' if len(states) == 1 else 'are'} known to +- {deviation:.2g} rad"
+
+
+def _find_deviations(covariance: Float[np.ndarray, "rows n n"]) -> Float[np.ndarray, "rows n"]:
+    """Return the standard deviations of all states in each row, 0 where a variance is none."""
+    variances = np.diagonal(np.nan_to_num(covariance), axis1=-2, axis2=-1)
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 @readable
 class WideAngles:
     """Watch a filter's variances, in rows of an array, for angles and attitudes known less well than it can use.
 
-    Each angle is said once, and each received one that is beyond a full turn, as degrees are. `states` and `received`
-    are the names of those that are watched, by their places.
+    Each is said once, an attitude with all its axes, and so is each received angle beyond a full turn, as degrees are.
+    `states` and `received` are the names of those that are watched, by their places.
 
     Args:
         filter: the filter.
@@ -113,8 +144,8 @@ class WideAngles:
         """Name the angles among the filter's states and received numbers; find the largest deviation it can use."""
         instance("filter", filter, AbstractFilter, "a filter")
         angles = None if filter.claim == "none" else filter.angles_used()
-        self._usable = _list_usable_deviations(filter)
-        self.states = {i: filter.states[i] for i in self._usable}
+        self._directions, self._names = _list_directions(filter), filter.states
+        self.states = {i: filter.states[i] for direction in self._directions for i in direction.states}
         if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
@@ -133,17 +164,20 @@ class WideAngles:
         return doubts
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each angle whose variance first exceeds what the filter can use in these rows.
+        """Return a row and a line for each angle or attitude that first is wider than the filter can use in these rows.
 
-        `self.states`: {state number: name} of the angles without such a line so far. An angle with a line is taken out.
+        `self.states`: {state number: name} of those without such a line so far. What has a line is taken out.
         """
-        doubts = []
-        for i in list(self.states):
-            usable = self._usable[i]
-            rows_of_wide = np.flatnonzero(variances[:, i] > usable.deviation**2)
-            if rows_of_wide.size:
-                finding = f"{self.states.pop(i)!r} is known to +- {variances[rows_of_wide[0], i] ** 0.5:.2g} rad"
-                doubts.append((int(rows_of_wide[0]), f"{finding}; {usable.remedy}"))
+        doubts, deviation = [], np.sqrt(np.maximum(np.nan_to_num(variances), 0.0))
+        for direction in list(self._directions):
+            rows, _ = _find_wide(direction, deviation)
+            if rows.size:
+                row = int(rows[0])
+                _, states = _find_wide(direction, deviation[[row]])
+                finding = _describe_width(states, self._names, deviation[row, states].max())
+                doubts.append((row, f"{finding}; {direction.remedy}"))
+                self._directions.remove(direction)
+        self.states = {i: self._names[i] for direction in self._directions for i in direction.states}
         return doubts
 
 
@@ -157,17 +191,6 @@ def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, Abs
     for label, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter) and fusion.angles_used():
             yield FUSED, label, fusion
-
-
-def _yield_deviations(
-    network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
-) -> Iterator[tuple[str, Float[np.ndarray, "*steps"], _Usable]]:
-    """Yield the name of each angle or axis of an attitude, its standard deviation (rad), and what the filter can use.
-
-    `covariance` is that which the filter claims.
-    """
-    for i, usable in _list_usable_deviations(filter).items():
-        yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0)), usable
 
 
 def doubt_degrees_at_start(network: Network) -> Iterator[str]:

@@ -37,6 +37,7 @@ from heliograph.simulation.recordings.scan_recording import (
     find_central_states_before_rows,
     read_recording_start,
 )
+from heliograph.simulation.recordings.screened_recording import leave_out_values
 from heliograph.simulation.recordings.smoothed import (
     SmoothingPlan,
     add_truth,
@@ -296,7 +297,7 @@ def _filter_without_implausible_data(
                 rows = list(reasons_by_row)
                 z[name] = z[name].copy()
                 left_out[name][rows] += ~np.isnan(z[name][rows]) * np.int8(number_of_reason("implausible"))
-                z[name][rows] = np.nan
+                z[name][rows] = leave_out_values(network.nodes[name], z[name][rows])
             again = filter_rows(task, group_measurements(), judged=False)
             outputs = filter_rows(task, group_measurements(), judged=True) if any_implausible(again) else again
         doubts = describe_doubts(network, first_time, refused, task.u)

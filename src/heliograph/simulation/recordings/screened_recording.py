@@ -65,6 +65,8 @@ def screen_recording(
             screened = node.limits.screen(z[name], before.get(name, Repeats()))
             repeats[name] = screened.repeats
             accepted[name], refused[name] = screened.values, screened.refused.astype(np.int8)
+            if isinstance(node, Node) and node.trigger is not None:
+                accepted[name] = node.trigger.leave_out_refused(z[name], refused[name] > 0, len(node.outputs))
             lines = [
                 _describe_refused(reason, node.limits, z[name], refused[name], node)
                 for reason in count_by_reason(refused[name])
@@ -81,6 +83,15 @@ def screen_recording(
     silences = find_long_silences(timeouts, accepted, u, inputs)
     lines_to_say += [f"node {name!r}: {silence.describe()}" for name, silence in silences.items()]
     return ScreenedRecording(measurements=accepted, refused=refused, said=lines_to_say, repeats=repeats)
+
+
+def leave_out_values(node: Node | ReceivingNode, z: Float[np.ndarray, "rows received"]) -> np.ndarray:
+    """Return rows of a node of which no value counts: NaN, but what a sender's rule tells of losses."""
+    trigger = node.trigger if isinstance(node, Node) else None
+    if trigger is None:
+        return np.full_like(z, np.nan)
+    is_value = np.arange(z.shape[1]) < z.shape[1] - trigger.side_information(len(node.outputs))
+    return trigger.leave_out_refused(z, np.broadcast_to(is_value, z.shape), len(node.outputs))
 
 
 def _describe_refused(
