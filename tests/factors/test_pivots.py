@@ -1,5 +1,7 @@
 """Derivatives of a Gaussian in factors where covariances are zero or singular, against those of covariances."""
 
+from functools import cache, partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,28 +43,47 @@ def double():
         yield
 
 
-def derivative(function, *slopes, tolerance=TOLERANCE):
-    """Return the function at 0 and its derivative along numbers that all move alike, by both modes of JAX."""
+def derivative(function, slopes, *given, tolerance=TOLERANCE):
+    """Return the function at `given` and its derivative along slopes that all move alike, by both modes of JAX.
 
-    def evaluate(t):
-        with write_for_derivatives():
-            return function(*(t * slope for slope in slopes))
-
-    @jax.jit
-    def differentiate(t):
-        return *jax.jvp(evaluate, (t,), (1.0,)), jax.jacrev(evaluate)(t)
-
-    value, forward, backward = differentiate(0.0)
+    The function takes `given`, and then a change along each slope.
+    """
+    value, forward, backward = differentiated(function)(0.0, slopes, given)
     for a, b in zip(jax.tree.leaves(forward), jax.tree.leaves(backward), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, float(np.max(np.abs(b)))))
     return value, forward
 
 
-@pytest.mark.parametrize("factor", [columns_of, columns_with_derivatives, lambda P: from_covariance(MEAN, P)])
+@cache
+def differentiated(function):
+    """Return value and derivatives as one program, compiled once for all covariances that it is given."""
+
+    @jax.jit
+    def differentiate(t, slopes, given):
+        def evaluate(t):
+            with write_for_derivatives():
+                return function(*given, *(t * slope for slope in slopes))
+
+        return *jax.jvp(evaluate, (t,), (1.0,)), jax.jacrev(evaluate)(t)
+
+    return differentiate
+
+
+def covariance_of_factors(factor, P, change):
+    return factor(P + change).covariance
+
+
+FACTORS = [
+    partial(covariance_of_factors, factor)
+    for factor in (columns_of, columns_with_derivatives, lambda P: from_covariance(MEAN, P))
+]
+
+
+@pytest.mark.parametrize("factor", FACTORS)
 @pytest.mark.parametrize("name", SINGULAR)
 def test_factors_have_the_derivatives_of_their_covariance(name, factor):
     """Of a covariance that moves in any direction: W' of each column is as large as its weight is small."""
-    value, slope = derivative(lambda change: factor(jnp.asarray(SINGULAR[name] + change)).covariance, P_SLOPE)
+    value, slope = derivative(factor, (P_SLOPE,), SINGULAR[name])
     np.testing.assert_allclose(slope, P_SLOPE, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(value, SINGULAR[name], rtol=0, atol=1e-14)
 
@@ -72,14 +93,14 @@ def noise_of(covariance):
     return triangularise(join_columns(columns_of(covariance), rounding_of(np.ones(3))))
 
 
+def predict(P, Q, dP, dQ):
+    return predict_affine(from_covariance(MEAN, P + dP), F, MEAN, noise_of(Q + dQ)).covariance
+
+
 @pytest.mark.parametrize("process", ["zero", "a known state"])
 @pytest.mark.parametrize("start", SINGULAR)
 def test_a_prediction_has_the_derivative_of_the_covariance(start, process):
-    def predict(dP, dQ):
-        x = from_covariance(MEAN, jnp.asarray(SINGULAR[start] + dP))
-        return predict_affine(x, F, MEAN, noise_of(jnp.asarray(SINGULAR[process] + dQ))).covariance
-
-    _, slope = derivative(predict, P_SLOPE, Q_SLOPE)
+    _, slope = derivative(predict, (P_SLOPE, Q_SLOPE), SINGULAR[start], SINGULAR[process])
     np.testing.assert_allclose(slope, F @ P_SLOPE @ F.T + Q_SLOPE, rtol=0, atol=TOLERANCE)
 
 
@@ -92,52 +113,57 @@ WITH_DENSITY = [
 ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("start, noise", WITH_DENSITY)
-def test_an_observation_has_the_derivatives_of_mean_covariance_and_density(start, noise):
-    """Of P - K S K' with K = P H' S^-1: the noise is only the rounding of numbers, or a part of it is."""
-    S = H @ SINGULAR[start] @ H.T + SINGULAR[noise]
-    tolerance = max(TOLERANCE, 4 * np.finfo(float).eps * np.linalg.cond(S))  # cond S is up to 1e4
+def observe(z, P, R, dP, dR):
+    x = from_covariance(MEAN, P + dP)
+    after, seen = condition_on_observation(x, H @ x.root, z - H @ x.mean, noise_of(R + dR))
+    return after.mean, after.covariance, seen.log_density(np.full(3, True), np.abs(Z))
 
-    def observe(dP, dR):
-        x = from_covariance(MEAN, jnp.asarray(SINGULAR[start] + dP))
-        columns = noise_of(jnp.asarray(SINGULAR[noise] + dR))
-        after, seen = condition_on_observation(x, H @ x.root, Z - H @ x.mean, columns)
-        return after.mean, after.covariance, seen.log_density(np.full(3, True), np.abs(Z))
 
-    def by_covariances(dP, dR):
-        P, R = SINGULAR[start] + dP, SINGULAR[noise] + dR
+@jax.jit
+def differentiate_by_covariances(P0, R0):
+    """Return mean, covariance and density after Z by P - K S K' with K = P H' S^-1, and their derivatives."""
+
+    def by_covariances(t):
+        P, R = P0 + t * P_SLOPE, R0 + t * R_SLOPE
         S, e = H @ P @ H.T + R, Z - H @ MEAN
         K = jnp.linalg.solve(S, H @ P).T
         density = -(e @ jnp.linalg.solve(S, e) + jnp.linalg.slogdet(S)[1] + 3 * np.log(2 * np.pi)) / 2
         return MEAN + K @ e, P - K @ S @ K.T, density
 
-    value, slopes = derivative(observe, P_SLOPE, R_SLOPE, tolerance=tolerance)
-    expected = jax.jvp(lambda t: by_covariances(t * P_SLOPE, t * R_SLOPE), (0.0,), (1.0,))
+    return jax.jvp(by_covariances, (0.0,), (1.0,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start, noise", WITH_DENSITY)
+def test_an_observation_has_the_derivatives_of_mean_covariance_and_density(start, noise):
+    """The noise is only the rounding of numbers, or a part of it is."""
+    P, R = SINGULAR[start], SINGULAR[noise]
+    tolerance = max(TOLERANCE, 4 * np.finfo(float).eps * np.linalg.cond(H @ P @ H.T + R))  # cond S is up to 1e4
+    value, slopes = derivative(observe, (P_SLOPE, R_SLOPE), Z, P, R, tolerance=tolerance)
+    expected = differentiate_by_covariances(P, R)
     for a, b in zip((*value, *slopes), (*expected[0], *expected[1]), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, float(np.max(np.abs(b)))))
 
 
-def test_an_observation_of_which_a_part_is_missing():
-    def observe(dP, dR):
-        x = from_covariance(MEAN, jnp.asarray(dP))
-        after, _ = condition_on_observation(
-            x, H @ x.root, jnp.array([0.3, np.nan, -0.2]), noise_of(jnp.eye(3) / 2 + dR)
-        )
-        return after.covariance
+def covariance_of_observed(*given_and_changes):
+    return observe(*given_and_changes)[1]
 
-    np.testing.assert_allclose(derivative(observe, P_SLOPE, R_SLOPE)[1], P_SLOPE, rtol=0, atol=TOLERANCE)
+
+def test_an_observation_of_which_a_part_is_missing():
+    z, zero, R = np.array([0.3, np.nan, -0.2]) + H @ MEAN, SINGULAR["zero"], np.eye(3) / 2
+    slope = derivative(covariance_of_observed, (P_SLOPE, R_SLOPE), z, zero, R)[1]
+    np.testing.assert_allclose(slope, P_SLOPE, rtol=0, atol=TOLERANCE)
+
+
+def merge(P, dP, dQ):
+    weights, shift = jnp.array([0.25, 0.75]), np.array([0.5, 0.0, -0.25])
+    parts = [from_covariance(MEAN + s, P + d) for s, d in ((0.0, dP), (shift, dQ))]
+    return merge_mixture(jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts), weights).covariance
 
 
 @pytest.mark.parametrize("name", SINGULAR)
 def test_a_mixture_has_the_derivative_of_its_covariance(name):
-    weights, shift = jnp.array([0.25, 0.75]), np.array([0.5, 0.0, -0.25])
-
-    def merge(dP, dQ):
-        parts = [from_covariance(MEAN + s, jnp.asarray(SINGULAR[name] + d)) for s, d in ((0.0, dP), (shift, dQ))]
-        return merge_mixture(jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts), weights).covariance
-
-    _, slope = derivative(merge, P_SLOPE, Q_SLOPE)
+    _, slope = derivative(merge, (P_SLOPE, Q_SLOPE), SINGULAR[name])
     np.testing.assert_allclose(slope, 0.25 * P_SLOPE + 0.75 * Q_SLOPE, rtol=0, atol=TOLERANCE)
 
 
@@ -147,10 +173,7 @@ def test_many_columns_are_a_loop_of_the_same_derivatives():
     slope = np.eye(n) + 0.3 * np.eye(n, k=1) + 0.3 * np.eye(n, k=-1)
     given = np.diag(np.arange(n) % 2.0)
 
-    def factor(change):
-        return columns_of(jnp.asarray(given + change)).covariance
-
-    np.testing.assert_allclose(derivative(factor, slope)[1], slope, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(derivative(FACTORS[0], (slope,), given)[1], slope, rtol=0, atol=TOLERANCE)
 
 
 def test_what_is_not_differentiated_is_factored_as_before():

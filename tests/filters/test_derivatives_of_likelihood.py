@@ -1,5 +1,7 @@
 """Derivatives of nonlinear filters' likelihoods where covariances are zero, against fractions and textbook formulas."""
 
+from functools import cache, partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,9 +24,15 @@ FILTERS = {
 START = np.array([0.3, -0.2])
 
 
+@cache
+def compile_slopes(function):
+    """Compile the derivative of a function, once for all numbers at which it is asked for."""
+    return jax.jit(jax.grad(function))
+
+
 def slopes_of(function, x):
     with jax.enable_x64(True):
-        return np.asarray(jax.jit(jax.grad(function))(np.array(x)))
+        return np.asarray(compile_slopes(function)(np.array(x)))
 
 
 def affine_models(scales):
@@ -34,11 +42,18 @@ def affine_models(scales):
     return plant, hg.Sensor(lambda x: jnp.asarray(READING) @ x, r)
 
 
+def likelihood(models, name, x):
+    return hg.log_likelihood(FILTERS[name](*models(x)), ROWS)
+
+
+AFFINE = {name: partial(likelihood, affine_models, name) for name in FILTERS}
+
+
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (0.0, 0.25, 0.0), (1.0, 0.25, 0.0), (0.5, 0.0, 0.25)])
 @pytest.mark.parametrize("name", FILTERS)
 def test_gradients_of_affine_functions_are_exact_where_covariances_are_zero(name, scales):
     """To 1e-11 of the largest: derivatives of factors are as large as variances are small, and some digits are lost."""
-    slopes = slopes_of(lambda x: hg.log_likelihood(FILTERS[name](*affine_models(x)), ROWS), scales)
+    slopes = slopes_of(AFFINE[name], scales)
     expected = differentiate_exactly(scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
 
@@ -75,10 +90,13 @@ def textbook_likelihood(scales, order):
     return total
 
 
+CURVED = {name: partial(likelihood, curved_models, name) for name in FILTERS}
+FIRST_ORDER, SECOND_ORDER = (partial(textbook_likelihood, order=order) for order in (1, 2))
+
+
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (0.0, 0.25, 0.0), (1.0, 0.25, 0.0), (0.5, 0.0, 0.25)])
 def test_the_extended_filter_has_the_gradient_of_the_textbook(scales):
-    slopes = slopes_of(lambda x: hg.log_likelihood(hg.extended_filter(*curved_models(x)), ROWS), scales)
-    expected = slopes_of(lambda x: textbook_likelihood(x, order=1), scales)
+    slopes, expected = slopes_of(CURVED["extended"], scales), slopes_of(FIRST_ORDER, scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
 
 
@@ -86,8 +104,7 @@ def test_the_extended_filter_has_the_gradient_of_the_textbook(scales):
 def test_points_have_the_gradient_of_second_order_where_nothing_is_uncertain(name):
     """As P goes to 0 all points give the mean f + tr(f'' P) / 2 and the covariance f' P f', to the first power of P."""
     scales = (0.0, 0.0, 0.5)
-    slopes = slopes_of(lambda x: hg.log_likelihood(FILTERS[name](*curved_models(x)), ROWS), scales)
-    expected = slopes_of(lambda x: textbook_likelihood(x, order=2), scales)
+    slopes, expected = slopes_of(CURVED[name], scales), slopes_of(SECOND_ORDER, scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
 
 
@@ -123,41 +140,47 @@ OTHERS = {
 }
 
 
+def other_likelihood(name, x):
+    z = np.concatenate([ROWS, ROWS[::-1]], axis=1) if name == "two nodes" else ROWS
+    return hg.log_likelihood(OTHERS[name](x), z)
+
+
+LIKELIHOODS = {name: partial(other_likelihood, name) for name in OTHERS}
+
+
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5, 0.3), (0.8, 0.25, 0.4, 0.0)])
 @pytest.mark.parametrize("name", OTHERS)
 def test_gradients_of_other_filters_are_one_sided_differences(name, scales):
     """To 1e-5 of the largest: rounding of values over the step, and the fourth power of the step times what varies."""
-    z = np.concatenate([ROWS, ROWS[::-1]], axis=1) if name == "two nodes" else ROWS
-
-    def likelihood(x):
-        return hg.log_likelihood(OTHERS[name](x), z)
-
-    slopes, expected = slopes_of(likelihood, scales), differences(lambda x: float(likelihood(x)), scales)
+    value = LIKELIHOODS[name]
+    slopes, expected = slopes_of(value, scales), differences(lambda x: float(value(x)), scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-5 * np.max(np.abs(expected)))
+
+
+def marginal(x):
+    """Return the log-density of the rows with an unknown start, but for a constant: by all of them at once."""
+    F, n = MOTION, len(ROWS)
+    power = [np.linalg.matrix_power(F, k) for k in range(n + 1)]
+    Q, R = x[0] * SHAPES[1], x[1] * SHAPES[2]
+    G = np.concatenate([READING @ power[t + 1] for t in range(n)])
+    W = np.block([[READING @ power[t - j] if j <= t else np.zeros((2, 2)) for j in range(n)] for t in range(n)])
+    S = W @ jnp.kron(np.eye(n), Q) @ W.T + jnp.kron(np.eye(n), R)
+    z, inverse = ROWS.ravel(), jnp.linalg.inv(S)
+    J = G.T @ inverse @ G
+    rest = inverse - inverse @ G @ jnp.linalg.inv(J) @ G.T @ inverse
+    return -(jnp.linalg.slogdet(S)[1] + jnp.linalg.slogdet(J)[1] + z @ rest @ z) / 2
+
+
+def from_unknown_start(x):
+    plant = hg.LinearPlant(MOTION, x[0] * SHAPES[1], np.zeros(2), hg.diffuse)
+    return hg.log_likelihood(hg.kalman_filter(plant, hg.LinearSensor(READING, x[1] * SHAPES[2])), ROWS)
 
 
 @pytest.mark.parametrize("scales", [(0.25, 0.0), (0.0, 0.5), (0.25, 0.5)])
 def test_an_unknown_start_has_the_gradient_of_the_marginal_density(scales):
     """Of z = G delta + y with an unknown delta: -(log |S| + log |G' S^-1 G| + y' S^-1 (y - G delta^)) / 2."""
-    F, n = MOTION, len(ROWS)
-    power = [np.linalg.matrix_power(F, k) for k in range(n + 1)]
-
-    def marginal(x):
-        Q, R = x[0] * SHAPES[1], x[1] * SHAPES[2]
-        G = np.concatenate([READING @ power[t + 1] for t in range(n)])
-        W = np.block([[READING @ power[t - j] if j <= t else np.zeros((2, 2)) for j in range(n)] for t in range(n)])
-        S = W @ jnp.kron(np.eye(n), Q) @ W.T + jnp.kron(np.eye(n), R)
-        z, inverse = ROWS.ravel(), jnp.linalg.inv(S)
-        J = G.T @ inverse @ G
-        rest = inverse - inverse @ G @ jnp.linalg.inv(J) @ G.T @ inverse
-        return -(jnp.linalg.slogdet(S)[1] + jnp.linalg.slogdet(J)[1] + z @ rest @ z) / 2
-
-    def filtered(x):
-        plant = hg.LinearPlant(F, x[0] * SHAPES[1], np.zeros(2), hg.diffuse)
-        return hg.log_likelihood(hg.kalman_filter(plant, hg.LinearSensor(READING, x[1] * SHAPES[2])), ROWS)
-
-    expected = slopes_of(marginal, scales)
-    np.testing.assert_allclose(slopes_of(filtered, scales), expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+    slopes, expected = slopes_of(from_unknown_start, scales), slopes_of(marginal, scales)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
 
 
 def test_a_traced_known_part_of_an_unknown_start():
@@ -168,22 +191,18 @@ def test_a_traced_known_part_of_an_unknown_start():
         return hg.log_likelihood(hg.kalman_filter(plant, hg.LinearSensor(READING, 0.5 * SHAPES[2])), ROWS)
 
     expected = differences(lambda x: float(likelihood(float(x[0]))), [0.0], step=1e-3)[0]
-    with jax.enable_x64(True):
-        assert float(jax.grad(likelihood)(0.0)) == pytest.approx(expected, rel=1e-8)
+    assert slopes_of(likelihood, 0.0) == pytest.approx(expected, rel=1e-8)
 
 
 def test_what_has_no_derivative_is_no_number():
     """By side information, where nothing is uncertain; elsewhere it is that of the best linear filter."""
 
-    def slopes(build, scales):
-        return slopes_of(lambda x: hg.log_likelihood(build(x), ROWS), scales)
-
     def by_side_information(x):
-        return hg.filters.side_information_filter(*linear_models(x), fading(x[3]))
+        return hg.log_likelihood(hg.filters.side_information_filter(*linear_models(x), fading(x[3])), ROWS)
 
-    assert np.all(np.isnan(slopes(by_side_information, (0.0, 0.0, 0.5, 0.3))))
-    regular = slopes(by_side_information, (0.8, 0.25, 0.4, 0.3))
-    best = slopes(OTHERS["best linear filter behind modes"], (0.8, 0.25, 0.4, 0.3))
+    assert np.all(np.isnan(slopes_of(by_side_information, (0.0, 0.0, 0.5, 0.3))))
+    regular = slopes_of(by_side_information, (0.8, 0.25, 0.4, 0.3))
+    best = slopes_of(LIKELIHOODS["best linear filter behind modes"], (0.8, 0.25, 0.4, 0.3))
     np.testing.assert_allclose(regular, best, rtol=1e-10)
 
 
@@ -197,14 +216,20 @@ def test_a_transform_of_moments_alone_has_no_derivative_where_nothing_is_uncerta
         return hg.log_likelihood(gaussian_filter(*curved_models(x), PERFECT, transform=Moments()), ROWS)
 
     assert np.isnan(slopes_of(likelihood, (0.0, 0.0, 0.5))[0])
-    expected = slopes_of(lambda x: textbook_likelihood(x, order=1), (0.8, 0.25, 0.4))
+    expected = slopes_of(FIRST_ORDER, (0.8, 0.25, 0.4))
     np.testing.assert_allclose(slopes_of(likelihood, (0.8, 0.25, 0.4)), expected, rtol=1e-9)
+
+
+def planned_likelihood(x):
+    return hg.log_likelihood(hg.kalman_filter(*linear_models(x)).planned(np.zeros((len(ROWS), 0))), ROWS)
+
+
+def kalman_likelihood(x):
+    return hg.log_likelihood(hg.kalman_filter(*linear_models(x)), ROWS)
 
 
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (1.0, 0.25, 0.0)])
 def test_a_planned_filter_has_the_gradient_of_the_filter_itself(scales):
     """Its matrices are recorded in the same trace; to some thousand roundings of the largest."""
-    zero = np.zeros((len(ROWS), 0))
-    slopes = slopes_of(lambda x: hg.log_likelihood(hg.kalman_filter(*linear_models(x)).planned(zero), ROWS), scales)
-    expected = slopes_of(lambda x: hg.log_likelihood(hg.kalman_filter(*linear_models(x)), ROWS), scales)
+    slopes, expected = slopes_of(planned_likelihood, scales), slopes_of(kalman_likelihood, scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))

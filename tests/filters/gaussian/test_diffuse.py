@@ -2,6 +2,7 @@
 
 import warnings
 from fractions import Fraction
+from functools import cache
 from math import log, pi
 
 import numpy as np
@@ -94,6 +95,7 @@ def least_squares(f, h, q, r, known, unknown, mean, z):
     for _ in range(steps):
         powers.append(f @ powers[-1])
 
+    @cache
     def cov(a, b):
         total = powers[a] @ known @ powers[b].T
         for j in range(1, min(a, b) + 1):

@@ -1,5 +1,7 @@
 """Derivatives of a linear filter's likelihood, by covariances, against those of its factors and differences."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,6 +60,12 @@ def test_gradients_in_all_numbers_and_data_are_those_of_the_factors():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.max(np.abs(b)))
 
 
+@cache
+def compile_slopes_and_value(kind):
+    """Compile both, once for all numbers that are zero."""
+    return jax.jit(jax.grad(likelihood(kind))), jax.jit(likelihood(kind))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "zero"),
@@ -68,26 +76,28 @@ def test_gradients_where_a_covariance_is_zero(kind, zero):
     x, step = X.copy(), 1e-6
     x[[list(NUMBERS).index(name) for name in zero]] = 0.0
     with jax.enable_x64(True):
-        slopes, value = jax.jit(jax.grad(likelihood(kind)))(x), jax.jit(likelihood(kind))
+        gradient, value = compile_slopes_and_value(kind)
+        slopes = gradient(x)
         # One-sided differences, as variances have none below zero; their error is the square of the step.
         at = [[float(value(x + count * step * e)) for count in (0, 1, 2)] for e in np.eye(len(x))]
     differences = np.array(at) @ [-3.0, 4.0, -1.0] / (2 * step)
     np.testing.assert_allclose(slopes, differences, rtol=1e-6)
 
 
+@jax.jit
+@jax.grad
+def slopes_of_kalman(scales):
+    start, q, r = scales[:, None, None] * SHAPES
+    plant, sensor = hg.LinearPlant(MOTION, q, np.zeros(2), start), hg.LinearSensor(READING, r)
+    return hg.log_likelihood(hg.kalman_filter(plant, sensor), ROWS)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.5), (0.0, 0.25, 0.0), (1.0, 0.25, 0.0), (0.5, 0.0, 0.25)])
 def test_kalmans_gradient_is_exact_where_covariances_are_zero(scales):
     """To some thousand roundings."""
-
-    def function(scales):
-        start, q, r = scales[:, None, None] * SHAPES
-        return hg.log_likelihood(
-            hg.kalman_filter(hg.LinearPlant(MOTION, q, np.zeros(2), start), hg.LinearSensor(READING, r)), ROWS
-        )
-
     with jax.enable_x64(True):
-        slopes = jax.jit(jax.grad(function))(np.array(scales))
+        slopes = slopes_of_kalman(np.array(scales))
     expected = differentiate_exactly(scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
 
@@ -106,7 +116,8 @@ def test_a_kalman_filter_that_starts_from_another_law_than_its_plant():
         return hg.log_likelihood(hg.kalman_filter(other, sensor), ROWS)
 
     with jax.enable_x64(True):
-        assert float(jax.grad(from_filter)(0.0)) == pytest.approx(float(jax.grad(from_plant)(0.0)), rel=1e-13)
+        both = jax.jit(lambda x: (jax.grad(from_filter)(x), jax.grad(from_plant)(x)))(0.0)
+    assert both[0] == pytest.approx(float(both[1]), rel=1e-13)
 
 
 @pytest.mark.slow

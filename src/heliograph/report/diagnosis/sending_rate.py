@@ -11,7 +11,7 @@ PEAKS = 8  # of the spectrum of arrivals that are looked at
 FEWEST = 8  # arrivals from which a rate is looked for
 ENOUGH = 20_000  # rows that decide
 ROUNDING = 1e-9  # periods: the arrivals at both ends of a line are in it
-STEPS = 30  # of the search for a rate, each to two thirds
+STEPS = 18  # of the search for a rate, each to a half
 LINE_PARAMETERS = 5  # rate, phase, width, first and last row: N rows tell some N values of each apart
 OFF = 0.25  # periods by which a line at a peak of the spectrum is too wide, at most
 
@@ -78,11 +78,11 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     # Frequencies in cycles per row.
     for frequency in _find_likely_frequencies(arrived):
         # Due rows have phases in an interval of length 1 / T = frequency: the rest of the circle, about, is empty.
-        _, gap = _find_largest_gap(frequency, rows)
+        middle, gap = _find_largest_gap(frequency, rows)
         if gap < 1 - frequency - OFF:
             continue
         # Each arrival has to be in a period of its own.
-        line = _fit_periodic_rows(frequency, rows)
+        line = _fit_periodic_rows(frequency, rows, middle)
         slots = np.floor(line.phases(rows)).astype(np.int64)
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
@@ -127,22 +127,18 @@ def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> t
     return float(phases[largest] + gaps[largest] / 2), float(gaps[largest])
 
 
-def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows:
+def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"], middle: float) -> _PeriodicRows:
     """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
 
-    Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.
+    Then the width is a convex function of the frequency, and its slope is the distance of the rows of the largest and
+    the least phase: halves that cannot hold its minimum are cut off. `middle`: of the largest gap between phases.
     """
-    middle, _ = _find_largest_gap(frequency, rows)
     whole_periods = np.floor(frequency * rows - middle)  # of each arrival, counted from the middle of the gap
-
-    def width(f: float) -> float:
-        """Return how far phases are apart at a frequency."""
-        phases = f * rows - whole_periods
-        return float(phases.max() - phases.min())
-
     low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)
     for _ in range(STEPS):
-        left, right = low + (high - low) / 3, high - (high - low) / 3
-        low, high = (low, right) if width(left) <= width(right) else (left, high)
-    best = (low + high) / 2
-    return _PeriodicRows(frequency=best, start=float(np.min(best * rows - whole_periods)), width=width(best))
+        best = (low + high) / 2
+        phases = best * rows - whole_periods
+        low, high = (best, high) if rows[phases.argmax()] < rows[phases.argmin()] else (low, best)
+    phases = (low + high) / 2 * rows - whole_periods
+    least = float(phases.min())
+    return _PeriodicRows(frequency=(low + high) / 2, start=least, width=float(phases.max()) - least)
