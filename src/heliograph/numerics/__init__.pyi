@@ -148,6 +148,7 @@ from .process.stop_signals import hold_signals as hold_signals
 from .random_keys import seed_key as seed_key
 from .times.data_row_checks import check_rows as check_rows
 from .times.dates import MISSING as MISSING
+from .times.dates import REACH as REACH
 from .times.dates import UNITS as UNITS
 from .times.dates import format_dates as format_dates
 from .times.dates import format_times as format_times
