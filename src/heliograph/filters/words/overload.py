@@ -109,7 +109,7 @@ def bound_overload(
     """
     link = at(numbers, k=0)
     # The sum over j assumes one gain per step: no late messages, no link with memory, every output a signal component.
-    no_bound = link.past or link.remembers or any(place < 0 for place in indices)
+    no_bound = link.past or link.remembers or any(index < 0 for index in indices)
     # Steps that are looked at, as far as plant, sensor and channel are defined.
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
     outputs = len(at(sensor, k=0).outputs)

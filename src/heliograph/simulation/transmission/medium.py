@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.stochastic_event_filter import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
@@ -132,8 +133,7 @@ class SeparateChannels(AbstractMedium):
             The channel and the sensor begin in states that are drawn. A sender that decides when to transmit begins
             with nothing sent. The estimate fed back to the sensor, or compared by the sender, is the filter's first.
             """
-            reference = group.reference_filter
-            feed_back = None if reference is None else jnp.asarray(reference.estimate(reference.init()).mean)
+            feed_back = None if group.reference_filter is None else _get_initial_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
             modes = start_modes(group.sensor, key, group.modes)
@@ -252,6 +252,11 @@ def _send_through_channel(
     codewords, bits = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
     memory, received = deliver_signal(group.channel, memory, bits, key, k, group.checksums, group.memories)
     return codewords, group.reader.read_words(group.encoder, len(y), received), memory
+
+
+def _get_initial_mean(filter: AbstractFilter) -> jax.Array:
+    """Return a filter's mean before the first step."""
+    return jnp.asarray(filter.estimate(filter.init()).mean)
 
 
 def measure(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
