@@ -143,14 +143,14 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
     return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
 
 
-def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
-    """Predict x over x+ = F x + b + w: F is `matrix`, b the `shift`, `noise` columns of Cov w.
+def predict_diffuse(x: Diffuse, matrix: jax.Array, offset: jax.Array, noise: WeightedColumns) -> Diffuse:
+    """Predict x over x+ = F x + b + w: F is `matrix`, b the `offset`, `noise` columns of Cov w.
 
     The covariance has two levels, a finite one and an infinite one. Both are predicted.
     """
     rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
     lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
-    return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
+    return Diffuse(matrix @ x.mean + offset, below_diagonal(lower), *levels)
 
 
 def _append_noise_columns(

@@ -104,13 +104,13 @@ def from_covariance(mean: Array, covariance: Array) -> Gaussian:
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
-def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumns) -> Gaussian:
+def predict_affine(x: Gaussian, matrix: Any, offset: Array, noise: WeightedColumns) -> Gaussian:
     """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w.
 
-    x has the mean m and covariance L diag(d) L'. F is `matrix`, b is `shift`, and `noise` holds columns of Cov w.
+    x has the mean m and covariance L diag(d) L'. F is `matrix`, b is `offset`, and `noise` holds columns of Cov w.
     """
     of_state = WeightedColumns(matrix @ x.root, x.variances)
-    return from_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(of_state, noise))
+    return from_columns(jnp.asarray(matrix @ x.mean + offset), join_columns(of_state, noise))
 
 
 class Image(NamedTuple):

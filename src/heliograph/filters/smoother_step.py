@@ -67,7 +67,7 @@ class SmootherStep(Module):
     `after` is the Gaussian after the step. `before` regresses the state before the step on the predicted state, given
     the data before the step; given both, the step's measurement says nothing more of it. So Rauch, Tung and Striebel's
     recursion holds for any state that moves by a prediction with a white noise, whatever the correction is. The plant's
-    state is projection y + shift of the filter's state y, or y itself without them. Stacked along time, and over runs,
+    state is projection y + offset of the filter's state y, or y itself without them. Stacked along time, and over runs,
     it describes a whole run of a filter.
 
     claim: what smoothed covariances are said to be. manifold: which of the plant's states are angles, which estimates
@@ -75,13 +75,13 @@ class SmootherStep(Module):
     the mean. limits: of the plant's states, on which estimates are conditioned. nis: e' S^-1 e of the step's
     innovation, with mean `received`, the number of components that arrived.
 
-    Shapes: projection (n, N), shift (n,).
+    Shapes: projection (n, N), offset (n,).
     """
 
     after: Gaussian
     before: BackwardGain  # None of a filter of modes with several laws of motion, which goes back by pairs
     projection: Float[jax.Array, "*time n N"] | None = eqx.field(default=None, kw_only=True)
-    shift: Float[jax.Array, "*time n"] | None = eqx.field(default=None, kw_only=True)
+    offset: Float[jax.Array, "*time n"] | None = eqx.field(default=None, kw_only=True)
     nis: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
     received: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
     claim: Claim = eqx.field(static=True, kw_only=True)
@@ -193,14 +193,14 @@ class SmootherStep(Module):
         return replace(self, after=self.after._replace(mean=mean_after), before=before)
 
     def estimate_from(self, law: Gaussian) -> Estimate:
-        """Return the estimate of the plant's state, projection y + shift, from the law of the filter's state y.
+        """Return the estimate of the plant's state, projection y + offset, from the law of the filter's state y.
 
         Where the plant's states have `limits`, the law is truncated to them.
         """
         mean, columns = law.mean, law.columns
         if self.projection is not None:
             mean, columns = self.projection @ mean, columns.through(self.projection)
-        mean = mean if self.shift is None else mean + self.shift
+        mean = mean if self.offset is None else mean + self.offset
         if self.limits:
             from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
 

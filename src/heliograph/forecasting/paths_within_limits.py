@@ -17,8 +17,8 @@ class StateLimits(Module):
 
     def hold(self, x: jax.Array) -> jax.Array:
         """Return a state (n,) with its limited components clipped to their limits."""
-        for place, low, high in self.limits:
-            x = x.at[place].set(jnp.clip(x[place], low, high))
+        for i, low, high in self.limits:
+            x = x.at[i].set(jnp.clip(x[i], low, high))
         return x
 
     def mirror(self, x: jax.Array) -> jax.Array:
@@ -26,10 +26,10 @@ class StateLimits(Module):
 
         At a limit, symmetric noise then has the law that it has given that it does not lead beyond the limit.
         """
-        for place, low, high in self.limits:
-            value = x[place]
+        for i, low, high in self.limits:
+            value = x[i]
             mirrored = jnp.where(value < low, 2 * low - value, jnp.where(value > high, 2 * high - value, value))
-            x = x.at[place].set(mirrored)
+            x = x.at[i].set(mirrored)
         return x
 
 
@@ -55,25 +55,25 @@ def draw_limited_components(
     """
     # `center` (draws, n) and `left` (K, n, n): mean and covariance given the components drawn so far.
     center, left, weight = means[part], covariances, np.ones(len(part))
-    for place, low, high in limits:
+    for i, low, high in limits:
         # Draw the component by the inverse of its distribution function, between that function's values at the limits.
         # A component without variance stays.
-        variance = left[:, place, place]
+        variance = left[:, i, i]
         is_random = variance > 0
         divisor = np.where(is_random, variance, 1.0)
         deviation = np.sqrt(divisor)[part]
-        least, most = (ndtr((end - center[:, place]) / deviation) for end in (low, high))
+        least, most = (ndtr((end - center[:, i]) / deviation) for end in (low, high))
         units = ndtri(least + generator.random(len(part)) * (most - least))
         moved = np.where(is_random[part], deviation * units, 0.0)
-        drawn = np.clip(center[:, place] + moved, low, high)
+        drawn = np.clip(center[:, i] + moved, low, high)
         # The probability of being within the limits.
         weight *= np.where(is_random[part], most - least, 1.0)
         # Condition the others: center + slope (drawn - mean), P - P_j P_j' / P_jj, with P_j the column of this
         # component.
-        slopes = np.where(is_random[:, None], left[:, :, place] / divisor[:, None], 0.0)
-        center = center + slopes[part] * (drawn - center[:, place])[:, None]
-        center[:, place] = drawn
-        left = left - slopes[:, :, None] * left[:, None, place]
+        slopes = np.where(is_random[:, None], left[:, :, i] / divisor[:, None], 0.0)
+        center = center + slopes[part] * (drawn - center[:, i])[:, None]
+        center[:, i] = drawn
+        left = left - slopes[:, :, None] * left[:, None, i]
     # Resample the draws of each Gaussian by weight.
     if len(limits) > 1 and np.ptp(weight) > 0:
         for number in np.unique(part):

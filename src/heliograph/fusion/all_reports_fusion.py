@@ -168,14 +168,14 @@ def propagate_errors(state: ReportsBelief, centre_step: CentreStep, links: Repor
     """Predict zeta = (x, e_1, ..., e_nodes) over a step, zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i.
 
     A centre fuses reports of estimates m_i = x - e_i (e_i: the error of node i) by a Kalman filter of zeta, which has x
-    and all errors as its state. F, f and B are `step.transition`, `step.shift` and `step.noise_input` of `centre_step`,
-    which has the model of the step. w is the process noise, nu the noise of what the nodes receive, and K has their
+    and all errors as its state. F, f and B are the transition, offset and noise input of `centre_step`, which has the
+    model of the step. w is the process noise, nu the noise of what the nodes receive, and K has their
     gains on its diagonal. `state` also holds past reports, since reports may come late. `links`: model of the reports
     that are sent at this step.
     """
     step, errors = centre_step
     nodes, n, _ = step.gain.shape
-    state_size, zeta_size = len(state.gaussian.mean), len(step.shift)  # the state is zeta and past reports
+    state_size, zeta_size = len(state.gaussian.mean), len(step.offset)  # the state is zeta and past reports
     # Noise of zeta. B w is common to x and all errors. K nu reaches the errors alone: `behind_x` puts it behind x. A
     # third part covers rounding errors, in proportion to E[x x'].
     behind_x = np.eye(zeta_size, nodes * n, -n)
@@ -184,11 +184,11 @@ def propagate_errors(state: ReportsBelief, centre_step: CentreStep, links: Repor
         _factor_measurement_noise(step.gain, step.received).through(behind_x),
         rounding_of(jnp.tile(_find_second_moments_of_state(errors), 1 + nodes)),
     )
-    # The whole state: zeta moves by F, past reports become one step older, without shift or noise.
+    # The whole state: zeta moves by F, past reports become one step older, without offset or noise.
     report_map = ReportMap(step.transition)
-    shift = jnp.pad(step.shift, (0, state_size - zeta_size))
+    offset = jnp.pad(step.offset, (0, state_size - zeta_size))
     noise = zeta_noise.through(np.eye(state_size, zeta_size))
-    predicted = predict_affine(state.gaussian, report_map, shift, noise)
+    predicted = predict_affine(state.gaussian, report_map, offset, noise)
     # The bound Q of the errors by quantizers moves without noise, F Q F'.
     quantizer_bound = None
     if state.quantizer_bound is not None:

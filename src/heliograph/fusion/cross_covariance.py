@@ -25,10 +25,10 @@ SAME = 1e-13  # relative difference of two numbers that are the same but for the
 
 
 class Motion(NamedTuple):
-    """Plant over one step, x- = A x + b + w with Q = Cov w: matrix A (n, n), shift b (n,), noise Q (n, n)."""
+    """Plant over one step, x- = A x + b + w with Q = Cov w: matrix A (n, n), offset b (n,), noise Q (n, n)."""
 
     matrix: Float[Array, "n n"]
-    shift: Float[Array, " n"]
+    offset: Float[Array, " n"]
     noise: Float[Array, "n n"]
 
 
@@ -69,12 +69,12 @@ class ErrorMap(NamedTuple):
 class ErrorStep(NamedTuple):
     """One step of the plant and of the nodes' errors, zeta+ = F zeta + f + B w - K nu, w and nu uncorrelated.
 
-    Shapes: transition F, shift f (N,), noise_input B (N, n), process Q = Cov w (n, n), gain K (node, n, m), received
+    Shapes: transition F, offset f (N,), noise_input B (N, n), process Q = Cov w (n, n), gain K (node, n, m), received
     E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes share nothing.
     """
 
     transition: ErrorMap
-    shift: Float[jax.Array, " N"]
+    offset: Float[jax.Array, " N"]
     noise_input: Float[jax.Array, "N n"]
     process: Float[Array, "n n"]
     gain: Float[jax.Array, "node n m"]
@@ -160,17 +160,17 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
     A difference of two nearly equal matrices, such as A - F, is taken for 0 if it is rounding.
     """
     # K, U and L, where M - C is the error of the filter's model of the measurement.
-    gain, u, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.shift)
+    gain, u, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.offset)
     wrong_gain = gain @ _subtract_without_rounding(observation.gain, filters.output)
     # A - F and b - f, then U (b - f) - L b - K (o - c).
     matrices = _subtract_without_rounding(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
-    drifts = _subtract_without_rounding(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
-    shift = _multiply_by_node(u, drifts) - wrong_gain @ jnp.asarray(motion.shift)
-    shift = shift - _multiply_by_node(gain, _subtract_without_rounding(observation.offset, filters.offset))
+    drifts = _subtract_without_rounding(jnp.broadcast_to(motion.offset, filters.drift.shape), filters.drift)
+    offset = _multiply_by_node(u, drifts) - wrong_gain @ jnp.asarray(motion.offset)
+    offset = offset - _multiply_by_node(gain, _subtract_without_rounding(observation.offset, filters.offset))
     of_state = u @ matrices - wrong_gain @ motion.matrix  # U (A - F) - L A
     return ErrorStep(
         transition=ErrorMap(plant=motion.matrix, of_state=of_state, errors=u @ filters.transition),
-        shift=jnp.concatenate([jnp.asarray(motion.shift), shift.reshape(-1)]),
+        offset=jnp.concatenate([jnp.asarray(motion.offset), offset.reshape(-1)]),
         noise_input=jnp.concatenate([jnp.eye(n), (u - wrong_gain).reshape(-1, n)]),
         process=motion.noise,
         gain=gain,
@@ -181,9 +181,9 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
 def propagate_state(
     mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return E x and Cov x after a step x+ = A x + shift + w, with A = `motion.matrix` and Cov w = `motion.noise`."""
+    """Return E x and Cov x after a step x+ = A x + offset + w, with A = `motion.matrix` and Cov w = `motion.noise`."""
     matrix = jnp.asarray(motion.matrix)
-    mean_after = matrix @ mean + motion.shift
+    mean_after = matrix @ mean + motion.offset
     covariance_after = symmetric(propagate_by_mode(matrix, covariance, motion.noise))
     return mean_after, covariance_after
 
@@ -194,7 +194,7 @@ def propagate_errors_jointly(errors: ErrorMoments, step: ErrorStep) -> ErrorMome
     `errors` has the mean and covariance of zeta = (x, e_1, ..., e_nodes). Q: process noise. S_ij: noise that nodes
     share. K_i: gain of node i.
     """
-    mean = step.transition @ errors.mean.reshape(-1) + step.shift
+    mean = step.transition @ errors.mean.reshape(-1) + step.offset
     covariance = symmetric(propagate_by_mode(step.transition, errors.covariance, step.noise()))
     return ErrorMoments(mean.reshape(errors.mean.shape), covariance)
 
@@ -294,7 +294,7 @@ def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> 
         new_roots = jnp.concatenate([new_roots, jnp.pad(measurement_roots, ((n, 0), (0, 0)))], axis=1)
     else:
         independent_noise = propagate_by_mode(step.gain, step.received, 0.0)
-    mean = step.transition @ factors.mean.reshape(-1) + step.shift
+    mean = step.transition @ factors.mean.reshape(-1) + step.offset
     # Columns of the roots: n for x_0, then those of step 0, of step 1, ...
     first_new_column = n + new_roots.shape[1] * k
     roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new_roots, (0, first_new_column))

@@ -298,17 +298,11 @@ class LinearPlant(AbstractPlant):
     ):
         """Check and hold x+ = A x + B u + w: A, B and the noise, which may depend on u, and the law of x_0."""
         # E x_0; Cov x_0, or a `DiffuseStart` if states start unknown; and the law of x_0 about its mean.
-        self.initial_mean, law_or_covariance, self.deviation = _read_initial_law(
-            initial_mean, initial_covariance, unknown=True
-        )
+        self.initial_mean, initial, self.deviation = _read_initial_law(initial_mean, initial_covariance, unknown=True)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
-        self.initial_covariance = (
-            law_or_covariance.of_states(self.states)
-            if isinstance(law_or_covariance, DiffuseStart)
-            else law_or_covariance
-        )
-        if isinstance(law_or_covariance, DiffuseStart) and (circular or limits):
+        self.initial_covariance = initial.of_states(self.states) if isinstance(initial, DiffuseStart) else initial
+        if isinstance(initial, DiffuseStart) and (circular or limits):
             raise fail("initial covariance", "a known one beside angles and limits of states", "hg.diffuse")
         # Inputs: as many as B has columns, or as have names where something depends on them.
         varies = any(callable(entry) for entry in (matrix, input_matrix, noise))
@@ -359,19 +353,19 @@ def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: t
 
 
 def _read_initial_law(
-    mean: ArrayLike, law_or_covariance: NoiseLike | DiffuseStart, unknown: bool = False
+    mean: ArrayLike, initial: NoiseLike | DiffuseStart, unknown: bool = False
 ) -> tuple[Vector, Any, AbstractNoise | None]:
     """Return mean, covariance and law (None: Gaussian) of an initial state, which may be diffuse if `unknown`."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]
-    if isinstance(law_or_covariance, DiffuseStart):
+    if isinstance(initial, DiffuseStart):
         if not unknown:
             expected = "a covariance or a law, of a plant that is not linear (a large one where little is known)"
             raise fail("initial covariance", expected, "hg.diffuse")
-        return center, law_or_covariance, None
-    if not isinstance(law_or_covariance, AbstractNoise):
-        return center, covariance("initial covariance", law_or_covariance, n), None
-    law = as_noise("initial deviation", law_or_covariance, n)
+        return center, initial, None
+    if not isinstance(initial, AbstractNoise):
+        return center, covariance("initial covariance", initial, n), None
+    law = as_noise("initial deviation", initial, n)
     return center + law.mean, law.covariance, law
 
 

@@ -150,7 +150,7 @@ class Node(Module):
         """
         if self.trigger is None or self.trigger.reference != "prediction":
             return None
-        return next(name for name, filter in self.filters.items() if compares_with_prediction(filter, self.trigger))
+        return next(name for name, filter in self.filters.items() if compares_with_prediction(filter))
 
     @property
     def informed_by(self) -> str | None:

@@ -17,8 +17,8 @@ from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
 from heliograph.random_affine.words.bit_flips import Flips
 
 
-def compares_with_prediction(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
-    """Return whether a filter is made for a sender with this trigger's rule that compares with its prediction."""
+def compares_with_prediction(filter: AbstractFilter) -> bool:
+    """Return whether a filter is made for a sender that compares its signal with a prediction of it."""
     return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
 
 
@@ -69,7 +69,7 @@ def check_trigger(
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("trigger", "no filter that is fed back", "one")
     if trigger.reference == "prediction" and not any(
-        isinstance(filter, AbstractFilter) and compares_with_prediction(filter, trigger) for filter in filters.values()
+        isinstance(filter, AbstractFilter) and compares_with_prediction(filter) for filter in filters.values()
     ):
         raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
 

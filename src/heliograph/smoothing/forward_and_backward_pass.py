@@ -189,7 +189,7 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
 
 
 def _take_plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
-    """Return the mean of the plant's state, projection m + shift, for a mean m of the filter's state."""
+    """Return the mean of the plant's state, projection m + offset, for a mean m of the filter's state."""
     return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
 
 

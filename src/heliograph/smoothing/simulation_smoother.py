@@ -106,9 +106,9 @@ def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
 
 
 def _take_plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
-    """Return the plant's state (n,), projection y + shift, for the filter's state y = `x`; angles within -pi and pi.
+    """Return the plant's state (n,), projection y + offset, for the filter's state y = `x`; angles within -pi and pi.
 
-    Without a projection the filter's state is the plant's; `shift` is a mean that the filter subtracts.
+    Without a projection the filter's state is the plant's; `offset` is a mean that the filter subtracts.
     """
     x = x if step.projection is None else step.projection @ x
-    return wrap_angles(x if step.shift is None else x + step.shift, step.angles)
+    return wrap_angles(x if step.offset is None else x + step.offset, step.angles)

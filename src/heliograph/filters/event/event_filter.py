@@ -126,9 +126,9 @@ class EventFilter(AbstractSizedFilter):
         joint = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), known_reference)  # r = 0
         # Probabilities of each sender's status: link mode, steps since it sent, transmissions lost (S, M, A, C).
         counts = COUNTED if self.trigger.losses == "numbered" else 1
-        label = jnp.zeros((len(self.senders), len(self.initial), self.age_count, counts))
-        label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], joint), label[None])
+        status = jnp.zeros((len(self.senders), len(self.initial), self.age_count, counts))
+        status = status.at[:, :, 0, 0].set(jnp.asarray(self.initial))
+        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], joint), status[None])
         # Before its first transmission a sender that needs a reference must send.
         has_sent = jnp.full(len(self.senders), not self.trigger.needs_reference)
         return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
@@ -192,7 +192,7 @@ class EventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
-        mixture, has_sent, start = state.parts, state.begun, second_moments_at_start(self.plant)
+        mixture, has_sent, start = state.gaussian_sum, state.begun, second_moments_at_start(self.plant)
         log_likelihood, innovations, covariances = jnp.zeros(()), [], []
         # Senders one after the other, each given those before it; each sends the entries `components` of y.
         for s, components in enumerate(self.senders):
@@ -242,7 +242,7 @@ class EventFilter(AbstractSizedFilter):
         """
         # Probabilities (K, M, A, C) of Gaussian, link mode, steps since sent and number of losses, for each cause.
         s, losses = message.sender, message.losses
-        unsent, must_send = split_by_obligation(xry.label[:, s], message.has_sent, self.trigger.heartbeat)
+        unsent, must_send = split_by_obligation(xry.status[:, s], message.has_sent, self.trigger.heartbeat)
         loss_probability = self._loss_probability(channel, s)[:, None, None]
         by_cause = split_by_cause(unsent, must_send, loss_probability, losses, self.trigger.losses)
         truncate = (
@@ -259,12 +259,12 @@ class EventFilter(AbstractSizedFilter):
         """
         sender, x_and_r = self.senders[s], np.arange(len(self.states) + self.outputs)
         # |y - r| <= delta: it was not sent, or it had to be sent nevertheless and was lost.
-        inside = xry.relabel_sender(s, by_cause.unsent + by_cause.forced if self.may_lose else by_cause.unsent)
+        inside = xry.with_sender_status(s, by_cause.unsent + by_cause.forced if self.may_lose else by_cause.unsent)
         no_lost_references = inside.select_range(0, 0)
         pieces, _ = self.region.truncate_inside(inside, no_lost_references, sender)
         if self.may_lose:
             # |y - r| > delta: it was sent and lost.
-            sent = xry.relabel_sender(s, by_cause.dropped + by_cause.forced)
+            sent = xry.with_sender_status(s, by_cause.dropped + by_cause.forced)
             outside = self.region.truncate_outside(sent, sender, scale=1.0)
             pieces = concatenate_sums([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
         return pieces.select_components(x_and_r)
@@ -279,16 +279,16 @@ class EventFilter(AbstractSizedFilter):
         n, sender = len(self.states), self.senders[s]
         x_and_r = np.arange(n + self.outputs)
         # Not sent: |y - r| <= delta, and r stays.
-        unsent = xry.relabel_sender(s, by_cause.unsent)
+        unsent = xry.with_sender_status(s, by_cause.unsent)
         known, lost_before = self.region.truncate_inside(
             unsent.select_range(0, self.pieces), unsent.select_range(self.pieces), sender
         )
         # Sent by the rule and lost: |y - r| > delta. Forced and lost: y anywhere. In both cases y is the new r.
         outside = merge_groups(
-            self.region.truncate_outside(xry.relabel_sender(s, by_cause.dropped), sender, 1.0),
+            self.region.truncate_outside(xry.with_sender_status(s, by_cause.dropped), sender, 1.0),
             self.region.count_outside_parts(sender),
         )
-        anywhere = merge_groups(xry.relabel_sender(s, by_cause.forced))
+        anywhere = merge_groups(xry.with_sender_status(s, by_cause.forced))
         lost_now = concatenate_sums([outside, anywhere]).select_components(self._find_new_reference(sender))
         # Of all Gaussians with a lost reference, those nearest in r are merged until few remain.
         few_lost = reduce_to_count(
@@ -313,7 +313,7 @@ class EventFilter(AbstractSizedFilter):
         pattern_number = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
         chance = jnp.asarray(channel.chance)[:, pattern_number]
         arrival_probability = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
-        status = xry.label[:, s] * arrival_probability[:, None, None]
+        status = xry.status[:, s] * arrival_probability[:, None, None]
         if self.trigger.losses == "numbered":  # the sender's counter says how many were lost before
             status = status * agrees_with_number(losses, COUNTED)
         # The Gaussians before z and updated by z, for each mode, or once if all modes have the same law.
@@ -325,7 +325,7 @@ class EventFilter(AbstractSizedFilter):
             links.append(
                 LinkMoments(*jax.tree.map(lambda part, at=(mode, pattern_number): jnp.asarray(part)[at], moments))
             )
-            prior.append(xry.relabel_sender(s, status_of_mode))
+            prior.append(xry.with_sender_status(s, status_of_mode))
             updated.append(
                 condition_parts_on_received(prior[j], z, arrived, links[j], sender, self.outputs, self.delivers_signal)
             )
@@ -337,7 +337,7 @@ class EventFilter(AbstractSizedFilter):
         sent_updated, sent_prior = sorted_blocks[:count], sorted_blocks[count:]
         # All merged to one Gaussian of (x, y), since y is the next reference.
         merged = merge_groups(concatenate_sums(sent_updated).select_components(self._find_new_reference(sender)))
-        merged = merged.relabel_sender(s, status_after_sending(merged.label[:, s], is_lost=False))
+        merged = merged.with_sender_status(s, status_after_sending(merged.status[:, s], is_lost=False))
         predicted_z = predict_sent_value(sent_prior, links, sender, self.outputs)
         return self._pad_sum(merged), predicted_z.mean[0], predicted_z.covariance[0]
 
@@ -348,14 +348,14 @@ class EventFilter(AbstractSizedFilter):
         with P(sent) = FLOOR if |y - r| > delta is less probable, else 0; each uncut where the sender must send.
         """
         s = message.sender
-        by_rule, must_send = split_by_obligation(xry.label[:, s], message.has_sent, self.trigger.heartbeat)
-        sent_by_rule, sender = xry.relabel_sender(s, by_rule), self.senders[s]
+        by_rule, must_send = split_by_obligation(xry.status[:, s], message.has_sent, self.trigger.heartbeat)
+        sent_by_rule, sender = xry.with_sender_status(s, by_rule), self.senders[s]
         # 1 - RIM: y was compared before it was rounded, and may lie inside by as much.
         outside = self.region.truncate_outside(sent_by_rule, sender, scale=1 - RIM)
         log_mass_outside = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(sender), -1), axis=0)
         least = sent_by_rule.log_weight + np.log(FLOOR)
         fallback = sent_by_rule._replace(log_weight=jnp.where(log_mass_outside < least, least, -jnp.inf))
-        return concatenate_sums([outside, fallback, xry.relabel_sender(s, must_send)])
+        return concatenate_sums([outside, fallback, xry.with_sender_status(s, must_send)])
 
     def _loss_probability(self, channel: ChannelByPattern, s: int) -> jax.Array:
         """Return the probability that what a sender transmits is lost, for each mode of the link (M,)."""
@@ -384,6 +384,6 @@ class EventFilter(AbstractSizedFilter):
 
     def _merge_state(self, state: EventBelief) -> Gaussian:
         """Merge the sum into one Gaussian of the plant's state, the first components of (x, r)."""
-        stack_of_one = take_leading(merge_groups(state.parts).gaussian, len(self.states))
+        stack_of_one = take_leading(merge_groups(state.gaussian_sum).gaussian, len(self.states))
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], stack_of_one)
         return x

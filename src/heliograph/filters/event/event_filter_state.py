@@ -29,7 +29,7 @@ class EventBelief(NamedTuple):
         return self.weight, self.gaussian
 
     @property
-    def parts(self) -> GaussianSum:
+    def gaussian_sum(self) -> GaussianSum:
         """The sum, with the logarithms of its weights."""
         return GaussianSum(safe_log(self.weight), self.gaussian, self.label)
 
@@ -41,5 +41,9 @@ class EventBelief(NamedTuple):
         compare with. `moved` is True once a step was predicted.
         """
         return EventBelief(
-            weight=jnp.exp(mixture.log_weight), gaussian=mixture.gaussian, label=mixture.label, begun=begun, moved=moved
+            weight=jnp.exp(mixture.log_weight),
+            gaussian=mixture.gaussian,
+            label=mixture.status,
+            begun=begun,
+            moved=moved,
         )

@@ -131,7 +131,7 @@ def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Ar
         return moments.log_mass, from_columns(mean, join_columns(given_e.columns, explained_by_e))
 
     log_mass, truncated = jax.lax.map(truncate_one, mixture.gaussian)
-    return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.label)
+    return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.status)
 
 
 def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:

@@ -25,24 +25,24 @@ FLOOR = 1e-6  # probability of what the rule forbids
 class GaussianSum(NamedTuple):
     """Gaussians of a sum, with what is known of the sender in each.
 
-    log_weight (K,), gaussian of N components with a leading axis K, label (K, senders, ...): probabilities of each
+    log_weight (K,), gaussian of N components with a leading axis K, status (K, senders, ...): probabilities of each
     sender's status (such as link mode, steps since it sent, transmissions lost) given the Gaussian.
     """
 
     log_weight: Float[jax.Array, " K"]
     gaussian: Gaussian
-    label: Float[jax.Array, "K senders ..."]
+    status: Float[jax.Array, "K senders ..."]
 
-    def relabel_sender(self, s: int, label: jax.Array) -> "GaussianSum":
-        """Give sender s the status probabilities `label` (K, ...), one array for each of the K Gaussians.
+    def with_sender_status(self, s: int, status: jax.Array) -> "GaussianSum":
+        """Give sender s the status probabilities `status` (K, ...), one array for each of the K Gaussians.
 
         They need not sum to 1: their sum multiplies the Gaussian's weight. If the sum is 0, the old ones stay.
         """
-        one_per_gaussian = (-1, *[1] * (label.ndim - 1))  # shape of totals (K,) that broadcasts against `label`
-        total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
-        normalised = label / jnp.where(total > 0, total, 1.0).reshape(one_per_gaussian)
-        normalised = jnp.where((total > 0).reshape(one_per_gaussian), normalised, self.label[:, s])
-        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(normalised))
+        one_per_gaussian = (-1, *[1] * (status.ndim - 1))  # shape of totals (K,) that broadcasts against `status`
+        total = jnp.sum(status, axis=tuple(range(1, status.ndim)))
+        normalised = status / jnp.where(total > 0, total, 1.0).reshape(one_per_gaussian)
+        normalised = jnp.where((total > 0).reshape(one_per_gaussian), normalised, self.status[:, s])
+        return self._replace(log_weight=self.log_weight + safe_log(total), status=self.status.at[:, s].set(normalised))
 
     def scale_weights(self, log_factor: Array | float) -> "GaussianSum":
         """Multiply all weights by exp(log_factor)."""
@@ -118,7 +118,7 @@ def _truncate(mixture: GaussianSum, mean: jax.Array, slopes: jax.Array, ends: Se
     Each weight is multiplied by the probability of that region.
     """
     log_mass, truncated = truncate_gaussians(mixture.gaussian, mean, slopes, ends)
-    return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.label)
+    return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.status)
 
 
 def merge_groups(mixture: GaussianSum, groups: int = 1) -> GaussianSum:
@@ -131,7 +131,7 @@ def merge_groups(mixture: GaussianSum, groups: int = 1) -> GaussianSum:
 def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
     """Merge the components of each group into one Gaussian: compiled body of `merge_groups`.
 
-    Groups are consecutive and of equal size. A label, the probabilities of the sender's states, is averaged by weights.
+    Groups are consecutive and of equal size. Status probabilities are averaged by weights.
     """
 
     def merge_group(mixture: GaussianSum) -> GaussianSum:
@@ -140,7 +140,7 @@ def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
         # Weights relative to their sum, which has the logarithm `total`.
         share = jnp.exp(mixture.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
-        return GaussianSum(total, merge_mixture(mixture.gaussian, share), jnp.tensordot(share, mixture.label, axes=1))
+        return GaussianSum(total, merge_mixture(mixture.gaussian, share), jnp.tensordot(share, mixture.status, axes=1))
 
     size = len(mixture.log_weight) // groups
     few: GaussianSum = jax.vmap(merge_group)(

@@ -132,7 +132,7 @@ def condition_parts_on_received(
 
     # Update all Gaussians at once; by Bayes' rule each weight is multiplied by the density of z under its Gaussian.
     updated, log_density = jax.vmap(update_one)(mixture.gaussian)
-    return GaussianSum(mixture.log_weight + log_density, updated, mixture.label)
+    return GaussianSum(mixture.log_weight + log_density, updated, mixture.status)
 
 
 def _condition_on_received(

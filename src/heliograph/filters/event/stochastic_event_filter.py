@@ -137,9 +137,9 @@ class StochasticEventFilter(AbstractSizedFilter):
         if len(down):
             flag_innovation, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, flag_innovation)
-        # The sum's one Gaussian, and the law of the link's modes, which is its label.
+        # The sum's one Gaussian, and the law of the link's modes, which is its status.
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
-        corrected = StochasticBelief(x, after.label[0, 0], reference=state.reference, moved=state.moved)
+        corrected = StochasticBelief(x, after.status[0, 0], reference=state.reference, moved=state.moved)
         return corrected, Innovation(value, covariance, log_likelihood)
 
     def _condition_on_sending(
@@ -192,14 +192,14 @@ class StochasticEventFilter(AbstractSizedFilter):
                 arrive (`present`).
             down: a flag that the receiver gets, (1,): 1 if the link is down; (0,) if it gets none.
         """
-        # P(nothing arrives | mode) (M,). A label holds P(mode, link up or down), whose sum multiplies the weight.
+        # P(nothing arrives | mode) (M,). Its status holds P(mode, link up or down), whose sum multiplies the weight.
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
-        while_up = silent.relabel_sender(0, law[None] * (1 - lost))
+        while_up = silent.with_sender_status(0, law[None] * (1 - lost))
         if len(down):  # weight 0 if the flag says that the link is down
             while_up = while_up.scale_weights(jnp.where(down[0] > 0, -jnp.inf, 0.0))
         if not self.may_lose:
             return merge_groups(while_up)
-        while_down = _sum_of_one_gaussian(jnp.zeros(()), prior, law).relabel_sender(0, law[None] * lost)
+        while_down = _sum_of_one_gaussian(jnp.zeros(()), prior, law).with_sender_status(0, law[None] * lost)
         if len(down):  # weight 0 if the flag says that the link is up
             while_down = while_down.scale_weights(jnp.where(down[0] > 0, 0.0, -jnp.inf))
         return merge_groups(concatenate_sums([while_up, while_down]))
@@ -322,6 +322,6 @@ def _law_of_signal(signal: Signal) -> Gaussian:
 
 
 def _sum_of_one_gaussian(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:
-    """Return a sum of one Gaussian, with the probabilities `law` of the link's modes as its label."""
+    """Return a sum of one Gaussian, with the probabilities `law` of the link's modes as its status."""
     alone: GaussianSum = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], GaussianSum(log_weight, belief, law[None]))
     return alone

@@ -146,7 +146,7 @@ class GivingInFilter(AbstractSizedFilter):
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
         after, innovation = self.base.correct(state.believed, z, k)
-        left_out = arrived & (_get_weights_of_received(innovation) < 0.5)  # a gate's weights are 0 and 1
+        left_out = arrived & (jnp.asarray(innovation.weight) < 0.5)  # a gate's weights are 0 and 1
         refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
         suspect = refused > 0
         # The rival: it begins as the gate's estimate. Its prior is widened if it would refuse what the gate refuses.
@@ -257,11 +257,6 @@ def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of
     # Cov(x, t) = L diag(d) slopes' of x = m + L xi and t = E t + slopes xi + noise.
     cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
     return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))
-
-
-def _get_weights_of_received(innovation: Innovation) -> jax.Array:
-    """Return the weights of the received numbers (m,)."""
-    return jnp.asarray(innovation.weight)
 
 
 def _get_gate_rule(base: RobustFilter) -> Gate:

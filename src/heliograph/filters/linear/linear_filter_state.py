@@ -20,12 +20,12 @@ from heliograph.numerics.types import Float
 class PlantMotion(NamedTuple):
     """Plant over one step, x+ = A x + b + w.
 
-    Shapes: matrix A (n, n), shift b (n,), covariance Cov w (n, n). `noise` has columns of Cov w plus the rounding of x
+    Shapes: matrix A (n, n), offset b (n,), covariance Cov w (n, n). `noise` has columns of Cov w plus the rounding of x
     (n, columns).
     """
 
     matrix: jax.Array
-    shift: jax.Array
+    offset: jax.Array
     covariance: jax.Array
     noise: WeightedColumns
 
@@ -37,7 +37,7 @@ def motion_of_plant(plant: LinearPlant, u: jax.Array, initial_power: jax.Array) 
     """
     return PlantMotion(
         matrix=plant.transition_matrix(u),
-        shift=plant.shift(u),
+        offset=plant.shift(u),
         covariance=plant.noise_covariance(u),
         noise=factor_process_noise(plant, u, initial_power),
     )
@@ -73,9 +73,9 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
 
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
     """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
-    gaussian = predict_affine(belief.gaussian, step.matrix, step.shift, step.noise)
+    gaussian = predict_affine(belief.gaussian, step.matrix, step.offset, step.noise)
     before_data = MomentsBeforeData(belief.state_mean, belief.state_covariance)
-    mean, covariance = before_data.predict(step.matrix, step.shift, step.covariance)
+    mean, covariance = before_data.predict(step.matrix, step.offset, step.covariance)
     return LinearBelief(gaussian, mean, covariance)
 
 
@@ -85,14 +85,14 @@ class MomentsBeforeData(NamedTuple):
     mean: Float[jax.Array, " n"]
     covariance: Float[jax.Array, "n n"]
 
-    def predict(self, matrix: jax.Array, shift: jax.Array, noise: jax.Array) -> "MomentsBeforeData":
+    def predict(self, matrix: jax.Array, offset: jax.Array, noise: jax.Array) -> "MomentsBeforeData":
         """Return mean and covariance before any data after a step x+ = A x + b + w: A m + b and A P A' + Q.
 
-        A is `matrix`, b the `shift` and Q = Cov w the `noise` (n, n). For an unstable plant these moments grow without
+        A is `matrix`, b the `offset` and Q = Cov w the `noise` (n, n). For an unstable plant these moments grow without
         limit, and are kept so small that their squares, which later formulas take, are finite.
         """
         covariance = matrix @ self.covariance @ matrix.T + noise
-        return MomentsBeforeData(*_limit_to_finite_squares(matrix @ self.mean + shift, symmetric(covariance)))
+        return MomentsBeforeData(*_limit_to_finite_squares(matrix @ self.mean + offset, symmetric(covariance)))
 
     def measure(self, sensor: LinearSensor) -> SignalMoments:
         """Return the moments of the signal y = C x + v: its mean, E[y y'] and the columns of Cov v.

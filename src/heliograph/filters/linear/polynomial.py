@@ -117,15 +117,15 @@ class PolynomialFilter(AbstractSizedFilter):
         return add_mean(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the inner filter, whose state are monomials of x - E[x], with E[x] as shift.
+        """Return the smoother step of the inner filter, whose state are monomials of x - E[x], with E[x] as offset.
 
         The inner filter measures the monomials of z - E[z], so they replace z in the trace of its step. The smoother
-        step's projection picks x - E[x] among the monomials, and `shift` adds E[x].
+        step's projection picks x - E[x] among the monomials, and `offset` adds E[x].
         """
         z = subtract_mean(self.centre, step.z, step.prior.mean, step.k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
         inner_step = step.map_states(lambda state: state.inner)._replace(z=monomials)
-        return replace(self.inner.smoother_step(inner_step), shift=jnp.asarray(step.after.mean))
+        return replace(self.inner.smoother_step(inner_step), offset=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Return the same filter with the gains and covariances of the inner filter precomputed."""

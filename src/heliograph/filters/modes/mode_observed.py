@@ -88,7 +88,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             belief=belief,
             before=belief,
             z=jnp.full(first(self.channel).outputs, jnp.nan),
-            move=PlantMotion(matrix=jnp.eye(n), shift=jnp.zeros(n), covariance=zeros, noise=no_noise),
+            move=PlantMotion(matrix=jnp.eye(n), offset=jnp.zeros(n), covariance=zeros, noise=no_noise),
             begun=jnp.asarray(False),
         )
 

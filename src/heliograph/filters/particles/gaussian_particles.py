@@ -47,12 +47,6 @@ class PartlyDrawn(NamedTuple):
         """1 / sum of the squared weights: how many particles of equal weight would say as much."""
         return effective_number(self.weight)
 
-    @property
-    @in_float64
-    def mode_weights(self) -> jax.Array:
-        """Probabilities (N, M) of particle and mode."""
-        return self.weight[:, None] * jax.nn.softmax(self.log_mode, axis=1)
-
 
 def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
     """Return Gaussians (N, n) as those of every mode (N, M, n)."""

@@ -138,7 +138,7 @@ def word_filter(
         raise fail("encoder", "Words, whose bits the channel flips", "none")
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     # A dither that is subtracted again is received with each codeword, after what the channel delivers.
-    dithers = sum(place != FLAG for place in indices) if words.dither == "subtracted" else 0
+    dithers = sum(index != FLAG for index in indices) if words.dither == "subtracted" else 0
     one_gaussian = WordFilter(
         plant=plant,
         transform=rule,

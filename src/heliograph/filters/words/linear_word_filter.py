@@ -132,8 +132,8 @@ def build_behind_words(
     base = make(plant, rounded, numbers)
     overload = bound_overload(plant, rounded, numbers, encoder, indices)
     refuse_overload(overload)
-    words = tuple(i for i, place in enumerate(indices) if place != FLAG)  # rows of z that are words
-    centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in indices])
+    words = tuple(i for i, index in enumerate(indices) if index != FLAG)  # rows of z that are words
+    centres = np.array([0.0 if index == FLAG else encoder.each(encoder.centre, outputs)[index] for index in indices])
     gains = _gains_by_mode(channels if channel_by_mode else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
     claim_of_delay: Claim = "upper" if first(channel).past else "exact"

@@ -28,21 +28,21 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
 class Motion(NamedTuple):
-    """A plant over one step with inputs zero: x+ = matrix x + shift + w, `covariance` = Cov w."""
+    """A plant over one step with inputs zero: x+ = matrix x + offset + w, `covariance` = Cov w."""
 
     matrix: np.ndarray
-    shift: np.ndarray
+    offset: np.ndarray
     covariance: np.ndarray
 
 
 class Sensing(NamedTuple):
-    """The signal that is sent: y - c = matrix x + shift + v, about the centre c of the codewords.
+    """The signal that is sent: y - c = matrix x + offset + v, about the centre c of the codewords.
 
     `covariance` = Cov v, `rounding`: covariance of the error of rounding y to a codeword.
     """
 
     matrix: np.ndarray
-    shift: np.ndarray
+    offset: np.ndarray
     covariance: np.ndarray
     rounding: np.ndarray
 
@@ -109,7 +109,7 @@ def bound_overload(
     """
     link = at(numbers, k=0)
     # The sum over j assumes one gain per step: no late messages, no link with memory, every output a signal component.
-    no_bound = link.past or link.remembers or any(place < 0 for place in indices)
+    no_bound = link.past or link.remembers or any(index < 0 for index in indices)
     # Steps that are looked at, as far as plant, sensor and channel are defined.
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
     outputs = len(at(sensor, k=0).outputs)
@@ -148,10 +148,10 @@ def _describe_system(
     steps, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     for k in range(horizon):
         motion, sensing, link = _find_models_of_step(plant, sensor, links, k)
-        # E x+ = A E x + b, P+ = A P A' + Q; E(y - c) = C E x + shift, Cov y = C P C' + Cov v.
-        mean, P = motion.matrix @ mean + motion.shift, motion.matrix @ P @ motion.matrix.T + motion.covariance
-        # `sensing.shift` includes -c, so that the y of the code is E(y - c); CPC = C P C'.
-        y, CPC = sensing.matrix @ mean + sensing.shift, sensing.matrix @ P @ sensing.matrix.T
+        # E x+ = A E x + b, P+ = A P A' + Q; E(y - c) = C E x + offset, Cov y = C P C' + Cov v.
+        mean, P = motion.matrix @ mean + motion.offset, motion.matrix @ P @ motion.matrix.T + motion.covariance
+        # `sensing.offset` includes -c, so that the y of the code is E(y - c); CPC = C P C'.
+        y, CPC = sensing.matrix @ mean + sensing.offset, sensing.matrix @ P @ sensing.matrix.T
         signals.append((y, np.diag(CPC + sensing.covariance)))
         if link is not None:  # E[(y - c)(y - c)'], of the rounded signal that is sent
             second_moment = CPC + sensing.covariance + sensing.rounding + np.outer(y, y)
@@ -182,8 +182,8 @@ def _find_models_of_step(
 @cache_by_object
 def _find_motion(plant: LinearPlant) -> Motion:
     """Return A, b and Cov w with inputs zero."""
-    matrix, shift, covariance = _evaluate_motion(plant)
-    return Motion(matrix=np.asarray(matrix), shift=np.asarray(shift), covariance=np.asarray(covariance))
+    matrix, offset, covariance = _evaluate_motion(plant)
+    return Motion(matrix=np.asarray(matrix), offset=np.asarray(offset), covariance=np.asarray(covariance))
 
 
 @compile_on_call
@@ -205,7 +205,7 @@ def _find_sensing(sensor: LinearSensor) -> Sensing:
     source = np.asarray(law.source.covariance)
     return Sensing(
         matrix=np.asarray(sensor.matrix),
-        shift=np.asarray(law.mean),
+        offset=np.asarray(law.mean),
         covariance=source,
         rounding=np.asarray(law.covariance) - source,
     )
@@ -214,7 +214,7 @@ def _find_sensing(sensor: LinearSensor) -> Sensing:
 def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np.ndarray, second: np.ndarray) -> Steps:
     """Return one step of the linear system x+ = A x + b + w, z = E[G] (y - c) + E n + noise.
 
-    The signal is y - c = C x + shift + v about the centre c of the codewords, r the error of rounding it, and the link
+    The signal is y - c = C x + offset + v about the centre c of the codewords, r the error of rounding it, and the link
     is z = G s + n for s = y - c + r. `mean` (outputs,) and `second` (outputs, outputs) are E s and E[s s'] before any
     data.
     """
@@ -227,10 +227,10 @@ def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np
     noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T
     return Steps(
         transition=motion.matrix,
-        drift=motion.shift,
+        drift=motion.offset,
         process=motion.covariance,
         output=gain @ sensing.matrix,
-        offset=gain @ sensing.shift + np.asarray(link.offset),
+        offset=gain @ sensing.offset + np.asarray(link.offset),
         noise=noise + gain_noise,
     )
 

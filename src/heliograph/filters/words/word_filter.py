@@ -108,7 +108,7 @@ class WordFilter(AbstractGaussianStateFilter):
         """
         outputs = len(self.indices)
         # Rows of z that are words, the component of y of each, and how many steps it lies above the lowest word.
-        rows = [i for i, place in enumerate(self.indices) if place != FLAG]
+        rows = [i for i, index in enumerate(self.indices) if index != FLAG]
         component = np.array([self.indices[i] for i in rows])
         dither = z[outputs:] if len(z) > outputs else jnp.zeros(len(rows))
         index = (z[np.array(rows)] - jnp.asarray(self.low)[component]) / jnp.asarray(self.spacing)[component]
@@ -222,7 +222,7 @@ class WordFilter(AbstractGaussianStateFilter):
         second = signal.covariance + jnp.diag(rounding_variance) + jnp.outer(mean, mean)
         about_centre = signal._replace(mean=mean, noise=noise, second=second)
         # Rows of z that are codewords (not the reported mode, FLAG), and the component of y in each.
-        rows = np.array([i for i, place in enumerate(self.indices) if place != FLAG])
+        rows = np.array([i for i, index in enumerate(self.indices) if index != FLAG])
         component = np.array(self.indices)[rows]
         gain = jnp.asarray(numbers.mean_gain)
         values = z[rows] - jnp.asarray(self.centre)[component]

@@ -132,15 +132,17 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, relay: RelayLine)
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.gaussian.mean), len(offset)
     line, received = slice(relay.start, relay.start + relay.length), slice(relay.received, relay.received + m)
-    # The state becomes `matrix` x + `shift` + noise, with M l + b in the entries `received` and all others unchanged.
+    # The state becomes `matrix` x + `offset_of_state` + noise: M l + b in the entries `received`, all others unchanged.
     matrix = jnp.eye(total).at[received, :].set(0.0).at[received, line].set(gain)
-    shift = jnp.zeros(total).at[received].set(offset)
+    offset_of_state = jnp.zeros(total).at[received].set(offset)
     # E Cov(r given l), by E[l l'] before any data: a random gain multiplies l itself.
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
     link_noise = factor_link_noise(link, covariance + jnp.outer(mean, mean), mean)
     noise_columns = jnp.zeros((total, link_noise.matrix.shape[1])).at[received].set(link_noise.matrix)
     noise = WeightedColumns(noise_columns, link_noise.weights)
-    return predict_belief(state, PlantMotion(matrix=matrix, shift=shift, covariance=noise.covariance, noise=noise))
+    return predict_belief(
+        state, PlantMotion(matrix=matrix, offset=offset_of_state, covariance=noise.covariance, noise=noise)
+    )
 
 
 def enlarge_by_relays(

@@ -134,17 +134,16 @@ def _bound_probability_within_step(
     return np.asarray(np.sum(np.exp(log_share) * within_step, axis=1))
 
 
-def longest_run_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
-    """Return the least n for which n equal readings in a row have a probability of at most `seldom`.
+def longest_run_by_chance(equal: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return the least n for which n equal readings in a row have a probability of at most SELDOM.
 
     Noise is independent between readings, so n equal ones in a row have probability at most p^(n - 1).
 
     Args:
         equal: p, a bound of the probability that a reading equals the previous one.
-        seldom: the probability.
     """
     with np.errstate(divide="ignore"):
-        n = 1 + np.ceil(np.log(seldom) / np.log(np.clip(equal, 0.0, 1 - 1e-12)))
+        n = 1 + np.ceil(np.log(SELDOM) / np.log(np.clip(equal, 0.0, 1 - 1e-12)))
     return np.asarray(np.maximum(n, LEAST))  # LEAST is 3, since two equal readings may be one that was sent twice
 
 

@@ -91,7 +91,7 @@ class FusionCentre(Module):
         `mean` (n,) and `covariance` (n, n): of the plant's state. `filters`: matrices in the order of the nodes.
         """
         plant: LinearPlant = at(self.plant, k)
-        # x+ = A x + shift + w. The measurement is taken after the step, so its model needs the moments after the step.
+        # x+ = A x + offset + w. The measurement is taken after the step, so its model needs the moments after the step.
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         mean_after, covariance_after = propagate_state(mean, covariance, motion)
         observation = self.observation_model.observe(mean_after, covariance_after, k)

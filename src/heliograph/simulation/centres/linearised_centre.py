@@ -106,7 +106,7 @@ class LinearisedCentre(Module):
             # `AllReports` estimates the errors themselves, so that their means matter too.
             if isinstance(rule, AllReports):
                 drift = _compute_drift_of_mean_errors(before.rule, matrix, moved, error_factor, linear)
-                step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
+                step = step._replace(offset=jnp.concatenate([motion.offset, drift.reshape(-1)]))
             rule_state, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
             following[name] = LinearisedFusionState(errors, known=mean, rule=rule_state)
             results[name] = Estimate(mean, covariance, self.claim)
@@ -116,7 +116,7 @@ class LinearisedCentre(Module):
 def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: LinearisedStep) -> ErrorStep:
     """Return the step x+ = A x + b + w of the plant, and e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors.
 
-    A, b and w are the matrix, shift and noise of the plant's `motion`. K_i and nu_i are the gain and the measurement
+    A, b and w are the matrix, offset and noise of the plant's `motion`. K_i and nu_i are the gain and the measurement
     noise of node i, from `linear`. F_i = I - K_i C_i is `error_factor` (node, n, n). Errors do not depend on x and are
     not shifted, so errors of mean zero keep that mean.
     """
@@ -125,7 +125,7 @@ def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: Line
         transition=ErrorMap(
             plant=motion.matrix, of_state=jnp.zeros_like(error_factor), errors=error_factor @ motion.matrix
         ),
-        shift=jnp.pad(motion.shift, (0, nodes * n)),
+        offset=jnp.pad(motion.offset, (0, nodes * n)),
         noise_input=jnp.concatenate([jnp.eye(n), error_factor.reshape(nodes * n, n)]),
         process=motion.noise,
         gain=linear.gain,
@@ -150,7 +150,7 @@ def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMo
 def _compute_drift_of_mean_errors(
     state: ReportsBelief, matrix: jax.Array, predicted_mean: jax.Array, error_factor: jax.Array, linear: LinearisedStep
 ) -> jax.Array:
-    """Return the shift F_i (E e_i- - A E e_i) (node, n) of the mean errors, which the linear step does not give.
+    """Return the offset F_i (E e_i- - A E e_i) (node, n) of the mean errors, which the linear step does not give.
 
     The linear step takes E e_i to F_i A E e_i. But the plant is not linear: the predicted error has the mean
     E e_i- = E x- - m_i- with the filter's prediction m_i-, and a correction leaves F_i = I - K_i C_i of it.

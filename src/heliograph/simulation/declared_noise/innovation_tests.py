@@ -62,7 +62,7 @@ def examine_innovations(
         classes: class of each row, -1 of a row that is not used.
     """
     # u = S^-1/2 (z - E z) of the link's values: independent of each other, of variance 1, if S is true.
-    values_of_link = declared.place.values  # columns of z
+    values_of_link = declared.columns.values  # columns of z
     whitened = whitened_innovations(declared.z, filter, declared.u)[:, values_of_link]
     # Probability beyond each end of a class's interval, two ends for each class: by Bonferroni, all classes together
     # contradict a true claim with probability LEVEL at most.

@@ -20,10 +20,10 @@ from heliograph.random_affine.channel_state_information import AbstractToldMap
 from heliograph.simulation.declared_noise.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared_noise.refit import (
     DeclaredRows,
-    ReceivedLinkPlace,
+    ReceivedLinkColumns,
     Refit,
     find_interval_end,
-    find_link_place,
+    find_link_columns,
     list_links_declaring_noise,
     list_noise_variances,
     refit_filter,
@@ -243,17 +243,17 @@ class _DeclaredVariances(eqx.Module):
 
 
 def _compute_declared_variances(
-    link_place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
+    link_columns: ReceivedLinkColumns, z: Float[np.ndarray, "steps received"]
 ) -> Float[np.ndarray, "steps outputs"]:
     """Return the noise variances that each row's message reports, NaN where one of its numbers is missing.
 
     Variances are a function of the reported numbers. Where these are missing it is computed of the values that the link
     assumes for them (`typical`), so that it never fails.
     """
-    numbers = z[:, link_place.numbers]
+    numbers = z[:, link_columns.numbers]
     is_complete = ~np.isnan(numbers).any(axis=1)[:, None]
-    assumed_numbers = np.asarray(link_place.told.typical)
-    variances = over_runs(_DeclaredVariances(link_place.told), np.where(is_complete, numbers, assumed_numbers))
+    assumed_numbers = np.asarray(link_columns.told.typical)
+    variances = over_runs(_DeclaredVariances(link_columns.told), np.where(is_complete, numbers, assumed_numbers))
     return np.asarray(np.where(is_complete, np.asarray(variances), np.nan))
 
 
@@ -267,24 +267,24 @@ def _classify_rows(
     Returns:
         The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
     """
-    z, place = z.copy(), find_link_place(filter, link)
+    z, columns = z.copy(), find_link_columns(filter, link)
     with np.errstate(all="ignore"):
         # Messages whose numbers give no positive variance count as lost: they would spoil the filter's state.
         for number in list_links_declaring_noise(filter):
-            declaring = find_link_place(filter, number)
+            declaring = find_link_columns(filter, number)
             valid = np.all(_compute_declared_variances(declaring, z) > 0, axis=1, keepdims=True)
             z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
-        variances = _compute_declared_variances(place, z)
+        variances = _compute_declared_variances(columns, z)
         log_size = np.mean(np.log(variances), axis=1)
     # Rows in which the link reported a variance and a value came.
-    heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
+    heard = ~np.isnan(log_size) & ~np.isnan(z[:, columns.values]).all(axis=1)
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
-    sizes, numbers = log_size[heard], int(np.count_nonzero(~np.isnan(z[heard][:, place.values])))
+    sizes, numbers = log_size[heard], int(np.count_nonzero(~np.isnan(z[heard][:, columns.values])))
     classes = min(CLASSES, len(np.unique(sizes)), max(numbers // EACH, 1))
     inner = np.quantile(sizes, np.arange(1, classes) / classes, method="lower") if classes else np.empty(0)
     edges = np.unique(inner[inner < np.max(sizes, initial=-np.inf)])
     # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
-    outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
+    outputs = variances.shape[1] if columns.outputs is None else len(columns.outputs)
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
     deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
     return DeclaredRows(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, log_size), -1)
@@ -295,7 +295,7 @@ def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
     filter = declared.filter
     # A bias is a further state: it needs a model constant over time, and a link whose values are outputs one by one.
     varies = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
-    if varies or declared.place.outputs is None:
+    if varies or declared.columns.outputs is None:
         return None
     best = refit_with_bias(declared, scales)
     gain = best.likelihood - scales.likelihood
@@ -336,16 +336,16 @@ def _make_judgement(
     explains the innovations where no scale does; None if there is none.
     """
     before, after = tested
-    place, judged_classes = declared.place, []
+    columns, judged_classes = declared.columns, []
     for class_index, (nis, nis_low, nis_high) in enumerate(before.nis):
         # What each message of the class declares: one variance, the geometric mean over the outputs.
         rows = declared.z[classes == class_index]
-        variances = np.exp(np.mean(np.log(_compute_declared_variances(place, rows)), axis=1))
+        variances = np.exp(np.mean(np.log(_compute_declared_variances(columns, rows)), axis=1))
         scale, scale_low, scale_high = (float(values[class_index]) for values in scales)
         judged = DeclaredClass(
             low=float(variances.min()),
             high=float(variances.max()),
-            numbers=int(np.sum(~np.isnan(rows[:, place.values]))),
+            numbers=int(np.sum(~np.isnan(rows[:, columns.values]))),
             nis=nis,
             nis_low=nis_low,
             nis_high=nis_high,
@@ -356,7 +356,7 @@ def _make_judgement(
         judged_classes.append(judged)
     names = first(declared.filter.sensor).outputs
     return DeclaredJudgement(
-        outputs=tuple(names[i] for i in place.outputs or ()),  # none where values are not outputs one by one
+        outputs=tuple(names[i] for i in columns.outputs or ()),  # none where values are not outputs one by one
         classes=tuple(judged_classes),
         correlation=before.correlation,
         p_value=before.p_value,

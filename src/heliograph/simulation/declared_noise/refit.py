@@ -69,12 +69,12 @@ class DeclaredRows(NamedTuple):
         return len(self.edges) + 1
 
     @property
-    def place(self) -> "ReceivedLinkPlace":
+    def columns(self) -> "ReceivedLinkColumns":
         """Which columns of z are the judged link's reported numbers and values, and which outputs it carries."""
-        return find_link_place(self.filter, self.link)
+        return find_link_columns(self.filter, self.link)
 
 
-class ReceivedLinkPlace(NamedTuple):
+class ReceivedLinkColumns(NamedTuple):
     """Which received numbers belong to a link that reports numbers of its law, and which outputs the link carries.
 
     Args:
@@ -90,7 +90,7 @@ class ReceivedLinkPlace(NamedTuple):
     outputs: list[int] | None
 
 
-def find_link_place(filter: ToldFilter, link: int) -> ReceivedLinkPlace:
+def find_link_columns(filter: ToldFilter, link: int) -> ReceivedLinkColumns:
     """Return which received numbers belong to one of the links that report numbers of their law with each message.
 
     Each message brings values, and numbers such as the variance of their noise. A row of z has the values and numbers
@@ -112,7 +112,7 @@ def find_link_place(filter: ToldFilter, link: int) -> ReceivedLinkPlace:
     carries_all = len(values_of_link) == len(filter.values)
     outputs = list(range(len(sensor.outputs))) if carries_all else values_of_link
     has_value_for_each_output = len(sensor.outputs) == len(filter.values)
-    return ReceivedLinkPlace(
+    return ReceivedLinkColumns(
         told=maps[link],
         numbers=[filter.numbers[number] for number in numbers_of_link],
         values=[filter.values[value] for value in values_of_link],
@@ -202,19 +202,19 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
     how much. Messages are classed by the variance that they declare, and each class has a scale.
 
     Args:
-        declared: the filter, the link that is judged (`place`), the edges of the classes and the recording.
+        declared: the filter, the link that is judged (`columns`), the edges of the classes and the recording.
         logs: logarithms of the scale of each class (classes,). With a bias (classes + 2,) two more logarithms: of its
             deviation over the root of its memory, in units of the declared deviation, which data tell better than the
             deviation itself; and of its memory (the time after which it is forgotten), in the time of the plant.
     """
-    filter, numbers, place = declared.filter, jnp.exp(jnp.asarray(logs)), declared.place
+    filter, numbers, columns = declared.filter, jnp.exp(jnp.asarray(logs)), declared.columns
 
     def rescale(leaf: object) -> object:
         """Return the judged link's map with its noise scaled; anything else as it is.
 
         The link is known by its memory. `numbers`: the scale of each class of its messages, which `edges` part.
         """
-        if not isinstance(leaf, ToldMap) or leaf.memory.identity != place.told.memory.identity:
+        if not isinstance(leaf, ToldMap) or leaf.memory.identity != columns.told.memory.identity:
             return leaf
         scaled = LinkWithScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
         return eqx.tree_at(lambda affine: affine.make, leaf, scaled)
@@ -228,7 +228,7 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
         assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
         rate, time = numbers[declared.classes :]
         dt = TIME_STEP if TIME_STEP in plant.inputs else 1.0
-        deviation, loading = rate * jnp.sqrt(time) * declared.deviation, np.eye(len(sensor.outputs))[:, place.outputs]
+        deviation, loading = rate * jnp.sqrt(time) * declared.deviation, np.eye(len(sensor.outputs))[:, columns.outputs]
         plant, sensor = with_bias(plant, sensor, deviation, time, dt, loading=loading)
     return filter.with_models(plant, sensor, link)
 

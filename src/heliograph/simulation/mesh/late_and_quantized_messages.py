@@ -141,11 +141,11 @@ def step_messages_on_the_way(
         information: H_j' R_j^-1 H_j (node, n, n).
     """
     nodes, (ages, senders) = len(weighted), way.mean.shape[:2]  # numbers of nodes, of ages on the way, of senders
-    a, shift = jnp.asarray(motion.matrix), jnp.asarray(motion.shift)
+    a, offset = jnp.asarray(motion.matrix), jnp.asarray(motion.offset)
 
     def predict(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return estimates (..., n) and their covariances (..., n, n) predicted by one step."""
-        return mean @ a.T + shift, a @ covariance @ a.T + motion.noise
+        return mean @ a.T + offset, a @ covariance @ a.T + motion.noise
 
     # What is sent now, predicted, and corrected by the measurement that is sent with it.
     mean, predicted_covariance = predict(messages.mean[nodes : 2 * nodes], messages.covariance[nodes : 2 * nodes])

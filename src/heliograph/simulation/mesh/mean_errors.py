@@ -181,7 +181,7 @@ def _average_joint(
         step: the plant over the step, and the measurements' information S_l = H_l' R_l^-1 H_l.
     """
     count, degree = mesh.senders.shape
-    q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.shift)
+    q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.offset)
 
     def mean(values: np.ndarray) -> np.ndarray:
         """Return E[value] of each node (node, ...), sum_r p_r value_r over its patterns r, from `values` (row, ...)."""

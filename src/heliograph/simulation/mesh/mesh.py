@@ -147,7 +147,7 @@ class Mesh(Module):
         received = self._select_received_estimates(mean, state, jnp.asarray(arrived[:, -1]), messages)
         # Rows of `state` that only send, as those of a `NodeFilter`, end here: one row goes on for each node.
         mean = mean[self.senders[:, 0]]
-        predicted = mean @ step.motion.matrix.T + step.motion.shift
+        predicted = mean @ step.motion.matrix.T + step.motion.offset
         common = jnp.mean(predicted, axis=0)
         weighted = weigh_measurements(step.data, measured, present, common)
         innovation = self._compute_innovation(predicted, common, weighted, step, arrived)
@@ -160,7 +160,7 @@ class Mesh(Module):
             joint = propagate_joint(state.joint, step, arrived[:, -1], self.senders, self.edges.present)
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
         # What neighbours received last is predicted along, and messages go on towards them.
-        last = None if state.sent is None else received @ step.motion.matrix.T + step.motion.shift
+        last = None if state.sent is None else received @ step.motion.matrix.T + step.motion.offset
         way = None
         if messages is not None and state.way is not None:
             way = step_messages_on_the_way(messages, state.way, step.motion, common, weighted, step.data.information)
@@ -235,8 +235,8 @@ class Mesh(Module):
         blocks = None if blocks is None else jnp.asarray(blocks)
         # The plant over the step.
         plant: LinearPlant = at(self.plant, jnp.asarray(k))
-        shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
-        motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
+        offset = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+        motion = Motion(jnp.asarray(plant.matrix), offset, plant.noise_covariance(u))
         mean_before, covariance_before = moments
         after = propagate_state(jnp.asarray(mean_before), jnp.asarray(covariance_before), motion)
         # Rounds before the last intersect estimates alone.
@@ -346,7 +346,7 @@ class Mesh(Module):
             covariance: of all estimates before the step (row, n, n), one row for each node unless `senders` is given.
             blocks: joint covariance of each neighbourhood (node, degree, n, degree, n); None where no rule needs it.
             present: which messages arrive (node, degree).
-            motion: the plant over the step: its matrix, shift, and noise covariance.
+            motion: the plant over the step: its matrix, offset, and noise covariance.
             information: sum of H_j' R_j^-1 H_j over the measurements that reach each node (node, n, n).
             complete: the same sum if none were missing (node, n, n).
             precomputed: weights computed before, by bucket; empty where the rule computes them.
@@ -364,7 +364,7 @@ class Mesh(Module):
             step = NodeStep(motion.matrix, motion.noise, arrived=information, complete=complete)
             if node_weights:
                 factors, fused_covariance = node_weights
-                return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), factors, fused_covariance), step)
+                return gains_of(NeighbourWeights(jnp.eye(len(motion.offset)), factors, fused_covariance), step)
             return rule.neighbour_gains(received, step)
 
         gains: NodeGains = self._map_nodes(compute_node_gains, covariance, blocks, present, information, complete,
