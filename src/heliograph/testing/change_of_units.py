@@ -214,7 +214,7 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 def _rescale_matrix(
     matrix: MatrixOfInputs | ArrayLike, rows: np.ndarray, columns: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix of rows_i A_ij / columns_j, where these are factors; it is a function of the inputs if A is one.
+    """Return the matrix of rows_i A_ij / columns_j, all factors but A; it is a function of the inputs if A is one.
 
     `inputs` are the factors by which the inputs are divided before this function is called.
     """
