@@ -91,7 +91,7 @@ class CLowering(Lowering):
     def make_known_array(self, number: Any) -> Value:
         """Return an array of known numbers as a table in memory.
 
-        An entry of the table at a known place is read as a constant. Single numbers and empty arrays get no table:
+        An entry of the table at a known index is read as a constant. Single numbers and empty arrays get no table:
         the base class makes them. An array of objects holds nodes already, and is returned as it is.
         """
         if not isinstance(number, np.ndarray | np.generic | jax.Array) or not np.shape(number) or not np.size(number):

@@ -124,8 +124,8 @@ class Buffer:
     """Numbers in memory, `size` of each run; a table has the same numbers in all runs.
 
     `kind`: "input", "scratch", "table", or "carried" by a loop, of which each iteration fills it anew. A buffer that
-    the program fills is read after the statement of `block` that fills it. A buffer `inside` another starts at a place
-    of it. `first`: for each entry of a row the first place in the row that has the same number, as across the diagonal
+    the program fills is read after the statement of `block` that fills it. A buffer `inside` another starts at an entry
+    of it. `first`: for each entry of a row the first entry of the row that has the same number, as across the diagonal
     of a symmetric matrix; empty where all entries differ.
     """
 
@@ -145,7 +145,7 @@ class Buffer:
         self.stores: list[Store] = []  # statements that fill it
         self.inside: tuple[Buffer, int] | None = None  # the buffer that it is a part of, and from which entry on
         self.parts: list[Buffer] = []  # buffers inside it
-        self.first: list[int] = []  # for each place in a row the first place with the same number; empty if all differ
+        self.first: list[int] = []  # for each entry of a row the first entry with the same number; empty if all differ
 
     def place_buffer_inside(self, inner: "Buffer", start: int) -> None:
         """Place another buffer inside this one, from an offset on."""

@@ -38,14 +38,14 @@ LITTLE = 400_000
 TABLE = 64
 LOADED = TABLE**2
 # Numbers that all iterations of a loop compute, written out; of an array that a loop carries outside memory; terms of a
-# product by a known matrix in memory, its zeros left out; entries that updates at places of the data may change. The
+# product by a known matrix in memory, its zeros left out; entries that updates at indices of the data may change. The
 # noise of 32 outputs, 64 columns, in memory: 75 us a step and run, and 2.5 s of LLVM, for 103 and 6.1 written out; as
 # known to be of its own for each of 64 outputs 2 us written out, for 2.0 ms.
 WRITTEN_OUT = 2000
 # Terms of a product of numbers, or operations of a function in the place of another, that are written out: above that a
 # quarter of the longest program would be this one.
 MANY_TERMS = LONGEST // 4
-# Rows of a matrix whose eigenvalues are written out, numbers that are sorted, and places that data choose among, by
+# Rows of a matrix whose eigenvalues are written out, numbers that are sorted, and indices that data choose among, by
 # comparing each with each: of 20 rows the library's method is as fast.
 FEW = 20
 # Operations of a branch: one that has fewer is computed in any case, a jump past it would take as long. Of an event

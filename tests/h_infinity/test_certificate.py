@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.h_infinity import lipschitz_check
+from heliograph.h_infinity import slope_bounds
 from heliograph.h_infinity.certificate import make_theorem_matrix
 from tests.h_infinity.h_infinity_problems import node
 from tests.oracles import h_infinity_fusion as paper
@@ -73,7 +73,7 @@ def f(s):
 
 @pytest.mark.slow
 def test_the_papers_growth_constant_is_false_and_the_certificate_is_refused(monkeypatch):
-    monkeypatch.setattr(lipschitz_check, "LIMIT", 0)  # what is refuted hangs on no proof
+    monkeypatch.setattr(slope_bounds, "LIMIT", 0)  # what is refuted hangs on no proof
     design = hg.h_infinity.recursive_design(node(0), 1.8, START)
     findings = [hg.h_infinity.check_growth(f(s), 0.7, [-2.2, -2.2], [2.2, 2.2], name=f"f at step {s}") for s in (0, 15)]
     assert not findings[0].refuted and findings[1].refuted and findings[1].ratio > 15.7

@@ -11,7 +11,7 @@ from heliograph.learning.long_run_covariance import (
     estimate_by_bartlett,
     estimate_by_cosines,
     estimate_if_white,
-    find_numbers_told_by_few_stretches,
+    find_numbers_in_few_stretches,
     remove_predicted_scores,
 )
 from heliograph.learning.unidentified_directions import (
@@ -138,8 +138,8 @@ def test_a_step_is_told_of_by_few_rows_and_a_mean_by_all():
     """Of 100 rows: all at one, all alike, as a chi-square tells, and in the second half."""
     step, half = (np.arange(100) == 50).astype(float), (np.arange(100) >= 50).astype(float)
     columns = [step, np.ones(100), np.random.default_rng(0).normal(size=100) ** 2, half]
-    assert find_numbers_told_by_few_stretches([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
-    assert not find_numbers_told_by_few_stretches([np.ones((40, 1)), np.ones((60, 1))]).any()
+    assert find_numbers_in_few_stretches([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
+    assert not find_numbers_in_few_stretches([np.ones((40, 1)), np.ones((60, 1))]).any()
 
 
 def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():

@@ -43,7 +43,7 @@ class LateMeasurementWindow(NamedTuple):
         return self.steps + 1
 
     @property
-    def places(self) -> int:
+    def capacity(self) -> int:
         """Return for how many rows (steps) there must be memory.
 
         In continuous time a late measurement adds a row between others before the oldest row is dropped: one more.
@@ -107,7 +107,7 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
     data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
     row = lay_out_struct([state, *data])
     counters = [lay_out_array("uint32_t", 1)] * 4
-    whole = lay_out_struct([state, StructLayout(window.places * row.size, row.alignment), *counters])
+    whole = lay_out_struct([state, StructLayout(window.capacity * row.size, row.alignment), *counters])
     return WindowText(
         comment=_explain_window(window, prefix, whole.size),
         types=_declare_window(window, prefix, real),
@@ -139,7 +139,7 @@ def _declare_window(window: LateMeasurementWindow, prefix: str, real: Real) -> s
 
 typedef struct {{
     {prefix}_state now;
-    {prefix}_row rows[{window.places}];
+    {prefix}_row rows[{window.capacity}];
     uint32_t first;
     uint32_t count;
     uint32_t late;
@@ -186,7 +186,7 @@ def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int)
         f"is there already, counted in `held`; {refused_ages}and, by the code of {prefix}_step, one",
         "that would have its own step refused, or one after it.",
         f"sizeof({prefix}_window) is {bytes_held:,}. {prefix}_window_step takes the time of one step,",
-        f"{late} that of at most {window.places}, or {2 * window.places} where a step is refused.",
+        f"{late} that of at most {window.capacity}, or {2 * window.capacity} where a step is refused.",
     ]
 
 
@@ -198,7 +198,7 @@ def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real:
     names = {
         "p": prefix,
         "real": real,
-        "places": f"{window.places}U",
+        "capacity": f"{window.capacity}U",
         "rows": f"{window.rows}U",
         "check": "\n".join([*(f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(received)), nothing]),
         "copy_z": _generate_array_copy("row->z", "z", received),
@@ -208,7 +208,7 @@ def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real:
     }
     late = _LATE_STEP if window.time is None else _LATE_TIME
     if window.time is not None:
-        names |= {"dt": window.time, "rounding": _format_literal(window.places * DIGITS[real], real)}
+        names |= {"dt": window.time, "rounding": _format_literal(window.capacity * DIGITS[real], real)}
     return [text.format(**names) for text in (_PLACE, _RUN, _FILL, _START, _STEP, late)]
 
 
@@ -226,7 +226,7 @@ def _format_literal(number: float, real: Real) -> str:
 
 _PLACE = """static {p}_row *{p}_row_at({p}_window *window, uint32_t i)
 {{
-    return &window->rows[(window->first + i) % {places}];
+    return &window->rows[(window->first + i) % {capacity}];
 }}"""
 
 _RUN = """/* Run the rows from one on again; the estimate changes only where none is refused. */
@@ -282,7 +282,7 @@ _STEP = """int {p}_window_step({p}_window *window, const {real} z[], const {real
     if (refused != 0) {{ return refused; }}
     /* The row takes the place behind the newest one, or that of the oldest. */
     if (window->count == {rows}) {{
-        window->first = (window->first + 1U) % {places};
+        window->first = (window->first + 1U) % {capacity};
         --window->count;
     }}
     {p}_row *row = {p}_row_at(window, window->count);
@@ -324,7 +324,7 @@ static int {p}_make_row({p}_window *window, uint32_t i, {real} rest, const {real
         row->u[{dt}] = whole;
         (void){p}_run_again(window, i);
     }} else if (window->count > {rows}) {{
-        window->first = (window->first + 1U) % {places};
+        window->first = (window->first + 1U) % {capacity};
         --window->count;
     }}
     return refused;

@@ -225,7 +225,7 @@ def make_theorem_matrix(
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
         """Return rows over eta, q long, that multiply its parts by these blocks, given by the letter of the part.
 
-        eta is the vector of all that a step depends on. `at` gives the first place of each part by its letter. Parts
+        eta is the vector of all that a step depends on. `at` gives the first index of each part by its letter. Parts
         without a block get zeros.
         """
         matrix = np.zeros((height, q))

@@ -167,7 +167,7 @@ def _compute_eta_covariance(
         x: covariance of the state before the step.
         e: covariance of the error before the step.
     """
-    # The blocks of x and e; `begin` is the place of the next block.
+    # The blocks of x and e; `begin` is where the next block begins.
     n, y, q = system.states, system.output.shape[1], len(step.energy)
     covariance, begin = np.zeros((q, q)), 2 * n
     covariance[:n, :n], covariance[n:begin, n:begin] = x, e

@@ -231,7 +231,7 @@ def _format_interval(
     Args:
         parameters: the free numbers v_i.
         group: the confounded numbers; `coordinates` are theirs.
-        row: exponents a_i of a product, or weights of a sum, by place in the group.
+        row: exponents a_i of a product, or weights of a sum, by number in the group.
         solution: the maximum of the likelihood; None where there is none yet.
         log: whether it is a product, whose logarithm sum_i a_i log |v_i| is a sum.
     """

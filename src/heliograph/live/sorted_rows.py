@@ -13,8 +13,8 @@ import numpy as np
 
 from heliograph.live.event import CheckedEvent, Verdict
 
-Key: TypeAlias = "tuple[float, int, int]"  # of a row: time, place of the node (-1: inputs), sequence
-BEFORE = -2  # the place of what stands before everything at its time
+Key: TypeAlias = "tuple[float, int, int]"  # of a row: time, index of the node (-1: inputs), sequence
+BEFORE = -2  # the index of what stands before everything at its time
 
 
 class HeldRow:

@@ -54,16 +54,19 @@ Ended = TypeVar("Ended", bound=WithEnds)
 
 
 class FunctionInUnits(Module):
-    """A function of vectors in other units: out f(x_1 / into_1, ...). Functions in all units share one program."""
+    """A function f of vectors, in other units: r f(x_1 / a_1, ...). Functions in all units share one program.
+
+    result_factors: r, new units of the result per old one. argument_factors: a_1, ..., the same of each argument.
+    """
 
     function: Callable[..., ArrayLike]
-    out: np.ndarray
-    into: tuple[np.ndarray, ...]
+    result_factors: np.ndarray
+    argument_factors: tuple[np.ndarray, ...]
 
     def __call__(self, *vectors: jax.Array) -> jax.Array:
-        """Return the function's value in the other units, of vectors in these."""
-        before = (x / factors for x, factors in zip(vectors, self.into, strict=True))
-        return jnp.asarray(self.out) * jnp.asarray(self.function(*before))
+        """Return the function's value in the new units, of vectors in the new units."""
+        in_old_units = (x / factors for x, factors in zip(vectors, self.argument_factors, strict=True))
+        return jnp.asarray(self.result_factors) * jnp.asarray(self.function(*in_old_units))
 
 
 class Units(NamedTuple):
@@ -209,16 +212,16 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 
 
 def _rescale_matrix(
-    matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
+    matrix: MatrixOfInputs | ArrayLike, rows: np.ndarray, columns: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix with the elements out_i A_ij / into_j; it is a function of the inputs if A is one.
+    """Return the matrix of rows_i A_ij / columns_j, all factors but A; it is a function of the inputs if A is one.
 
     `inputs` are the factors by which the inputs are divided before this function is called.
     """
-    factor = out[:, None] / into
+    factor = rows[:, None] / columns
     if isinstance(matrix, MatrixOfInputs):
         return FunctionInUnits(matrix.function, factor, (inputs,))
-    return np.asarray(out[:, None] * matrix / into)
+    return np.asarray(rows[:, None] * matrix / columns)
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:

@@ -54,7 +54,7 @@ def is_long(inputs: list[Value]) -> bool:
 
 
 def _is_table(x: Value) -> bool:
-    """Return whether an array is a table of constants, at a place that is known."""
+    """Return whether an array is a table of constants, at an index that is known."""
     return isinstance(x, StridedArray) and x.buffer.kind == "table" and not x.moves
 
 
@@ -217,12 +217,12 @@ def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
     """
     if a.size * b.size <= MANY_TERMS * a.shape[left]:
         return 0
-    # At each place along the summed axis, each entry of a that is no known zero meets each such entry of b.
+    # At each index along the summed axis, each entry of a that is no known zero meets each such entry of b.
     return int(_count_nonzero_entries(a, left) @ _count_nonzero_entries(b, right))
 
 
 def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
-    """Return for each place along an axis how many of the entries there are not known to be zero."""
+    """Return for each index along an axis how many of the entries there are not known to be zero."""
     is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
     counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
     return counts
@@ -284,7 +284,7 @@ def _write_out_product(
 
 
 def _find_nonzero_entries(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
-    """Return the nodes of a row's entries that are not known to be zero, by their places.
+    """Return the nodes of a row's entries that are not known to be zero, by their indices.
 
     A row of numbers, rather than of nodes, is made constants.
     """

@@ -67,7 +67,7 @@ def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key several new keys: the hashes of 0, 1, 2, ... by the key, one for each place of a shape."""
+    """Return for each key several new keys: the hashes of 0, 1, 2, ... by the key, one for each entry of a shape."""
     _check_key_type(equation.invars[0])
     graph, counters = lowering.graph, _make_counters(lowering.graph, equation.params["shape"])
     keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
@@ -133,7 +133,7 @@ def _return_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray
 
 
 def _make_counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
-    """Return the counters 0, 1, 2, ..., one for each place of a shape, each as two words (upper, lower).
+    """Return the counters 0, 1, 2, ..., one for each entry of a shape, each as two words (upper, lower).
 
     More than LOADED counters raise Unsupported at once. So many hashes make a program too long, and it would take long
     to write them until they are refused.

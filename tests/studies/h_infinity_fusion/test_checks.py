@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.h_infinity import lipschitz_check
+from heliograph.h_infinity import slope_bounds
 from heliograph_studies import h_infinity_fusion
 from heliograph_studies.h_infinity_fusion import discriminating, example, levels, worst_disturbance
 from heliograph_studies.h_infinity_fusion.setting import Setting, dynamics
@@ -31,7 +31,7 @@ def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(m
 
 
 def test_the_growth_constant_is_false_for_differences_and_true_for_sizes(monkeypatch):
-    monkeypatch.setattr(lipschitz_check, "LIMIT", 256)  # boxes: of a slope above 15 no number proves 0.7
+    monkeypatch.setattr(slope_bounds, "LIMIT", 256)  # boxes: of a slope above 15 no number proves 0.7
     f, side = dynamics(15), np.full(2, 2.0)
     result = hg.h_infinity.check_growth(f, 0.7, -side, side)
     assert result.refuted and 15 < result.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2

@@ -222,9 +222,9 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
         for node, filters in record.estimates.items()
         for name, estimate in filters.items()
     ]
-    places = pose.places(record.states)
+    state_indices = pose.places(record.states)
     # Without any state of a pose no odometry is written.
-    is_on_some_axis = any(state is not None for axes in places for state in axes)
+    is_on_some_axis = any(state is not None for axes in state_indices for state in axes)
     for k, stamp in enumerate(times):
         for estimates in all_estimates:
             if not estimates.sound[k]:
@@ -232,7 +232,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
             if is_on_some_axis:
                 # A filter without a claim has no covariance to write.
                 claimed = None if estimates.claims[k] == "none" else estimates.covariance[k]
-                odometry = _make_odometry(stamp, estimates.mean[k], claimed, places, pose, types)
+                odometry = _make_odometry(stamp, estimates.mean[k], claimed, state_indices, pose, types)
                 yield stamp, f"{estimates.prefix}/odometry", odometry
             for topic, number in _yield_state_numbers(estimates, k, record.states):
                 yield stamp, topic, types[NUMBER](number)
@@ -251,7 +251,7 @@ def _make_odometry(
     stamp: int,
     mean: Float[np.ndarray, " n"],
     covariance: Float[np.ndarray, "n n"] | None,
-    places: tuple[list[int | None], list[int | None]],
+    state_indices: tuple[list[int | None], list[int | None]],
     pose: Pose,
     types: Any,
 ) -> object:
@@ -261,14 +261,14 @@ def _make_odometry(
         stamp: time of the estimate in nanoseconds since 1970.
         mean: mean of the states.
         covariance: covariance of the states; None where none is claimed.
-        places: by axis the index of the state that is along or about it, of the pose and of the twist (its velocity),
-            as `Pose.places` returns them.
+        state_indices: by axis the index of the state that is along or about it, of the pose and of the twist (its
+            velocity), as `Pose.places` returns them.
         pose: names of the frames.
         types: classes of messages by the names of their types.
     """
     geometry = "geometry_msgs/msg/"
     vector, point, quaternion = (types[f"{geometry}{name}"] for name in ("Vector3", "Point", "Quaternion"))
-    pose_states, twist_states = places
+    pose_states, twist_states = state_indices
     # Six numbers each, three along the axes and three about them, and their covariance (36,).
     position, position_covariance = _select_pose_and_covariance(mean, covariance, pose_states)
     velocity, velocity_covariance = _select_pose_and_covariance(mean, covariance, twist_states)
@@ -286,16 +286,16 @@ def _make_odometry(
 
 
 def _select_pose_and_covariance(
-    mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
+    mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, state_indices: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
     """Return the six numbers of a pose or twist, and their covariance (6, 6) row by row, (36,).
 
-    `places` holds for each axis the index of its state, or None; an axis without a state has zeros. If `covariance` is
-    None, the first entry of the result is UNKNOWN, -1, as ROS prescribes.
+    `state_indices` holds for each axis the index of its state, or None; an axis without a state has zeros. If
+    `covariance` is None, the first entry of the result is UNKNOWN, -1, as ROS prescribes.
     """
-    numbers = [0.0 if state is None else float(mean[state]) for state in places]
+    numbers = [0.0 if state is None else float(mean[state]) for state in state_indices]
     covariance_of_axes = np.zeros((6, 6))
-    pairs = [(axis, state) for axis, state in enumerate(places) if state is not None]
+    pairs = [(axis, state) for axis, state in enumerate(state_indices) if state is not None]
     if covariance is None:
         covariance_of_axes[0, 0] = UNKNOWN
     elif pairs:

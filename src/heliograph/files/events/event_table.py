@@ -179,19 +179,27 @@ class EventTable:
             ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
         by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
-        # Look at dates always, and at numbers only if these are no step numbers.
-        for name, columns in by_node if self.dated or not self.steps else ():
-            unset = columns.drop_unset_stamps_in_place(f"{source}, {name}")
-            self.notes += [unset.note] if unset.note else []
-            self.notes += columns.describe_doubtful_count(f"{source}, {name}")
-            if unset.reason:
-                self.refuse(InputError(unset.reason), strict)
-                self.refused += unset.removed - 1  # one was counted with the reason
+        if self.dated or not self.steps:  # step numbers are no stamps
+            for name, columns in by_node:
+                self._leave_out_unset_stamps(f"{source}, {name}", columns, strict)
         # Without an event the first thing that went wrong is the error.
         if not len(self) and (first := (*self.reasons, self.broken)[0]):
             raise InputError(first)
-        for name, columns in () if self.steps else by_node:
-            self.notes += columns.list_lost_digits(f"{source}, {name}")
+        if not self.steps:
+            self.notes += [line for name, columns in by_node for line in columns.list_lost_digits(f"{source}, {name}")]
+
+    def _leave_out_unset_stamps(self, name: str, columns: NodeEvents, strict: bool) -> None:
+        """Leave out a node's events whose time stamp was not set; count them as refused, and note what was doubtful.
+
+        Raises:
+            ValueError: there is such an event, where reading is strict.
+        """
+        unset = columns.drop_unset_stamps_in_place(name)
+        self.notes += [unset.note] if unset.note else []
+        self.notes += columns.describe_doubtful_count(name)
+        if unset.reason:
+            self.refuse(InputError(unset.reason), strict)
+            self.refused += unset.removed - 1  # `refuse` has counted one
 
     @property
     def origin(self) -> int:

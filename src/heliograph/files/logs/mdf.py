@@ -75,7 +75,7 @@ def _list_channels(file: "MDF", group: int) -> dict[str, int]:
 
 
 def _read_group(file: "MDF", group: int, indices: dict[str, int]) -> MessageSeries:
-    """Return the times, in seconds, and the signals of a group; `indices` holds their places in it, by name.
+    """Return the times, in seconds, and the signals of a group; `indices` holds their indices in it, by name.
 
     A sample that the file marks as invalid becomes None. A signal with several numbers per sample is left out.
     """

@@ -39,7 +39,7 @@ class RemarkWatch:
 
     def note_said(self, plant: PlantState) -> None:
         """Note that all remarks on a plant were made before it was stored, so that none is made again."""
-        plant.remarked = {place: said.times for place, said in self._read_remarks(plant.rows.held[-1]).items()}
+        plant.remarked = {filter: said.times for filter, said in self._read_remarks(plant.rows.held[-1]).items()}
 
     def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
         """Return the remark of each filter on its state after a row, by node and filter.
