@@ -201,7 +201,8 @@ def test_dates_beyond_64_bits_are_refused_at_every_door(text):
         with pytest.raises(ValueError):
             Message(node="a", sequence=0, time=text)
     for unit, beyond in (("Y", "1677"), ("M", "2262-05"), ("D", "2262-04-12"), ("us", "1677-12-31T23:59:59.999999"),
-                         ("us", "2262-04-11T23:47:16.854776"), ("W", "2262-04-17"), ("s", "1500-01-01"), ("ns", "1677-12-31")):  # fmt: skip
+                         ("us", "2262-04-11T23:47:16.854776"), ("W", "2262-04-17"), ("s", "1500-01-01"),
+                         ("ns", "1677-12-31")):  # fmt: skip
         with pytest.raises(ValueError, match=f"^time: expected dates {expected}, got {beyond[:4]}"):
             read_dates("time", np.array([beyond, "NaT"], f"datetime64[{unit}]"))
 
@@ -244,7 +245,9 @@ def test_basic_dates_and_leap_seconds_are_read(text, same):
 
 @pytest.mark.parametrize("text", ["2016-12-31T22:59:60Z", "2016-12-30T23:59:60Z", "2016-12-31T23:59:60.1234567891Z"])
 def test_other_sixtieth_seconds_and_finer_than_nanoseconds_are_refused(text):
-    with pytest.raises(ValueError, match=r"^time, row 1: expected a date as .*, from 1678 to 2262-04-11, to the nanosecond"):
+    with pytest.raises(
+        ValueError, match=r"^time, row 1: expected a date as .*, from 1678 to 2262-04-11, to the nanosecond"
+    ):
         parse_dates([text], "time")
 
 

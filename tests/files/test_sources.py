@@ -94,8 +94,8 @@ SECONDS = "1700000000.123456789"  # doubles are 2.4e-7 apart there
         ("t.csv", f"ts,p\n{SECONDS},1"),
         ("log.jsonl", f'{{"topic": "t.csv", "payload": {{"ts": {SECONDS}, "p": 1}}}}'),
         ("log.jsonl", f'{{"topic": "t.csv", "payload": "{{\\"ts\\": {SECONDS}, \\"p\\": 1}}"}}'),
-        ("log.txt", f"{SECONDS} u {{\"p\": 1}}"),
-        ("log.csv", f"topic,timestamp,payload\nu,{SECONDS},\"{{\"\"p\"\": 1}}\""),
+        ("log.txt", f'{SECONDS} u {{"p": 1}}'),
+        ("log.csv", f'topic,timestamp,payload\nu,{SECONDS},"{{""p"": 1}}"'),
     ],
 )
 def test_seconds_with_nine_decimals_keep_every_nanosecond(tmp_path, name, text):

@@ -91,7 +91,7 @@ class AbstractTrigger(Module):
             count = z.shape[-1] - self.side_information(outputs)
             came, stays = ~np.isnan(z[..., :count]), ~np.isnan(left[..., :count])
             if self.region != "each":  # all values are one message
-                came, stays = came.any(axis=-1, keepdims=True), stays.any(axis=-1, keepdims=True)
+                came, stays = (np.asarray(mask.any(axis=-1, keepdims=True)) for mask in (came, stays))
             left[..., count:] = np.where(came & ~stays, 1.0, left[..., count:])
         return left
 

@@ -216,6 +216,51 @@ def test_a_clock_that_was_set_back_is_refused(minutes):
         assert len(h.files.read_recording({"time": kept, "y": np.ones(len(kept))}, WALK).time) == len(kept)
 
 
+def in_berlin(utc):
+    """Local time in the weeks around the 29th of March and the 25th of October 2026."""
+    summer = (utc >= np.datetime64("2026-03-29T01:00")) & (utc < np.datetime64("2026-10-25T01:00"))
+    return utc + np.where(summer, 2, 1) * np.timedelta64(1, "h")
+
+
+@pytest.mark.parametrize("minutes", [10, 60])
+def test_a_clock_that_was_set_forward_is_said(minutes):
+    """As when summer time begins: a dt is an hour too long."""
+    utc = np.datetime64("2026-03-28T22:00", "ns") + np.arange(30) * np.timedelta64(minutes, "m")
+    with pytest.warns(UserWarning, match=r"column 'time': 2026-03-29T03:00:00 after .*: clocks are set forward so"):
+        h.files.read_recording({"time": in_berlin(utc), "y": np.ones(30)}, WALK)
+    others = utc, in_berlin(utc) + np.timedelta64(1, "D"), in_berlin(utc) + np.timedelta64(7, "D"), np.delete(utc, 20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for times in others:
+            h.files.read_recording({"time": times, "y": np.ones(len(times))}, WALK)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".jsonl"])
+def test_messages_in_local_time_are_refused_or_said_too(tmp_path, ending):
+    """Put in order, messages of two hours were mixed without a word; with their zone they are what they are."""
+
+    def read(first, zone=""):
+        utc = np.datetime64(first, "ns") + np.arange(30) * np.timedelta64(10, "m")
+        dates = [f"{moment}{zone}" for moment in (utc if zone else in_berlin(utc))]
+        rows = [f"a,{i},{date},1" for i, date in enumerate(dates)]
+        lines = [f'{{"node":"a","sequence":{i},"time":"{date}","values":[1]}}' for i, date in enumerate(dates)]
+        text = ["node,sequence,time,y", *rows] if ending == ".csv" else lines
+        (tmp_path / f"t{ending}").write_text("\n".join(text))
+        return h.files.read_messages(tmp_path / f"t{ending}", WALK)
+
+    with pytest.raises(
+        h.InputError, match=rf"t{ending}, a, column 'time': expected dates in UTC.* clocks are set back"
+    ):
+        read("2026-10-24T22:00")
+    (note,) = read("2026-03-28T22:00").notes
+    assert note.endswith(
+        "a, column 'time': 2026-03-29T03:00:00 after 2026-03-29T01:50:00: clocks are set forward so when summer time "
+        "begins; dates without a zone are taken as UTC"
+    )
+    for first in ("2026-10-24T22:00", "2026-03-28T22:00"):
+        assert read(first, zone="Z").notes == []
+
+
 def test_steps_that_are_rounded_by_the_size_of_their_times_are_said():
     """Nanoseconds since 1970 as doubles are multiples of 256: steps of 1000 were 1024, or 768, without a word."""
     k = np.arange(20)

@@ -89,6 +89,22 @@ def test_an_uplink_keeps_its_time_count_and_device(translator):
     assert message.values == pytest.approx([10.0], rel=1e-14)  # rounding
 
 
+@pytest.mark.parametrize("zone", ["", "Z"])
+def test_dates_without_a_zone_are_said_once(zone, caplog):
+    plant = hg.Plant(lambda x, u: x, lambda u: u[:1, None], [0.0], 1.0, states=["x"], inputs=["dt"])
+    network = hg.Network(plant, {"a": hg.Node(hg.LinearSensor([[1.0]], 0.1), hg.perfect(), {})})
+    line = f'{{"node":"a","sequence":0,"time":"2026-10-25T02:00:00{zone}","values":[1]}}'
+    for lines in ([line], ["node,sequence,time,values", f"a,0,2026-10-25T02:00:00{zone},1"],
+                  ["time,y0", f"2026-10-25T02:00:00{zone},1"]):  # fmt: skip
+        caplog.clear()
+        reader = LineReader(network)
+        for _ in range(2):
+            assert len(reader.read([text.encode() for text in lines])) <= 1
+            lines = lines[-1:]
+        assert ("standard input: dates without a zone are taken as UTC" in caplog.text) == (zone == "")
+        assert len(caplog.records) == (zone == "")
+
+
 def test_stored_and_unknown_messages_are_counted(translator):
     assert translator.read("zigbee2mqtt/garden", b'{"temperature": 1}', NOW, stored=True) == []
     assert len(translator.read("v3/farm@ttn/devices/a/up", json.dumps(UPLINK).encode(), NOW, stored=True)) == 1

@@ -18,7 +18,12 @@ from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import looks_like_date, parse_moment
-from heliograph.numerics.times.row_times import is_mix_of_units
+from heliograph.numerics.times.row_times import (
+    describe_clock_set_forward,
+    fail_of_clock_set_back,
+    is_mix_of_units,
+)
+from heliograph.numerics.times.timestamp_order import find_clock_set_back, find_clock_set_forward
 from heliograph.simulation.network import Network
 
 EXACT = 2**53  # up to here doubles hold every whole number
@@ -105,8 +110,27 @@ class OwnMessageCollector:
         if is_mix_of_units(self._reader.least, self._reader.most):
             span = f"from {self._reader.least:.14g} to {self._reader.most:.14g}"
             self._table.notes.append(f"{self.source}: times {span}: seconds and milliseconds, or such, in one column")
+        if self._reader.local:
+            self._check_local_time(self._table)
         self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
         return self._table
+
+    def _check_local_time(self, table: EventTable) -> None:
+        """Note where a node's dates, which have no zone, go on by an hour more, as local time does in spring.
+
+        Raises:
+            ValueError: a node's dates go back by an hour: put in order, messages of two hours would be mixed.
+        """
+        events = [(plant, *of_node) for plant in table.plants for of_node in table.of(plant).columns.items()]
+        for plant, node, columns in events:
+            time, _, sequence = columns.arrays()
+            time = time.astype(np.int64).view("datetime64[ns]")
+            where = f"{self.source}, {f'plant {plant!r}, ' if plant else ''}{node}, column {TIME!r}"
+            for clock in (time, time[np.argsort(sequence, kind="stable")]):  # as they came, and as they were sent
+                if (row := find_clock_set_back(clock)) is not None:
+                    raise fail_of_clock_set_back(where, clock, row)
+            if (row := find_clock_set_forward(np.sort(time))) is not None:
+                table.notes.append(f"{where}: {describe_clock_set_forward(np.sort(time), row)}")
 
     def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and an event of the inputs if the message holds inputs."""
@@ -200,6 +224,11 @@ class HeliographMessageReader:
             inputs = _read_event_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
             events.append((Reading(plant, INPUTS, sequence, time, inputs), arrival))
         return [*events, (Reading(plant, node, sequence, time, values), arrival)]
+
+    @property
+    def local(self) -> bool:
+        """Return whether times are dates without a zone, which are taken as UTC and may be local time."""
+        return self._zoned is False
 
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
         """Raise ValueError at an unknown column, which is most likely misspelt, or at one that lacks.

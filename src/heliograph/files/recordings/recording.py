@@ -28,8 +28,15 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import read_compact_date, seconds_between
-from heliograph.numerics.times.row_times import backwards_text, find_backwards_row, find_lost_digits, is_mix_of_units
-from heliograph.numerics.times.timestamp_order import find_clock_set_back
+from heliograph.numerics.times.row_times import (
+    backwards_text,
+    describe_clock_set_forward,
+    fail_of_clock_set_back,
+    find_backwards_row,
+    find_lost_digits,
+    is_mix_of_units,
+)
+from heliograph.numerics.times.timestamp_order import find_clock_set_back, find_clock_set_forward
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
@@ -217,9 +224,7 @@ class RowReader:
         """Raise ValueError if the dates go back by an hour as local time does when summer time ends."""
         row = find_clock_set_back(cells.time) if cells.time.dtype.kind == "M" else None
         if row is not None:
-            where = f"{self.source}, row {cells.numbers[row]}, column {TIME!r}"
-            came = f"{backwards_text(cells.time, row)}: clocks are set back so when summer time ends"
-            raise fail(where, "dates in UTC, or with their zone (pandas: tz_localize(ambiguous='infer'))", came)
+            raise fail_of_clock_set_back(f"{self.source}, row {cells.numbers[row]}, column {TIME!r}", cells.time, row)
 
     def make_recording(self, cells: RecordingRows, before: RecordingRows | None = None) -> Recording:
         """Return rows in the order of their times as a recording.
@@ -277,6 +282,7 @@ def _make_inputs(
     _warn_of_dates_as_numbers(time[rows.arrived], source)
     _warn_of_mixed_units(time[rows.arrived], source, rows.numbers[rows.arrived])
     _warn_of_lost_digits(time[rows.arrived], source)
+    _warn_of_clock_set_forward(time[rows.arrived], source, rows.numbers[rows.arrived])
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
@@ -306,6 +312,14 @@ def _warn_of_lost_digits(time: np.ndarray, source: str) -> None:
             "lost digits; whole numbers, dates, or times from the first row on keep them",
             stacklevel=7,
         )
+
+
+def _warn_of_clock_set_forward(time: np.ndarray, source: str, numbers: np.ndarray) -> None:
+    """Warn if dates go on by an hour more in a row, as local time does in spring; `numbers`: of the rows, from 1."""
+    row = find_clock_set_forward(time)
+    if row is not None:
+        said = describe_clock_set_forward(time, row)
+        warnings.warn(f"{source}, row {numbers[row]}, column {TIME!r}: {said}", stacklevel=7)
 
 
 def _warn_of_mixed_units(time: np.ndarray, source: str, numbers: np.ndarray) -> None:

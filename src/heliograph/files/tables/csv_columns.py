@@ -200,6 +200,11 @@ class CsvColumnReader:
             raise fail(f"{row.where}, column {name!r}", expected, show_value(cell))
         return number
 
+    @property
+    def local(self) -> bool:
+        """Return whether a column has dates without a zone, which are taken as UTC and may be local time."""
+        return False in self._zoned.values()
+
     @staticmethod
     def _is_missing(cell: str) -> bool:
         """Return whether a cell is empty, or says that there is no value."""

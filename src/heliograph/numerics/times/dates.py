@@ -35,7 +35,7 @@ def round_to_nanoseconds(dates: np.ndarray) -> np.ndarray:
         return dates.astype("datetime64[ns]")
     if unit in {"Y", "M", "generic"}:  # of no fixed length
         dates, unit, count = dates.astype("datetime64[D]"), "D", 1
-    size = int(np.timedelta64(count, unit).astype("timedelta64[ns]").astype(np.int64))
+    size = int(np.array([1], f"timedelta64[{count}{unit}]").astype("timedelta64[ns]").astype(np.int64)[0])
     numbers = dates.astype(np.int64)
     within = (numbers >= -(-FIRST // size)) & (numbers <= LAST // size)  # NaT is none of these
     return np.asarray(np.where(within, dates, np.array("NaT", dates.dtype)).astype("datetime64[ns]"))

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.check import InputError, array, fail, show_value
 from heliograph.numerics.masked_arrays import fill_masked, find_packing
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.times.dates import REACH, looks_like_date, parse_dates, round_to_nanoseconds
@@ -194,6 +194,21 @@ def find_backwards_row(clock: np.ndarray) -> int | None:
     is_lower = clock[1:] < clock[:-1]
     falls = np.flatnonzero(is_lower)
     return int(falls[0]) + 1 if falls.size else None
+
+
+def fail_of_clock_set_back(where: str, clock: np.ndarray, row: int) -> InputError:
+    """Return the error of dates in local time that go back by an hour in a row, where summer time ends.
+
+    `where` is the place of the row.
+    """
+    came = f"{backwards_text(clock, row)}: clocks are set back so when summer time ends"
+    return fail(where, "dates in UTC, or with their zone (pandas: tz_localize(ambiguous='infer'))", came)
+
+
+def describe_clock_set_forward(clock: np.ndarray, row: int) -> str:
+    """Return in words that dates without a zone go on by an hour more in a row, as local time does in spring."""
+    moments = " after ".join(np.datetime_as_string(clock[[row, row - 1]], unit="s").tolist())
+    return f"{moments}: clocks are set forward so when summer time begins; dates without a zone are taken as UTC"
 
 
 def backwards_text(clock: np.ndarray, row: int) -> str:

@@ -61,14 +61,48 @@ def find_clock_set_back(time: np.ndarray) -> int | None:
     if step > hour or np.count_nonzero(steps <= 0) > 2 * (1 + np.ptp(nanoseconds) // YEAR):
         return None  # the rows are in no order at all, or share their times
     rows = 1 + np.flatnonzero((steps <= 0) & (np.abs(-steps - (hour - step)) <= step / 2))
-    days = time[rows].astype("datetime64[D]")
-    is_sunday = (days.astype(np.int64) + 4) % 7 == 0  # 1970 began on a Thursday
-    is_early = time[rows] - days < np.timedelta64(3, "h")
-    months = days.astype("datetime64[M]")
-    month, day = months.astype(np.int64) % 12 + 1, (days - months).astype(np.int64) + 1
+    is_sunday, month, day = _read_calendar(time[rows])
+    is_early = time[rows] - time[rows].astype("datetime64[D]") < np.timedelta64(3, "h")
     ends_summer_time = ((month == 10) & (day > 24)) | (np.isin(month, (4, 11)) & (day < 8))
     found = rows[is_sunday & is_early & ((steps[rows - 1] < 0) | ends_summer_time)]
     return int(found[0]) if len(found) else None
+
+
+def find_clock_set_forward(time: np.ndarray) -> int | None:
+    """Return the first row by which a clock of local time was set forward, as when summer time begins; else None.
+
+    Dates then go from 01:50 to 03:00, if a row comes every ten minutes: by a step and an hour, and all of that hour,
+    the second, third or fourth of the day, is missing. Summer time begins on the second or the last Sunday of March,
+    the last of September or the first of October.
+
+    Args:
+        time: dates in the order of the rows, datetime64[ns]; numbers are no dates.
+    """
+    if time.dtype.kind != "M":
+        return None
+    nanoseconds: Int[np.ndarray, " rows"] = time.astype("datetime64[ns]").astype(np.int64)
+    steps: Int[np.ndarray, " steps"] = np.diff(nanoseconds)
+    forward = steps[steps > 0]
+    if not forward.size:
+        return None
+    step, hour = float(np.median(forward)), 3600 * SECOND
+    rows = 1 + np.flatnonzero((np.abs(steps - (hour + step)) <= step / 2) & (step <= hour))
+    is_sunday, month, day = _read_calendar(time[rows])
+    begins_summer_time = (month == 3) & ((day > 24) | ((day > 7) & (day < 15)))
+    begins_summer_time |= ((month == 9) & (day > 23)) | ((month == 10) & (day < 8))
+    midnight = time[rows].astype("datetime64[D]").astype("datetime64[ns]").astype(np.int64)
+    last, next_ = nanoseconds[rows - 1] - midnight, nanoseconds[rows] - midnight
+    is_hour_missing = np.any([(last < h * hour) & (next_ >= (h + 1) * hour) & (last >= 0) for h in (1, 2, 3)], axis=0)
+    found = rows[is_sunday & begins_summer_time & is_hour_missing]
+    return int(found[0]) if len(found) else None
+
+
+def _read_calendar(time: np.ndarray) -> tuple[Bool[np.ndarray, " rows"], np.ndarray, np.ndarray]:
+    """Return whether dates are of a Sunday, their months from 1, and their days of the month from 1."""
+    days = time.astype("datetime64[D]")
+    months = days.astype("datetime64[M]")
+    is_sunday = (days.astype(np.int64) + 4) % 7 == 0  # 1970 began on a Thursday
+    return is_sunday, months.astype(np.int64) % 12 + 1, (days - months).astype(np.int64) + 1
 
 
 def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:

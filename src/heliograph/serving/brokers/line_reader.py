@@ -15,6 +15,7 @@ from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
 from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.brokers.table_line_reader import TableLineReader, read_own_event
+from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.simulation.network import Network
 
@@ -69,6 +70,7 @@ class LineReader:
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
         self._number = 0  # of the newest line, for errors
+        self._is_local = False  # whether dates came without a zone
         # Messages of a file are put in order of arrival; messages of a pipe are passed on as they come.
         self._order = None if path is None else ArrivalOrder(self.source, TIME_STEP not in network.inputs)
 
@@ -89,6 +91,10 @@ class LineReader:
                 self._number += 1
                 payloads += self._read_line(line)
         payloads += self._table.read(rows) if rows else []
+        if not self._is_local and (self._own.local or self._table.local):
+            self._is_local = True  # said once
+            again = "in local time an hour comes twice when summer time ends"
+            LOG.warning("%s: dates without a zone are taken as UTC; %s", self.source, again)
         return payloads if self._order is None else self._order.add_messages(payloads)
 
     def end(self) -> list[Payload]:

@@ -42,6 +42,12 @@ class TableLineReader:
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
         self._reader: IndependentRowReader | TimeRowReader | None = None
+        self._own = HeliographMessageReader(network, self._source, ignore_unknown, table=True)
+
+    @property
+    def local(self) -> bool:
+        """Return whether dates came without a zone, which are taken as UTC and may be local time."""
+        return self._own.local or (isinstance(self._reader, TimeRowReader) and self._reader.local)
 
     def names_columns(self, line: str) -> bool:
         """Return whether a line is a table's header: it names a column that the network or its sources know."""
@@ -83,8 +89,7 @@ class TableLineReader:
         of times with the measurements of all nodes.
         """
         if {NODE, SEQUENCE} <= set(header):
-            own = HeliographMessageReader(self._network, self._source, self._ignore, table=True)
-            return IndependentRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
+            return IndependentRowReader(lambda row: read_own_event(self._own, row.where, convert_cells(row)))
         translator = self._translator
         if translator is not None:
             topic = translator.topic_of_rows(self._path, header)
@@ -127,6 +132,11 @@ class TimeRowReader:
         self._before: float | None = None  # time of the previous row
         self._is_file = text.path is not None
         self._cells = list[RecordingRows]()  # the rows of a file, until it ends
+
+    @property
+    def local(self) -> bool:
+        """Return whether dates came without a zone."""
+        return self._columns.local
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
         """Return the messages of rows, the same as a replay of these rows makes, and errors for rows that are refused.
