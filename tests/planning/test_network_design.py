@@ -240,10 +240,10 @@ def test_powers_that_no_transmitter_sends_are_named(single, powers, message):
         hg.planning.designed_network(single, powers, Error())
 
 
-def test_an_unstable_plant_needs_a_horizon_or_feedback():
+def test_an_unstable_plant_needs_a_horizon():
     plant = hg.LinearPlant([[1.1]], [[1.0]], [0.0], [[1.0]])
     network = hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[1.0]], 0.5), hg.hop(1.0, 0.2), {})})
-    with pytest.raises(ValueError, match="steady power: expected a stable plant, or a horizon, or feedback"):
+    with pytest.raises(ValueError, match="steady power: expected a stable plant, or a horizon, as what is sent"):
         hg.design(network, budget=1)
     assert hg.design(network, budget=1, error=Error(horizon=5)).certificate.gap < 1e-9
 
@@ -282,6 +282,8 @@ def test_senders_that_decide_or_round_are_refused(options, got):
         hg.design(build(1.0), budget=1.0)
     with pytest.raises(hg.InputError, match=message):
         hg.design(build, free={"amplification": (0.5, 0.01, 2.0)}, budget=0.3, starts=1)
+    with pytest.raises(hg.InputError, match=message.replace("a design:", "a designed network:")):  # the rule was lost
+        hg.planning.designed_network(build(1.0), {"free.hop1": [1.0]}, Error())
 
 
 def test_a_plant_without_noise_has_a_steady_error_of_zero():

@@ -108,3 +108,25 @@ def test_words_are_no_numbers_to_learn_from(learn):
 
     with pytest.raises(hg.InputError, match="network to be learned: expected senders of the numbers themselves"):
         learn(build)
+
+
+LAWS = hg.Discrete([0.5, 1.5], [0.5, 0.5]), hg.Discrete([0.2, 1.8], [0.5, 0.5])
+LEARN_OF_FEEDBACK = {
+    "identifiable": hg.learning.identifiable,
+    "fit": lambda build: hg.fit(build, DATA),
+    "samples_to_tell": lambda build: hg.learning.samples_to_tell(*LAWS, build(0.1)),
+}
+
+
+@pytest.mark.parametrize("learn", LEARN_OF_FEEDBACK)
+def test_differences_from_a_prediction_are_no_measurements_to_learn_from(learn):
+    """They were taken for what the sensor measures, with the very log-likelihood of a node without feedback."""
+    link = hg.hop(LAWS[0], 0.1)
+
+    def build(noise=None):
+        sensor = hg.LinearSensor([[1.0]], hg.free(0.1) if noise is None else noise)
+        informed = hg.filters.fed_back_filter(PLANT, hg.LinearSensor([[1.0]], 0.1), link)
+        return hg.Network(PLANT, {"a": hg.Node(sensor, link, {"f": informed})})
+
+    with pytest.raises(hg.InputError, match="expected senders of the numbers themselves, got a sensor with feedback"):
+        LEARN_OF_FEEDBACK[learn](build)

@@ -66,8 +66,8 @@ def samples_to_tell(
         nodes: number of values that stand for each law (default 64).
 
     Raises:
-        ValueError: a network with several nodes or none that receives through a channel, no gain to put the laws in, an
-            error outside (0, 0.5).
+        ValueError: a network with several nodes or none that receives through a channel, a node with a trigger, words
+            or feedback, no gain to put the laws in, an error outside (0, 0.5).
     """
     for name, law in (("first law", law_a), ("second law", law_b)):
         instance(name, law, AbstractLaw, "a law such as Rayleigh(1.0)")
@@ -106,6 +106,7 @@ def _find_only_node(network: Network) -> tuple[str, Node]:
         ValueError: any other network.
     """
     instance("network", network, Network, "a Network").check_sends_each_step("samples to tell two laws")
+    network.check_sends_numbers("samples to tell two laws")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
         raise fail("network", "one node that receives its sensor through a channel", f"{len(network.nodes)} nodes")

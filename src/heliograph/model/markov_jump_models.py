@@ -256,8 +256,7 @@ def markov_plant(
     only: a row that is inserted between two others is a step more.
 
     Args:
-        models: one plant for each mode, of the same states, inputs, angles and law of x_0; the first one's law counts
-            where JAX traces all of them, as no trace can compare them.
+        models: one plant for each mode, of the same states, inputs, angles and law of x_0 (if traced, the first one's).
         transition: P(next mode j | present mode i) (modes, modes), or a chain.
         initial: law (modes,) of the mode at the first step; the stationary law by default.
         name: links, sensors and plants of one name share the chain; by default it is the plant's own.
@@ -278,15 +277,13 @@ def markov_plant(
                 raise fail(f"{what} of model {i}", f"{list(getattr(plants[0], what))}, as those of model 0{remedy}",
                            list(getattr(plant, what)))  # fmt: skip
         for what in ("initial_mean", "initial_covariance", "deviation"):
-            own, of_first = getattr(plant, what), getattr(plants[0], what)
-            are_both_traced = is_traced(own) and is_traced(of_first)  # whose numbers nobody can compare
-            if not (are_both_traced or are_same(own, of_first)):
+            laws = getattr(plant, what), getattr(plants[0], what)
+            if not all(map(is_traced, laws)) and not are_same(*laws):
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:
         return ModalPlant(_read_mode_chain(transition, initial, name, modes, len(plants)), plants)
-    # With rates, it is these that move the mode, by the time between rows. The chain only holds the number of modes and
-    # the initial law: it never switches by itself, so its transition is the identity.
+    # Rates move the mode, by the time between rows. The chain, of the identity, holds the modes and the initial law.
     if initial is None:  # a law is asked for, since the identity has no stationary one of its own
         raise fail("rates of the modes", "initial=, the law of the mode of the first row, beside them", "none")
     if transition is not None or modes is not None:

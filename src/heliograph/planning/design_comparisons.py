@@ -237,7 +237,7 @@ def _list_relays(
     for i, hop in enumerate(hops):
         channel = _insert_relay(node.channel, hop, exponent)
         now = [f"{name}.{each}" for each in transmitter_names(channel)]
-        renamed = {f"{name}.{each}": (now[j + (j > i)],) for j, each in enumerate(hops)}
+        renamed: dict[str, tuple[str, ...]] = {f"{name}.{each}": (now[j + (j > i)],) for j, each in enumerate(hops)}
         renamed[f"{name}.{hop}"] = (now[i], now[i + 1])
         with_relay = {**nodes, name: Node(node.sensor, channel, {})}
         problems[f"a relay halfway of {name}.{hop}"] = _change_nodes(problem, network, with_relay, free_nodes, renamed)

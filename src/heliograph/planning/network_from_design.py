@@ -18,7 +18,7 @@ from heliograph.numerics.types import Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.multihop_paths.model import require_at_least
 from heliograph.planning.plant_moments import measured_moment_with_one, moments_with_one_over, steady_moment_with_one
-from heliograph.planning.transmitters import set_transmitter_powers, transmitter_names
+from heliograph.planning.transmitters import require_plain_senders, set_transmitter_powers, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -45,10 +45,12 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         The network; a period is repeated for about 100 steps.
 
     Raises:
-        ValueError: an unstable plant without a horizon, a transmitter that receives nothing or that there is not.
+        ValueError: an unstable plant without a horizon, a transmitter that receives nothing or that there is not, a
+            node with a trigger, words or feedback.
     """
     plant = instance("network", network, Network, "a Network").plant
     instance("error", error, Error, "an Error")
+    require_plain_senders("a designed network", network.nodes)
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     powers = _check_powers(powers, nodes, error.steps)
     # E (x, 1)(x, 1)' of the state at each step, in the steady state or over the horizon. It gives E (y, 1)(y, 1)' of

@@ -25,7 +25,7 @@ def check_stable(transition: Float[np.ndarray, "n n"]) -> None:
     """Raise ValueError where the second moments of a plant with this transition grow without limit."""
     radius = spectral_radius(transition)
     if radius >= 1:
-        expected = "a stable plant, or a horizon, or feedback: what is sent of an unstable plant grows without limit"
+        expected = "a stable plant, or a horizon, as what is sent of an unstable one grows without limit"
         raise fail("steady power", expected, f"spectral radius {radius:.6g}")
 
 

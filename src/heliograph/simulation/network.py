@@ -62,7 +62,7 @@ from heliograph.simulation.node import (
     get_parts_of_reception,
 )
 from heliograph.simulation.recordings.screened_recording import ScreenedRecording, screen_recording
-from heliograph.simulation.sender_checks import check_type, refuse_words
+from heliograph.simulation.sender_checks import check_type, refuse_words_and_feedback
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
@@ -385,8 +385,8 @@ class Network(Module):
         return screened.measurements
 
     def check_sends_numbers(self, what: str) -> None:
-        """Raise ValueError if a node rounds to codewords (`encoder`), since `what` is for the numbers themselves."""
-        refuse_words(what, self.nodes)
+        """Raise ValueError if a node sends words (`encoder`) or differences (feedback), not the numbers themselves."""
+        refuse_words_and_feedback(what, self.nodes)
 
     def check_sends_each_step(self, what: str) -> None:
         """Raise ValueError if a node has a trigger, since `what` needs senders that transmit at each step."""

@@ -22,8 +22,10 @@ def compares_with_prediction(filter: AbstractFilter) -> bool:
     return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
 
 
-def refuse_words(what: str, nodes: Mapping[str, object]) -> None:
-    """Raise ValueError if a sender rounds to words, of which `what` knows nothing: it is for the numbers themselves.
+def refuse_words_and_feedback(what: str, nodes: Mapping[str, object]) -> None:
+    """Raise ValueError if a sender rounds to words, or sends differences from a prediction that is fed back to it.
+
+    `what` knows nothing of them: it is for the numbers that sensors measure.
 
     Args:
         what: what is asked for, for the message.
@@ -32,6 +34,8 @@ def refuse_words(what: str, nodes: Mapping[str, object]) -> None:
     for name, node in nodes.items():
         if getattr(node, "encoder", None) is not None:
             raise fail(what, "senders of the numbers themselves", f"an encoder of words at node {name!r}")
+        if getattr(node, "informed_by", None) is not None:
+            raise fail(what, "senders of the numbers themselves", f"a sensor with feedback at node {name!r}")
 
 
 def check_trigger(

@@ -30,7 +30,8 @@ def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, and the sensor and channel of all nodes together in their order, if all packets arrive.
 
     Raises:
-        ValueError: relays that filter and forward, senders of words (a sensor with a resolution can be learned).
+        ValueError: relays that filter and forward, sensors with feedback, senders of words (a sensor with a resolution
+            can be learned).
     """
     network.check_sends_numbers("network to be learned")
     if network.relays is not None:
