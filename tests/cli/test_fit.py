@@ -24,8 +24,8 @@ network = hg.Network(plant, {{"a": hg.Node(sensor, hg.erasure(channel, 0.9), fil
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A network file, what it measured with other numbers, and what the command found there.
+def recorded(tmp_path_factory):
+    """A network file, and what it measured with other numbers.
 
     The network lies in a folder whose name the file that the command writes has to quote.
     """
@@ -36,9 +36,15 @@ def folder(tmp_path_factory):
     network = hg.files.load_network(str(place / "truth.py"))
     z = hg.monte_carlo(network, horizon=600, runs=1, key=1).measurements["a"][0]
     write_recording(Recording({"a": z}, np.zeros((600, 0)), np.arange(600.0)), network, place / "data.csv")
-    command = ["fit", str(place / "cart.py"), "--measurements", str(place / "data.csv"), "--out", str(place / "out")]
-    assert cli.main([*command, "--starts", "2"]) == 0
     return place
+
+
+@pytest.fixture(scope="module")
+def folder(recorded):
+    """The same, and what the command found there."""
+    files = ["--measurements", str(recorded / "data.csv"), "--out", str(recorded / "out")]
+    assert cli.main(["fit", str(recorded / "cart.py"), *files, "--starts", "2"]) == 0
+    return recorded
 
 
 @pytest.mark.slow
@@ -61,11 +67,11 @@ def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tm
 
 
 @pytest.mark.slow
-def test_a_share_of_rows_is_of_the_decimal_that_is_typed(folder, tmp_path):
+def test_a_share_of_rows_is_of_the_decimal_that_is_typed(recorded, tmp_path):
     """29 of 100: the nearest double of 0.29 times 100 is 28.999999999999996."""
-    lines = (folder / "data.csv").read_text().splitlines()
+    lines = (recorded / "data.csv").read_text().splitlines()
     (tmp_path / "data.csv").write_text("\n".join(lines[:101]))
-    command = ["fit", str(folder / "cart.py"), "--measurements", str(tmp_path / "data.csv"), "--held-out", "0.29"]
+    command = ["fit", str(recorded / "cart.py"), "--measurements", str(tmp_path / "data.csv"), "--held-out", "0.29"]
     assert cli.main([*command, "--out", str(tmp_path / "out"), "--starts", "1"]) == 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["held_out_rows"] == 29
 
@@ -109,21 +115,21 @@ def test_the_losses_of_the_recording_are_informed(folder):
     assert "How measurements are lost" in (folder / "out" / "report.html").read_text()
 
 
-def test_other_numbers_are_refused(folder, tmp_path):
+def test_other_numbers_are_refused(recorded, tmp_path):
     other = tmp_path / "other.json"
     other.write_text(json.dumps({"values": {"plant noise": 0.1}}))
     with pytest.raises(ValueError, match="expected those that are free in the network"):
-        load_fitted(folder / "cart.py", other)
+        load_fitted(recorded / "cart.py", other)
     other.write_text("[]")
     with pytest.raises(ValueError, match="expected a file that `heliograph fit` wrote"):
-        load_fitted(folder / "cart.py", other)
+        load_fitted(recorded / "cart.py", other)
 
 
-def test_a_network_in_which_nothing_is_free_is_informed(folder, tmp_path, capsys):
+def test_a_network_in_which_nothing_is_free_is_informed(recorded, tmp_path, capsys):
     path = tmp_path / "still.py"
     path.write_text(SOURCE.format(plant=1.0, hop=1.0).replace("hg.free(1.0, ", "(lambda x, y: x)(1.0, "))
     out = str(tmp_path / "out")
-    assert cli.main(["fit", str(path), "--measurements", str(folder / "data.csv"), "--out", out]) == 2
+    assert cli.main(["fit", str(path), "--measurements", str(recorded / "data.csv"), "--out", out]) == 2
     assert "expected at least one number marked by hg.free" in capsys.readouterr().err
     assert cli.main(["fit", str(path), "--measurements", "none.csv", "--out", out, "--held-out", "1"]) == 2
     assert "--held-out: expected a number from 0 to 0.9, got 1" in capsys.readouterr().err
@@ -157,7 +163,7 @@ def test_a_sender_that_decides_is_refused_with_what_learns_it(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypatch):
+def test_an_interrupted_search_keeps_the_best_so_far(recorded, tmp_path, monkeypatch):
     """The interrupt comes at the third look at how far the search has come."""
     from heliograph.learning import fitting
 
@@ -175,7 +181,7 @@ def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypat
     real = fitting.fit
     monkeypatch.setattr(fitting, "fit", lambda *a, progress, **k: real(*a, progress=interrupted(progress), **k))
     out = tmp_path / "out"
-    command = ["fit", str(folder / "cart.py"), "--measurements", str(folder / "data.csv"), "--out", str(out)]
+    command = ["fit", str(recorded / "cart.py"), "--measurements", str(recorded / "data.csv"), "--out", str(out)]
     assert cli.main([*command, "--starts", "2"]) == 0  # the command itself was not interrupted
     content = json.loads((out / "fitted.json").read_text())
     assert content["stopped"] and "best so far" in content["sentences"][0]
@@ -183,10 +189,10 @@ def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, capsys):
+def test_the_truth_is_learned_from_where_the_table_has_it(recorded, tmp_path, capsys):
     command = [
         "fit",
-        str(folder / "cart.py"),
+        str(recorded / "cart.py"),
         "--truth",
         "--starts",
         "1",
@@ -194,12 +200,12 @@ def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, caps
         str(tmp_path / "out"),
         "--measurements",
     ]
-    assert cli.main([*command, str(folder / "data.csv")]) == 2
+    assert cli.main([*command, str(recorded / "data.csv")]) == 2
     expected = (
-        f"heliograph: {folder / 'data.csv'}: expected columns of the true states, truth.STATE, for --truth, got none"
+        f"heliograph: {recorded / 'data.csv'}: expected columns of the true states, truth.STATE, for --truth, got none"
     )
     assert capsys.readouterr().err.endswith(f"{expected}\n")
-    table = (folder / "data.csv").read_text().splitlines()
+    table = (recorded / "data.csv").read_text().splitlines()
     rows = [f"{row},{row.split(',')[1]}" for row in table[1:60]]
     (tmp_path / "true.csv").write_text("\n".join([f"{table[0]},truth.x0", *rows]))
     assert cli.main([*command, str(tmp_path / "true.csv")]) == 0
@@ -233,12 +239,12 @@ def test_a_slower_sender_loses_what_was_due_and_did_not_come(tmp_path):
 
 
 @pytest.mark.filterwarnings("default")
-def test_readings_that_a_node_refuses_are_neither_learned_from_nor_judged_by(folder, tmp_path, capsys):
+def test_readings_that_a_node_refuses_are_neither_learned_from_nor_judged_by(recorded, tmp_path, capsys):
     """A code of -999 in a learned row and in a held-out one was a measurement of the fit and of its comparison."""
-    network = (folder / "cart.py").read_text()
+    network = (recorded / "cart.py").read_text()
     (tmp_path / "plain.py").write_text(network)
     (tmp_path / "codes.py").write_text(network.replace("0.9), filters)", "0.9), filters, invalid=-999)"))
-    lines = (folder / "data.csv").read_text().splitlines()[:121]
+    lines = (recorded / "data.csv").read_text().splitlines()[:121]
     place = lines[0].split(",").index("far")
     for value, name in (("", "plain"), ("-999", "codes")):
         rows = [line.split(",") for line in lines]

@@ -63,8 +63,8 @@ def test_a_run_takes_the_form_that_its_numbers_need():
         return item.correct(item.predict(item.init()), np.zeros(1))[0].gaussian.covariance
 
     with jax.enable_x64(True):
-        together = jax.jit(jax.vmap(variance))(np.array([[[1e-9]], [[1.0]]]))
-        apart = jax.jit(jax.vmap(variance))(np.array([[[1.0]], [[1.0]]]))
+        of_runs = jax.jit(jax.vmap(variance))
+        together, apart = (of_runs(np.array([[[noise]], [[1.0]]])) for noise in (1e-9, 1.0))
     np.testing.assert_array_equal(together[1], apart[1])
     assert together[0][0, 0] == pytest.approx(1e-9, rel=1e-6)
 
