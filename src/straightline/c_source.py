@@ -1,6 +1,7 @@
 """Graphs as statements of C99: a local variable for each number; operations, loops and guards as in the graph."""
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
@@ -89,6 +90,8 @@ def write_literal(value: float | int | bool, type: Type, real: Real) -> str:
     if math.isinf(value):
         return "INFINITY" if value > 0 else "(-INFINITY)"
     if c_type(type, real) == "float":
+        if abs(value) == sys.float_info.max:  # the largest number there is, as in nan_to_num
+            value = math.copysign(float(np.finfo(np.float32).max), value)
         with np.errstate(over="ignore", under="ignore"):
             single = np.float32(value)
         if not np.isfinite(single):
@@ -225,15 +228,16 @@ class CSource:
         return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def _clip_to_range(self, node: Node) -> str:
-        """Return the text of an argument of min or max; in float, a constant is clipped to float's range.
+        """Return the text of a number that others are compared with; in float, a constant is clipped to float's range.
 
-        A constant beyond that range bounds no float, and `write_literal` would refuse it.
+        A constant beyond that range bounds no float, and `write_literal` would refuse it. One that is nearer to zero
+        than any normal float, such as the least double, asks whether there is a reciprocal, and would be zero.
         """
-        if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
+        if node.op != "constant" or self.real != "float" or node.type != "f64" or not math.isfinite(node.value):
             return self.name_node(node)
-        largest = float(np.finfo(np.float32).max)
-        clipped = min(max(node.value, -largest), largest) if node.type == "f64" else node.value
-        return write_literal(clipped, node.type, self.real)
+        limits = np.finfo(np.float32)
+        size = min(max(abs(node.value), float(limits.tiny)), float(limits.max)) if node.value else 0.0
+        return write_literal(math.copysign(size, node.value), node.type, self.real)
 
     def write_statements(self, block: Block, indent: str = "    ") -> list[str]:
         """Return the lines of C for a block's operations and statements, in order, each after `indent`."""
@@ -282,7 +286,7 @@ class CSource:
             buffer, offset, strides = node.value
             text = self._write_entry(buffer, offset, strides, node.args)
         else:
-            named = self._clip_to_range if node.op in ("min", "max") else self.name_node
+            named = self._clip_to_range if node.op in ("min", "max", *QUIET) else self.name_node
             text = write_expression(node, [named(a) for a in node.args], self.real)
             self.operations[node.op] = self.operations.get(node.op, 0) + 1
         self.names[node] = self._new_name()

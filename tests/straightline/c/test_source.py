@@ -134,6 +134,23 @@ def test_in_single_precision(function, tmp_path):
     assert "double" not in "".join(body + tables), "a device without double precision would emulate it"
 
 
+def at_the_ends_of_doubles(x):
+    """A reciprocal of what has one, a bound far below float, and the largest number for an infinite one."""
+    least = jnp.finfo(float).tiny
+    one = jnp.where(x > least, 1 / jnp.where(x > least, x, 1.0), 0.0)
+    return one, 1 / jnp.sqrt(jnp.maximum(x, 1e-60)), jnp.nan_to_num(x + jnp.inf), jnp.where(x < 1e300, x, 0.0)
+
+
+@needs_compiler
+def test_in_single_precision_the_ends_of_doubles_are_those_of_floats(tmp_path):
+    """Before, both small bounds were 0, so that a subnormal number had an infinite reciprocal; the others no code."""
+    x, limits = np.array([3e-41, 0.25]), np.finfo(np.float32)
+    one, bounded, largest, small = compiled(at_the_ends_of_doubles, x, tmp_path, "float").reshape(4, 2)
+    assert np.array_equal(one, [0, 4]) and np.array_equal(small, x.astype(np.float32))
+    np.testing.assert_allclose(bounded, [float(limits.tiny) ** -0.5, 2], rtol=1e-6)
+    assert np.all(largest == limits.max)
+
+
 def test_control_stays_control():
     """A branch that is not taken is not computed, and a loop is not written out."""
     assert sum(line.strip().startswith("if (") for line in written(guarded, X)[0]) == 2

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns, join_columns
 from heliograph.factors.factored_gaussian import (
@@ -21,8 +22,9 @@ from heliograph.factors.factored_gaussian import (
 from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.received_outlier_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.trace_settings import precision_in_use
 
-LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow
+LARGEST = {np.float64: 1e150, np.float32: 1e12}  # deviations of the widest branch: beyond, squares overflow
 SMALLEST = 1e-200  # weight: below, a component counts as missing
 
 
@@ -113,7 +115,7 @@ def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.A
     p_j N(e; m_j, s_j). Then g = sum_j q_j u_j, and Var[t | z] / v = sum_j q_j r_j / s_j + v Var_q u.
     """
     s = v + noise
-    largest = LARGEST * jnp.sqrt(jnp.max(s))  # so that squares stay finite
+    largest = LARGEST[precision_in_use()] * jnp.sqrt(jnp.max(s))  # so that squares stay finite
     difference = jnp.clip(e, -largest, largest) - mean
     u = difference / s
     # log p_j N(e; m_j, s_j); q_j relative to the largest, so that none overflows.

@@ -14,6 +14,7 @@ from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.linalg import diagonal, outer, symmetric
 from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.trace_settings import precision_in_use
 from heliograph.numerics.types import Float
 
 
@@ -113,7 +114,7 @@ def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[ja
     Covariances are limited to `largest`, the root of the largest number, and means to the root of `largest`. Behind a
     known gain nothing depends on these moments.
     """
-    largest = float(np.finfo(covariance.dtype).max) ** 0.5
+    largest = min(float(np.finfo(one).max) for one in (covariance.dtype, precision_in_use())) ** 0.5
     # The mean of a damped plant decays to subnormal numbers, with which processors are ten times slower. Adding and
     # subtracting c rounds numbers to multiples of eps c (8e-140), and does not change those above c / eps (2e-108).
     c = float(np.finfo(covariance.dtype).tiny) ** 0.4
