@@ -145,6 +145,28 @@ def test_an_observation_has_the_derivatives_of_mean_covariance_and_density(start
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, float(np.max(np.abs(b)))))
 
 
+@pytest.mark.parametrize("r", [0.0, 1e-20, 1e-3])
+def test_a_precise_component_that_shows_one_state_alone(r):
+    """The other states have slopes of 0 in it: their variances get no differences of numbers of 1 / r."""
+    P, rows = SINGULAR["regular"], np.array([[1.0, 0.0, 0.0], [0.9, -1.0, 0.1]])
+
+    def observe(dR):
+        x = from_covariance(MEAN, P)
+        columns = join_columns(columns_of(r * np.eye(2) + dR), rounding_of(np.ones(2)))
+        after, seen = condition_on_observation(x, rows @ x.root, Z[:2], columns)
+        return after.covariance, seen.log_density(np.full(2, True), np.ones(2))
+
+    def by_covariances(dR):
+        S, C = rows @ P @ rows.T + r * np.eye(2) + dR, P @ rows.T
+        density = -(Z[:2] @ jnp.linalg.solve(S, Z[:2]) + jnp.linalg.slogdet(S)[1]) / 2
+        return P - C @ jnp.linalg.solve(S, C.T), density
+
+    slope = jnp.eye(2)
+    expected = jax.jvp(lambda t: by_covariances(t * slope), (0.0,), (1.0,))[1]
+    for a, b in zip(derivative(observe, slope)[1], expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=10 * TOLERANCE)
+
+
 def covariance_of_observed(*given_and_changes):
     return observe(*given_and_changes)[1]
 

@@ -35,11 +35,11 @@ def slopes_of(function, x):
         return np.asarray(compile_slopes(function)(np.array(x)))
 
 
-def affine_models(scales):
+def affine_models(scales, reading=READING):
     """Return a linear plant and sensor, written as functions of which a filter does not know that they are linear."""
     start, q, r = scales[:, None, None] * SHAPES
     plant = hg.Plant(lambda x, u: jnp.asarray(MOTION) @ x, q, np.zeros(2), start)
-    return plant, hg.Sensor(lambda x: jnp.asarray(READING) @ x, r)
+    return plant, hg.Sensor(lambda x: jnp.asarray(reading) @ x, r[: len(reading), : len(reading)])
 
 
 def likelihood(models, name, x):
@@ -56,6 +56,36 @@ def test_gradients_of_affine_functions_are_exact_where_covariances_are_zero(name
     slopes = slopes_of(AFFINE[name], scales)
     expected = differentiate_exactly(scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-20])
+@pytest.mark.parametrize("name", ["extended", "cubature"])
+def test_gradients_with_a_precise_sensor_of_one_of_the_states(name, noise):
+    """To 1e-11 of the largest, as above: the other state has no slope in what is measured."""
+    reading, rows, scales = np.array([[1.0, 0.0]]), ROWS[:, :1], (0.8, 0.25, noise)
+    slopes = slopes_of(lambda x: hg.log_likelihood(FILTERS[name](*affine_models(x, reading)), rows), scales)
+    expected = differentiate_exactly(scales, reading, rows)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+def test_second_derivatives_are_right_or_not_finite():
+    """Of a filter by factors those along a variance of zero; beside it they are the Kalman filter's, to 1e-9."""
+
+    def hessian(scales, make):
+        with jax.enable_x64(True):
+            return np.asarray(jax.jit(jax.hessian(lambda x: hg.log_likelihood(make(x), ROWS)))(np.array(scales)))
+
+    def by_factors(x):
+        return hg.extended_filter(*affine_models(x))
+
+    def by_covariances(x):
+        plant, sensor = affine_models(x)
+        linear = hg.LinearPlant(MOTION, plant.noise.covariance, np.zeros(2), plant.initial_covariance)
+        return hg.kalman_filter(linear, hg.LinearSensor(READING, sensor.noise.covariance))
+
+    expected = hessian((0.8, 0.25, 0.4), by_covariances)
+    np.testing.assert_allclose(hessian((0.8, 0.25, 0.4), by_factors), expected, rtol=1e-9)
+    assert not np.any(np.isfinite(hessian((0.0, 0.0, 0.5), by_factors)[:2, :2]))
 
 
 def move(x, u=()):
@@ -233,3 +263,53 @@ def test_a_planned_filter_has_the_gradient_of_the_filter_itself(scales):
     """Its matrices are recorded in the same trace; to some thousand roundings of the largest."""
     slopes, expected = slopes_of(planned_likelihood, scales), slopes_of(kalman_likelihood, scales)
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
+def scalar_models(scales):
+    start, q, r = scales[:3, None, None]
+    return hg.LinearPlant([[0.8]], q, [0.3], start), hg.LinearSensor([[1.0]], r)
+
+
+@pytest.mark.parametrize("scales", [(0.8, 0.25, 0.3), (0.0, 0.0, 0.5)])
+def test_a_sender_that_is_silent_by_chance(scales):
+    """To 1e-8: silence has no innovation, of which NaN took part in the derivative backwards."""
+
+    def likelihood(x):
+        trigger = hg.StochasticTrigger(0.6)
+        return hg.log_likelihood(hg.event_filter(*scalar_models(x), hg.perfect(), trigger), [[1.25], [np.nan], [0.4]])
+
+    expected = differences(lambda x: float(likelihood(x)), scales, step=1e-3)
+    np.testing.assert_allclose(slopes_of(likelihood, scales), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+
+
+def test_a_clock_has_a_gradient():
+    """Backwards too: whether a clock is observed is judged by eigenvalues."""
+    dt, clock, z = 0.5, {"b": hg.model.Clock(0.5, 2e-3)}, np.array([[0.6, 0.2], [1.1, 0.7], [1.4, 1.3]])
+
+    def likelihood(x):
+        cart = hg.LinearPlant([[1.0, dt], [0.0, 1.0]], x[1] * SHAPES[1], [0.0, 1.0], x[0] * SHAPES[0])
+        position = hg.LinearSensor([[1.0, 0.0]], x[2:, None])
+        plant, sensors = hg.model.with_clocks(cart, dict.fromkeys("ab", position), clock, [[0.0, 1.0], [0.0, 0.0]], dt)
+        both = hg.model.joint_sensor(sensors)
+        return hg.log_likelihood(hg.filters.clock_filter(plant, both, hg.parallel([hg.perfect()] * 2), ["b"]), z)
+
+    expected = differences(lambda x: float(likelihood(x)), (0.0, 0.0, 0.5))
+    slopes = slopes_of(likelihood, (0.0, 0.0, 0.5))
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-5 * np.max(np.abs(expected)))
+
+
+def test_what_jumps_or_is_excluded_has_no_derivative():
+    """A precise value beyond a limit is moved into it by what is left of the covariance; 1.2 is no multiple of 0.25."""
+
+    def within_limits(x):
+        start, q, r = x[:, None, None] * SHAPES
+        plant = hg.LinearPlant(MOTION, q, START, start, limits={"x0": (-1.0, 0.5)})
+        return hg.log_likelihood(hg.kalman_filter(plant, hg.LinearSensor(READING, r)), ROWS)
+
+    def in_steps(x):
+        plant, sensor = scalar_models(x)
+        sensor = hg.LinearSensor([[1.0]], sensor.noise.covariance, resolution=0.25)
+        return hg.log_likelihood(hg.word_filter(plant, sensor), [[1.25], [1.2]])
+
+    assert np.all(np.isnan(slopes_of(within_limits, (0.8, 0.25, 0.0))))
+    assert np.all(np.isnan(slopes_of(in_steps, (0.8, 0.25, 0.5))))

@@ -44,6 +44,24 @@ def square_root(x: jax.Array) -> jax.Array:
     return lax.select(positive, lax.sqrt(lax.select(positive, x, lax.full_like(x, 1.0))), lax.full_like(x, 0.0))
 
 
+@jax.custom_jvp
+def share_of_sum(part: jax.Array, rest: jax.Array) -> jax.Array:
+    """Return part / (part + rest), 0 of 0, with the derivative (rest part' - part rest') / (part + rest)^2.
+
+    Derivatives of a quotient would be differences of numbers as large as 1 / part, where the rest is zero.
+    """
+    return part * reciprocal_or_one(part + rest)
+
+
+@share_of_sum.defjvp
+def _differentiate_share(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """Return the share, and its derivative along the tangents, which has no difference of nearly equal numbers."""
+    (part, rest), (d_part, d_rest) = primals, tangents
+    reciprocal = reciprocal_or_one(part + rest)
+    d_share = (rest * reciprocal) * (d_part * reciprocal) - (part * reciprocal) * (d_rest * reciprocal)
+    return share_of_sum(part, rest), d_share
+
+
 def replace_value(value: jax.Array, expression: jax.Array) -> jax.Array:
     """Return a value with the derivatives of an expression that is another way to compute it, or all but it."""
     return value + (expression - lax.stop_gradient(expression))
@@ -80,14 +98,17 @@ def take_pivot(
         return d, column, reciprocal_or_zero(d)
     is_more = pivot > jnp.maximum(lowest, rounding_of_pivots(covariance) * abs(covariance[j, j]))
     smallest = float(np.finfo(np.dtype(pivot.dtype)).tiny) ** INFINITESIMAL
-    d = jnp.where(is_more, pivot, replace_value(jnp.maximum(lowest, smallest), pivot))
-    return d, jnp.where(is_more, column, replace_value(jnp.zeros_like(column), column)), 1 / d
+    once = differentiable_once(column, ~is_more)  # 1 / d has no digits left of a second derivative
+    d = jnp.where(is_more, pivot, replace_value(jnp.maximum(lowest, smallest), once[j]))
+    return d, jnp.where(is_more, column, replace_value(jnp.zeros_like(column), once)), 1 / d
 
 
 def set_to_zero(numbers: jax.Array, is_rounding: jax.Array) -> jax.Array:
     """Return numbers, zero where they are rounding, but with their derivatives where the program is differentiated."""
-    zero = replace_value(jnp.zeros_like(numbers), numbers) if writes_for_derivatives() else 0.0
-    return jnp.where(is_rounding, zero, numbers)
+    if not writes_for_derivatives():
+        return jnp.where(is_rounding, 0.0, numbers)
+    once = differentiable_once(numbers, is_rounding)
+    return jnp.where(is_rounding, replace_value(jnp.zeros_like(numbers), once), numbers)
 
 
 def spoils_what_is_known(power: jax.Array, least: jax.Array, noise: jax.Array) -> jax.Array:
@@ -111,3 +132,18 @@ def _differentiate_spoilt(primals: Any, tangents: Any) -> tuple[jax.Array, jax.A
     """Return the numbers, and their derivatives times NaN where they are spoilt."""
     (numbers, spoilt), (slopes, _) = primals, tangents
     return numbers, slopes * jnp.where(spoilt, jnp.nan, 1.0)
+
+
+@jax.custom_jvp
+def differentiable_once(numbers: jax.Array, where: jax.Array) -> jax.Array:
+    """Return numbers whose second derivatives at `where`, which cannot be had, are infinite or NaN."""
+    return numbers
+
+
+@differentiable_once.defjvp
+def _differentiate_once(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """Return the numbers, and their derivatives times a 1 whose own derivative overflows at `where`."""
+    (numbers, where), (slopes, _) = primals, tangents
+    largest = jnp.where(where, float(np.finfo(np.dtype(numbers.dtype)).max), jnp.zeros_like(numbers))
+    none = numbers - lax.stop_gradient(numbers)
+    return differentiable_once(numbers, where), slopes * (1 + none * largest * largest)

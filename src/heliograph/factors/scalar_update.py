@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.factors.pivots import is_positive, reciprocal_or_one, spoils_what_is_known
+from heliograph.factors.pivots import is_positive, reciprocal_or_one, share_of_sum, spoils_what_is_known
 from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN, where
-from heliograph.numerics.trace_settings import writes_short_programs
+from heliograph.numerics.trace_settings import writes_for_derivatives, writes_short_programs
 
 
 def update_by_scalar(
@@ -77,7 +77,8 @@ def update_root_columns(
     # w_{j+1} is zero above row j + 1, so V stays lower triangular.
     is_strictly_lower = np.concatenate([is_lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
     updated_root = root - lax.select(is_strictly_lower, w_next * (f * reciprocal_next), jnp.zeros_like(root))
-    updated_d = lax.select(is_positive(s_j), d * (s_next * reciprocal_j), d)
+    share = share_of_sum(s_next, f * product) if writes_for_derivatives() else s_next * reciprocal_j
+    updated_d = lax.select(is_positive(s_j), d * share, d)
     return updated_root, updated_d, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 

@@ -4,8 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from heliograph.factors.pivots import spoil_derivatives
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.trace_settings import write_for_derivatives
 
@@ -51,9 +53,13 @@ def take_derivatives_from(plain: Likelihood, differentiated: Likelihood, argumen
         moving = [n for n, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
 
         def move(moved: list[jax.Array]) -> jax.Array:
-            """Return the log-likelihood with the values `moved` in place of those with tangents."""
+            """Return the log-likelihood with the values `moved` in place of those with tangents.
+
+            One that is not finite, of data that the model excludes, has no derivative.
+            """
             all_values = _replace_entries(values, moving, moved)
-            return differentiated(*jax.tree.unflatten(form, _replace_entries(leaves, traced, all_values)))
+            total = differentiated(*jax.tree.unflatten(form, _replace_entries(leaves, traced, all_values)))
+            return spoil_derivatives(total, ~jnp.isfinite(total))
 
         return jax.jvp(move, ([values[n] for n in moving],), ([slopes[n] for n in moving],))
 

@@ -11,6 +11,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.numerics.confidence_intervals import Share, count_independent, round_to, wilson
 from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.module import readable
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import Array, Float
 
 
@@ -52,7 +53,18 @@ def mixed_innovation(
         total: its innovation covariance (parts, m, m).
         density: log-likelihood of z under the mixture.
     """
-    return innovation_of_mean_covariance(weight, value, jnp.einsum("a,aij->ij", weight, total), density)
+    if not writes_for_derivatives():
+        return innovation_of_mean_covariance(weight, value, jnp.einsum("a,aij->ij", weight, total), density)
+    # 0 times NaN is NaN, in derivatives too: what did not arrive is 0 in the sums.
+    arrived = ~jnp.isnan(value[0])
+    both = arrived[:, None] & arrived
+    within = jnp.einsum("a,aij->ij", weight, jnp.where(both, total, 0.0))
+    mixed = innovation_of_mean_covariance(weight, jnp.where(arrived, value, 0.0), within, density)
+    return Innovation(
+        value=jnp.where(arrived, mixed.value, jnp.nan),
+        covariance=jnp.where(both, mixed.covariance, jnp.nan),
+        log_likelihood=jnp.where(jnp.any(arrived), density, 0.0),
+    )
 
 
 def innovation_of_mean_covariance(
@@ -93,11 +105,11 @@ def posterior_weights(
     log_prior = jnp.where(is_possible, jnp.log(jnp.where(is_possible, weight, 1.0)), -jnp.inf)
     log_posterior = jnp.where(is_possible, likelihood, 0.0) + log_prior
     all_excluded = jnp.max(log_posterior) == -jnp.inf
-    return (
-        jax.nn.softmax(jnp.where(all_excluded, log_prior, log_posterior)),
-        jax.nn.logsumexp(log_posterior),
-        all_excluded,
-    )
+    possible = jnp.where(all_excluded, log_prior, log_posterior)
+    if not writes_for_derivatives():
+        return jax.nn.softmax(possible), jax.nn.logsumexp(log_posterior), all_excluded
+    # A sum of zeros has a logarithm whose derivative, even where it is not used, is NaN.
+    return jax.nn.softmax(possible), jnp.where(all_excluded, -jnp.inf, jax.nn.logsumexp(possible)), all_excluded
 
 
 @readable

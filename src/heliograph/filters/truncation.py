@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.factored_gaussian import Gaussian, impose_moments_of_combination
+from heliograph.factors.pivots import spoil_derivatives
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
+from heliograph.numerics.trace_settings import writes_for_derivatives
 
 PlacedLimits = tuple[tuple[int, float, float], ...]  # place, lowest and highest value of each limited component
 CERTAIN = 1e-24  # a variance below this share of its mean square and of the interval's is rounding
@@ -60,6 +62,9 @@ def hold_mean_within_limits(x: Gaussian, limits: PlacedLimits) -> Gaussian:
         is_certain = column[i] <= 0
         most_likely = mean + column * ((nearest - value) / jnp.where(is_certain, 1.0, column[i]))
         mean = jnp.where(is_certain, mean, most_likely.at[i].set(nearest))
+        if writes_for_derivatives():  # as P_ii goes to 0 the way into the limits depends on how it does
+            is_known = column[i] <= CERTAIN * (value**2 + nearest**2)
+            mean = spoil_derivatives(mean, is_known & (nearest != value))
     return x._replace(mean=mean)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jax.custom_batching import sequential_vmap
 
 from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import Float
 
 A = TypeVar("A", jax.Array, np.ndarray)
@@ -17,9 +18,10 @@ def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.
     """Return the eigenvalues and eigenvectors (columns) of a symmetric matrix; a batch is computed one after another.
 
     JAX would distribute a batch over the processor's threads, by a call that waits for them on one of them. Programs
-    that run side by side on as many threads would then wait for each other for ever.
+    that run side by side on as many threads would then wait for each other for ever. One after another they have no
+    derivative backwards, so that what is differentiated leaves it to JAX.
     """
-    values, vectors = _eigh(a)
+    values, vectors = jnp.linalg.eigh(a) if writes_for_derivatives() else _eigh(a)
     return values, vectors
 
 

@@ -17,6 +17,7 @@ from heliograph.factors.factored_gaussian import (
     take_leading,
 )
 from heliograph.filters.truncation import truncate_gaussians
+from heliograph.numerics.trace_settings import trace_settings
 from heliograph.numerics.types import Array, Float
 
 FLOOR = 1e-6  # probability of what the rule forbids
@@ -123,15 +124,16 @@ def _truncate(mixture: GaussianSum, mean: jax.Array, slopes: jax.Array, ends: Se
 
 def merge_groups(mixture: GaussianSum, groups: int = 1) -> GaussianSum:
     """Merge the sum by moment matching into `groups` Gaussians, each of one consecutive block (default: all)."""
-    few: GaussianSum = _merge_groups(mixture, groups)
+    few: GaussianSum = _merge_groups(mixture, groups, trace_settings())
     return few
 
 
-@partial(jax.jit, static_argnames="groups")
-def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
+@partial(jax.jit, static_argnames=("groups", "settings"))
+def _merge_groups(mixture: GaussianSum, groups: int, settings: tuple[object, ...]) -> GaussianSum:
     """Merge the components of each group into one Gaussian: compiled body of `merge_groups`.
 
     Groups are consecutive and of equal size. Status probabilities are averaged by weights.
+    `settings` is only a key, so that a trace is not used again under other settings.
     """
 
     def merge_group(mixture: GaussianSum) -> GaussianSum:
@@ -168,17 +170,18 @@ def reduce_to_count(mixture: GaussianSum, count: int, places: slice) -> Gaussian
     `places` of the vector, each in units of its variance.
     """
     while len(mixture.log_weight) > count:
-        mixture = _merge_cheapest_pair(mixture, (places.start, places.stop))
+        mixture = _merge_cheapest_pair(mixture, (places.start, places.stop), trace_settings())
     return mixture
 
 
-@partial(jax.jit, static_argnames="ends")
-def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
+@partial(jax.jit, static_argnames=("ends", "settings"))
+def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int], settings: tuple[object, ...]) -> GaussianSum:
     """Return a sum of one Gaussian fewer: the cheapest pair (a, b) merged at a's place, the last one moved to b's.
 
     Cost of a pair: w_a w_b / (w_a + w_b) sum_i (m_a - m_b)_i^2 / (v_a + v_b)_i, w weight, m mean and v variance, over
     the components i from ends[0] to ends[1] - 1. It is how much the merged Gaussian spreads more than its parts, in
-    units of their variance. A filter merges pairs to keep few Gaussians.
+    units of their variance. A filter merges pairs to keep few Gaussians. `settings` is only a key, as
+    of `_merge_groups`.
     """
     size, places = len(mixture.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
