@@ -317,7 +317,7 @@ class CompiledFilter:
     ) -> Float[np.ndarray, " received"]:
         """Return a measurement without the readings that were refused; a sender that decides sent them all the same."""
         if self.sender is None:
-            return screened.values[0]
+            return np.asarray(screened.values[0])
         return self.sender.trigger.leave_out_refused(z, screened.refused[0] > 0, self.sender.outputs)
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:

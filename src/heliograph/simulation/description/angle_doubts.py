@@ -93,8 +93,8 @@ def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
         for direction in _list_directions(filter):
             rows, states = _find_wide(direction, deviation)
             if rows.size:
-                known = float(deviation[0, states].max())
-                key = _join_names(states, network.states), label, known, direction.remedy
+                largest = float(deviation[0, states].max())
+                key = _join_names(states, network.states), label, largest, direction.remedy
                 nodes_by_angle.setdefault(key, []).append(node)
     for (names, label, deviation_at_start, remedy), nodes in nodes_by_angle.items():
         first_nodes = ", ".join(map(repr, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
@@ -122,7 +122,7 @@ def _describe_width(states: Sequence[int], names: Sequence[str], deviation: floa
 def _find_deviations(covariance: Float[np.ndarray, "rows n n"]) -> Float[np.ndarray, "rows n"]:
     """Return the standard deviations of all states in each row, 0 where a variance is none."""
     variances = np.diagonal(np.nan_to_num(covariance), axis1=-2, axis2=-1)
-    return np.sqrt(np.maximum(variances, 0.0))
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
 @readable
