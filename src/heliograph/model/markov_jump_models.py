@@ -277,13 +277,9 @@ def markov_plant(
                 raise fail(f"{what} of model {i}", f"{list(getattr(plants[0], what))}, as those of model 0{remedy}",
                            list(getattr(plant, what)))  # fmt: skip
         for what in ("initial_mean", "initial_covariance", "deviation"):
-            here, first = getattr(plant, what), getattr(plants[0], what)
-            if not are_same(here, first):
-                got = f"another {what.replace('_', ' ')}"
-                if is_traced(here, first):  # a model that `eqx.tree_at` makes of model 0 has the same array
-                    got = f"an {what.replace('_', ' ')} that JAX traces and that is another array: numbers unknown"
+            if not are_same(here := getattr(plant, what), getattr(plants[0], what)):
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
-                           got)  # fmt: skip
+                           f"another {what.replace('_', ' ')}{', traced by JAX' * is_traced(here)}")  # fmt: skip
     if rates is None:
         return ModalPlant(_read_mode_chain(transition, initial, name, modes, len(plants)), plants)
     # With rates, it is these that move the mode, by the time between rows. The chain only holds the number of modes and
