@@ -163,7 +163,7 @@ def test_a_precise_component_that_shows_one_state_alone(r):
 
     slope = jnp.eye(2)
     expected = jax.jvp(lambda t: by_covariances(t * slope), (0.0,), (1.0,))[1]
-    for a, b in zip(derivative(observe, slope)[1], expected, strict=True):
+    for a, b in zip(derivative(observe, (slope,))[1], expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=10 * TOLERANCE)
 
 

@@ -69,7 +69,7 @@ def test_gradients_with_a_precise_sensor_of_one_of_the_states(name, noise):
 
 
 def test_second_derivatives_are_right_or_not_finite():
-    """Of a filter by factors those along a variance of zero; beside it they are the Kalman filter's, to 1e-9."""
+    """Twice along a variance of zero a filter by factors has none; elsewhere they are the Kalman filter's, to 1e-9."""
 
     def hessian(scales, make):
         with jax.enable_x64(True):
@@ -85,7 +85,7 @@ def test_second_derivatives_are_right_or_not_finite():
 
     expected = hessian((0.8, 0.25, 0.4), by_covariances)
     np.testing.assert_allclose(hessian((0.8, 0.25, 0.4), by_factors), expected, rtol=1e-9)
-    assert not np.any(np.isfinite(hessian((0.0, 0.0, 0.5), by_factors)[:2, :2]))
+    assert not np.any(np.isfinite(np.diagonal(hessian((0.0, 0.0, 0.5), by_factors))[:2]))
 
 
 def move(x, u=()):
@@ -272,14 +272,14 @@ def scalar_models(scales):
 
 @pytest.mark.parametrize("scales", [(0.8, 0.25, 0.3), (0.0, 0.0, 0.5)])
 def test_a_sender_that_is_silent_by_chance(scales):
-    """To 1e-8: silence has no innovation, of which NaN took part in the derivative backwards."""
+    """Silence has no innovation, of which NaN took part in the derivative backwards. To 1e-5, as of other filters."""
 
     def likelihood(x):
         trigger = hg.StochasticTrigger(0.6)
         return hg.log_likelihood(hg.event_filter(*scalar_models(x), hg.perfect(), trigger), [[1.25], [np.nan], [0.4]])
 
-    expected = differences(lambda x: float(likelihood(x)), scales, step=1e-3)
-    np.testing.assert_allclose(slopes_of(likelihood, scales), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+    expected = differences(lambda x: float(likelihood(x)), scales)
+    np.testing.assert_allclose(slopes_of(likelihood, scales), expected, rtol=0, atol=1e-5 * np.max(np.abs(expected)))
 
 
 def test_a_clock_has_a_gradient():

@@ -50,7 +50,8 @@ def share_of_sum(part: jax.Array, rest: jax.Array) -> jax.Array:
 
     Derivatives of a quotient would be differences of numbers as large as 1 / part, where the rest is zero.
     """
-    return part * reciprocal_or_one(part + rest)
+    share: jax.Array = part * reciprocal_or_one(part + rest)
+    return share
 
 
 @share_of_sum.defjvp
@@ -136,7 +137,7 @@ def _differentiate_spoilt(primals: Any, tangents: Any) -> tuple[jax.Array, jax.A
 
 @jax.custom_jvp
 def differentiable_once(numbers: jax.Array, where: jax.Array) -> jax.Array:
-    """Return numbers whose second derivatives at `where`, which cannot be had, are infinite or NaN."""
+    """Return numbers whose second derivatives at `where`, which cannot be had, are infinite or NaN along themselves."""
     return numbers
 
 
