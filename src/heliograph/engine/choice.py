@@ -144,7 +144,8 @@ def scan_rows(
     fixed: PyTree,
     rows: PyTree,
     by_xla: Callable[[], PyTree],
-) -> tuple[PyTree, PyTree]:
+    most: int | None = None,
+) -> PyTree:
     """Step over rows of data in double precision; return the last state and the outputs of all rows, as NumPy arrays.
 
     Native code is made by the compiler `straightline`, and serves any number of rows: a recording of another length
@@ -157,6 +158,7 @@ def scan_rows(
         fixed: a tree of what is the same for all rows, such as a filter.
         rows: a tree of arrays (rows, ...).
         by_xla: computes the same by XLA, where native code does not take the step, and for no rows.
+        most: operations above which `by_xla` computes, unless native code is forced; no limit by default.
 
     Raises:
         ValueError: native code is forced and does not take the step.
@@ -166,15 +168,14 @@ def scan_rows(
         # Native code first, unless XLA is forced. The flags say which of the four trees differ from row to row.
         if engine != "xla" and count:
             choice = _find_code(_compile_scan, (begin, step, fixed, rows), (False, False, False, True), most=None)
-            why = choice.why or choice.code.generate_code(count)
+            is_long = most is not None and engine != "native" and choice.code and choice.code.operations > most
+            why = choice.why or ("long" if is_long else choice.code.generate_code(count))
             if not why:
                 first = len(choice.arrays) - len(jax.tree.leaves(rows))  # of the rows, behind those of `fixed`
-                results: tuple[PyTree, PyTree] = choice.code(choice.arrays[:first], choice.arrays[first:])
-                return results
+                return choice.code(choice.arrays[:first], choice.arrays[first:])
             if engine == "native":
                 raise fail("native code", "a program of operations that it takes", why)
-        computed: tuple[PyTree, PyTree] = float64.to_numpy(by_xla())
-        return computed
+        return float64.to_numpy(by_xla())
 
 
 def map_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:

@@ -17,6 +17,7 @@ from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
 from heliograph.filters.rows.chunks import ScanResult
 from heliograph.filters.rows.run_over_data import Filtered, run_over_data, scan_inside_jit
+from heliograph.filters.run_over_data import Filtered, run_over_data, scan_inside_jit, step_over_row
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector_check import check_vector
@@ -124,7 +125,7 @@ class AbstractFilter(Module):
                 that is NaN.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return call_with_inputs(self, state, _step, z, u, check_step_number(self, k))
+        return call_with_inputs(self, state, step_over_row, z, u, check_step_number(self, k))
 
     def run(
         self,
@@ -307,13 +308,6 @@ class AbstractSizedFilter(AbstractFilter):
     def angles_used(self) -> FilterAngles | None:
         """Return no angles; a filter whose models may have some overrides this, others refuse such models."""
         return FilterAngles((), ())
-
-
-@compile_on_call
-def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
-    """Predict, correct and return state and estimate: compiled body of `AbstractFilter.step`."""
-    after, _ = filter.correct(filter.predict(state, u, k), z, k)
-    return after, filter.after_step(after, k)
 
 
 @compile_on_call

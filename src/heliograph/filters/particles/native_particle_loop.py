@@ -236,7 +236,7 @@ def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: Py
 
 
 def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
-    """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles.
+    """Return estimate, innovation and effective number of particles of a row, from sums over its particles.
 
     The sums are vectors. Their fields have the shapes of the same sums over a single particle.
     """
@@ -247,7 +247,7 @@ def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple
     estimate = filter.estimate_from_sums(states, sums.second)
     innovation = filter.innovation_from_sums(received, sums.reference, row.z, row.k, sums.density)
     effective_number = states.first.weight**2 / states.first.square  # (sum of w)^2 / sum of w^2
-    return estimate.mean, estimate.covariance, innovation, estimate.modes, effective_number
+    return estimate, innovation, effective_number
 
 
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import scan_rows
+from heliograph.engine.choice import compile_on_call, scan_rows
+from heliograph.engine.size_thresholds import SHORT
 from heliograph.filters.rows.chunks import ScanResult, filter_in_chunks
 from heliograph.filters.rows.linear_recursion import initial_state_if_linear
 from heliograph.model.checks.plant_inputs import check_inputs
@@ -24,9 +25,10 @@ from heliograph.model.forecast_origin import (
     last_input,
 )
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.float64 import as_array, quickly_compiled, refuse_forked_process
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import readable
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.trace_settings import KEPT
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -183,21 +185,21 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row_results, *start)
     result = result or filter.filter_rows(rows_z, rows_u, *start)
     state, outputs = result or step_over_known_rows(filter, rows_z, rows_u, _collect_row_results, start)
-    mean, covariance, innovation, modes, counts = outputs
+    estimate, innovation, counts = outputs
     # Warn of estimates that are no numbers, and of particle filters whose weight is on few particles.
-    _warn_of_lost_estimate(filter, mean, begin)
+    _warn_of_lost_estimate(filter, estimate.mean, begin)
     if counts is not None:
         _warn_of_few_particles(counts, innovation.log_likelihood, begin)
     return Filtered(
-        means=mean,
-        covariances=covariance,
+        means=estimate.mean,
+        covariances=estimate.covariance,
         innovations=innovation.value,
         innovation_covariances=innovation.covariance,
         log_likelihoods=innovation.log_likelihood,
         claim=filter.claim,
         weights=innovation.weight,
         origin=_make_end_origin(filter, state, begin + len(rows_z), rows_u, dates),
-        modes=modes,
+        modes=estimate.modes,
         effective_numbers=counts,
     )
 
@@ -223,7 +225,32 @@ def step_over_known_rows(
     """
     begin = start[1] if start else 0
     rows = np.asarray(begin + np.arange(len(z))), z, u
-    return scan_rows(_begin, _step, (filter, output, *start), rows, lambda: _by_xla(filter, output, z, u, *start))
+    stepped: tuple[PyTree, PyTree] = scan_rows(
+        _begin, _step, (filter, output, *start), rows, lambda: _by_xla(filter, output, z, u, *start)
+    )
+    return stepped
+
+
+def step_over_row(filter: Any, state: PyTree, z: Array, u: Array, k: Array) -> tuple[PyTree, Estimate]:
+    """Predict and correct over row k of data; return state and estimate. This is the body of a filter's `step`.
+
+    A linear filter's step is computed by the code of its runs, if that is short: it has the bits of a run, and after a
+    run nothing is compiled.
+    """
+    if filter.is_linear and not is_traced(filter, state, z, u, k):
+        refuse_forked_process()
+        fixed, row = (filter, _collect_row_results, jax.tree.map(as_array, state), k), (k[None], z[None], u[None])
+        if found := scan_rows(_begin, _step, fixed, row, by_xla=lambda: None, most=SHORT):
+            after, (estimate, *_) = found
+            return after, jax.tree.map(lambda leaf: leaf[0, ...], estimate)
+    return _step_alone(filter, state, z, u, k)
+
+
+@compile_on_call
+def _step_alone(filter: Any, state: PyTree, z: Array, u: Array, k: Array) -> tuple[PyTree, Estimate]:
+    """Return state and estimate after row k, compiled for one row."""
+    after, _ = filter.correct(filter.predict(state, u, k), z, k)
+    return after, filter.after_step(after, k)
 
 
 def _begin(fixed: tuple[Any, ...]) -> PyTree:
@@ -328,9 +355,8 @@ def _compute_rows(
 
 
 def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: Array) -> PyTree:
-    """Return what is kept of a row: mean, covariance, innovation, probabilities of modes, number of particles."""
-    estimate = filter.after_step(state, k)
-    return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)
+    """Return what is kept of a row: the estimate, the innovation, and the effective number of particles or None."""
+    return filter.after_step(state, k), innovation, getattr(state, "effective_number", None)
 
 
 _by_xla = quickly_compiled(_compute_rows)
