@@ -16,8 +16,7 @@ from heliograph.filters.derivatives_of_likelihood import evaluate_for_derivative
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
 from heliograph.filters.rows.chunks import ScanResult
-from heliograph.filters.rows.run_over_data import Filtered, run_over_data, scan_inside_jit
-from heliograph.filters.run_over_data import Filtered, run_over_data, scan_inside_jit, step_over_row
+from heliograph.filters.rows.run_over_data import Filtered, run_over_data, scan_inside_jit, step_over_row
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector_check import check_vector

@@ -67,6 +67,7 @@ from .domains import REAL as REAL
 from .domains import SIMPLEX as SIMPLEX
 from .domains import mark_checked as mark_checked
 from .domains import report_domain as report_domain
+from .float64 import as_array as as_array
 from .float64 import compile_in_float64 as compile_in_float64
 from .float64 import fully_optimised as fully_optimised
 from .float64 import in_float64 as in_float64
@@ -164,6 +165,8 @@ from .times.dates import unequal_steps as unequal_steps
 from .times.row_times import backwards_text as backwards_text
 from .times.row_times import check_dates as check_dates
 from .times.row_times import check_times as check_times
+from .times.row_times import describe_clock_set_forward as describe_clock_set_forward
+from .times.row_times import fail_of_clock_set_back as fail_of_clock_set_back
 from .times.row_times import find_backwards_row as find_backwards_row
 from .times.row_times import find_lost_digits as find_lost_digits
 from .times.row_times import is_mix_of_units as is_mix_of_units
@@ -171,6 +174,7 @@ from .times.row_times import row_dates as row_dates
 from .times.timestamp_order import SECOND as SECOND
 from .times.timestamp_order import YEAR as YEAR
 from .times.timestamp_order import find_clock_set_back as find_clock_set_back
+from .times.timestamp_order import find_clock_set_forward as find_clock_set_forward
 from .times.timestamp_order import find_out_of_order as find_out_of_order
 from .times.timestamp_order import find_unset_stamps as find_unset_stamps
 from .trace_settings import KEPT as KEPT

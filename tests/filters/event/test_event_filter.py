@@ -114,8 +114,8 @@ def test_certain_loss_leaves_the_prior(reference):
 
 def test_without_loss_no_gaussian_has_a_lost_reference():
     item = hg.event_filter(PLANT, SENSOR, hg.perfect(), hg.SendOnDelta(0.6))
-    assert len(item.init().parts.log_weight) == 3
-    assert len(hg.event_filter(PLANT, SENSOR, LOSSY, hg.SendOnDelta(0.6)).init().parts.log_weight) == 5
+    assert len(item.init().weight) == 3
+    assert len(hg.event_filter(PLANT, SENSOR, LOSSY, hg.SendOnDelta(0.6)).init().weight) == 5
 
 
 def test_a_value_that_the_rule_forbids_has_a_floor_and_no_nan():
