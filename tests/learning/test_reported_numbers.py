@@ -1,5 +1,6 @@
 """Laws of what messages tell, learned: the noise as a function of what is declared."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -60,3 +61,46 @@ def test_before_data_it_is_known_that_messages_which_tell_their_gain_identify_th
     assert hg.learning.identifiable(behind_a_gain, horizon=100).identified == ("plant noise", "link noise")
     with pytest.raises(ValueError, match=r"expected a law of the numbers: told\(..., law=...\), got none"):
         hg.learning.identifiable(build, horizon=100)
+
+
+def piloted(scale=0.8, noise=0.1):
+    link = hg.hop(hg.Rayleigh(scale), 0.05, known=hg.model.Pilot(noise))
+    return hg.Network(PLANT, {"a": hg.Node(SENSOR, link, {"f": hg.linear_filter(PLANT, SENSOR, link)})})
+
+
+def test_likelihood_behind_a_pilot_has_its_derivatives():
+    """To 1e-6, the error of central differences; by the pilot's noise it was NaN, from a root of a gain of 0."""
+    z = hg.simulate(piloted(), 100, 3).measurements["a"]
+
+    def likelihood(*numbers):
+        return hg.log_likelihood(piloted(*numbers).nodes["a"].filters["f"], z)
+
+    at, h = (0.7, 0.3), 1e-5
+    for i in (0, 1):
+        above, below = (likelihood(*(x + sign * h * (i == j) for j, x in enumerate(at))) for sign in (1, -1))
+        with jax.enable_x64(True):
+            slope = float(jax.grad(likelihood, argnums=i)(*at))
+        assert abs(slope / ((above - below) / (2 * h)) - 1) < 1e-6
+
+
+@pytest.mark.slow
+def test_a_pilot_s_noise_is_learned():
+    """Refused before as a number on which nothing depends."""
+    z = hg.simulate(piloted(), 400, 3).measurements["a"]
+    (row,) = hg.fit(lambda: piloted(noise=hg.free(0.3, "noise")), {"a": z}, starts=1).table
+    assert row.low < 0.1 < row.high < 0.3
+
+
+@pytest.mark.parametrize("law", [hg.Rayleigh, lambda gain: hg.Discrete([gain, 1.0], [0.5, 0.5])])
+def test_a_told_gain_s_law_has_no_part_in_the_likelihood_of_what_it_tells(law):
+    """The error blamed NumPy in the user's network, which had called none."""
+
+    def build():
+        link = hg.hop(law(hg.free(0.5, "gain")), 0.05, known=True)
+        return hg.Network(PLANT, {"a": hg.Node(SENSOR, link, {"f": hg.linear_filter(PLANT, SENSOR, link)})})
+
+    z = hg.simulate(build(), 50, 3).measurements["a"]
+    with pytest.raises(
+        ValueError, match="free number 'gain': expected one on which the likelihood depends, got one on"
+    ):
+        hg.fit(build, {"a": z}, starts=1)

@@ -173,12 +173,13 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 
 
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
-    """Raise ValueError for a free number on which the data have no information at any of the points (points, p)."""
-    largest = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
-    names = surface.objective.description.parameters.coordinates
-    without = [name for name, information in zip(names, largest, strict=True) if not information > 0]
-    if without:
-        raise fail(f"free number {without[0]!r}", "one on which the measurements depend", "one on which nothing does")
+    """Raise ValueError for a free number of which the data have no information, or no derivative, at all points."""
+    information = np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2)
+    for name, own in zip(surface.objective.description.parameters.coordinates, information.T, strict=True):
+        if np.all(np.isnan(own)):
+            raise fail(f"free number {name!r}", "one by which the likelihood has a derivative", "NaN at every start")
+        if not np.nanmax(own) > 0:
+            raise fail(f"free number {name!r}", "one on which the likelihood depends", "one on which it does not")
 
 
 def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[[ClimbEnds], None]:

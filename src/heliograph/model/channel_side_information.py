@@ -13,7 +13,8 @@ from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import array, fail, flag, instance, name_list, scalar, show_value
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.types import ArrayLike, Float, Names
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Array, ArrayLike, Float, Names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
     PilotedHop,
@@ -124,8 +125,15 @@ def _average_law(law: object, memory: AbstractMemory) -> ArrayLike:
     if law is None:
         raise fail("typical numbers", "numbers as they may come, where there is no law", "none")
     if isinstance(law, AbstractLaw):
-        return np.asarray([law.moment(1)])
+        return _list_mean(law)
     return law.mean if isinstance(law, AbstractNoise) else np.zeros(memory.announced)
+
+
+def _list_mean(law: AbstractLaw) -> Array:
+    """Return the mean of a gain's law as an array of one number; traced where the law is, as one that is learned."""
+    mean = law.moment(1)
+    array_of_one: Array = library(mean).stack([mean])
+    return array_of_one
 
 
 KnownGain = TypeAliasType("KnownGain", bool | Pilot)  # of a hop: told, by a pilot, or not at all
@@ -147,7 +155,7 @@ def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stac
     told_hop = ToldMap(
         memory=FreshNumbers(hop.law, count=1),
         make=ToldGainHop(hop.matrix, hop.noise),
-        typical=np.asarray([hop.law.moment(1)]),
+        typical=_list_mean(hop.law),
         names=("gain",),
     )
     return append_told_numbers(told_hop)

@@ -119,7 +119,9 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     # The part of these that does count: within NATS of the mode.
     mode = _find_density_mode(log_density, low, high)
     least = log_density(mode) - NATS
-    left, right = _find_density_edge(log_density, low, mode, least), _find_density_edge(log_density, high, mode, least)
+    ends = _find_density_edge(log_density, low, mode, least), _find_density_edge(log_density, high, mode, least)
+    # Where the interval ends has no part in the integral, and none in its derivative, which at g = 0 it would not have.
+    left, right = jax.lax.stop_gradient(ends)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
     x, w = np.polynomial.legendre.leggauss(NODES)
     t = (left + right) / 2 + (right - left) / 2 * x
