@@ -29,8 +29,8 @@ def log_likelihood(
     (`jax.enable_x64`). In double precision the derivatives by covariances are right also where these are zero or
     singular: there they are one-sided, as no variance is negative. Where some components of z are determined by others,
     the derivatives are those of the density of the free components. Derivatives are NaN, not wrong, where a state is
-    known by `side_information_filter`, or by a transform of one's own that has `apply` alone; where z is excluded by
-    the model; and where a mean is moved into `limits=` by a variance of zero. Second derivatives along variances of
+    known by `side_information_filter`, `clock_filter`, or a transform of one's own that has `apply` alone; where the
+    model excludes z; and where a variance of zero moves a mean into `limits=`. Second derivatives along variances of
     zero cannot be had, but for `kalman_filter` of a known start and `linear_filter`: twice along one they are not
     finite, along two they may be beyond 1e80.
 

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.factored_gaussian import Gaussian, correct_by_gain
+from heliograph.factors.pivots import spoil_derivatives, unit_of
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.factories import make_base_gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
-from heliograph.filters.gaussian.moment_transforms import AbstractTransform, PolynomialMoments
+from heliograph.filters.gaussian.moment_transforms import KNOWN, SMALLEST, AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.signal_moments import (
     find_signal_moments,
     innovation_covariance,
@@ -31,6 +32,8 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angles.angle import wrap_near
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.lapack import eigh
+from heliograph.numerics.linalg import diagonal
+from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -128,6 +131,10 @@ class ClockFilter(AbstractWrapper):
         # The Kalman gain, with zero rows for offset and drift of a clock that is not observable (Schmidt's filter).
         kalman_gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
         gain = kalman_gain * self._mask_estimated(observed)[:, None]
+        if writes_for_derivatives():  # by this gain they are not those of the covariances where a state is known
+            spread = prior.mean**2 + diagonal(prior.covariance)
+            known = prior.variances <= jnp.maximum((KNOWN * unit_of(spread)) ** 2 * spread, SMALLEST)
+            gain = spoil_derivatives(gain, jnp.any(known))
         slopes, noise = jnp.asarray(channel.mean_gain) @ signal.slopes, make_received_noise(signal, channel)
         after = correct_by_gain(prior, slopes, noise, gain, jnp.where(present, z - expected, 0.0))
         belief = ClockBelief(gaussian=after, inputs=state.inputs, silence=silence, observed=observed)
