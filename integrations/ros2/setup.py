@@ -4,7 +4,7 @@ from setuptools import setup
 
 setup(
     name="heliograph_ros",
-    version="0.4.0",
+    version="0.5.0",
     packages=["heliograph_ros"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/heliograph_ros"]),

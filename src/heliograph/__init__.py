@@ -4,7 +4,7 @@ Public names are listed in `__init__.pyi`, in the order data flows, and loaded w
 import path.
 """
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 
 
 def __getattr__(name: str) -> object:

@@ -27,7 +27,7 @@ def test_the_recipe_builds_and_its_tests_pass(tmp_path, monkeypatch):
         tool_config=ToolConfiguration(test_strategy="native"), output_dir=tmp_path / "out", channels=[channel.url]
     )
     (package,) = built.packages
-    assert package.name.startswith("heliograph-0.4.0-py") and package.parent.name == "noarch"
+    assert package.name.startswith("heliograph-0.5.0-py") and package.parent.name == "noarch"
     log = "\n".join(built.log)
-    assert "python imports test passed" in log and "+ heliograph --version\n0.4.0\n" in log
+    assert "python imports test passed" in log and "+ heliograph --version\n0.5.0\n" in log
     assert "all tests passed" in log
