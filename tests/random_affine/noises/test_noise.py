@@ -90,3 +90,20 @@ def test_a_filter_with_another_covariance_put_into_it_filters_by_it():
     changed = eqx.tree_at(lambda f: f.plant.noise.covariance, old, 5.0 * np.eye(3))
     z = np.ones((4, 3))
     assert hg.log_likelihood(changed, z) == hg.log_likelihood(new, z) != hg.log_likelihood(old, z)
+
+
+def test_a_covariance_put_into_a_traced_noise_is_factored():
+    """Where both are traced no number tells that the factor is of the old one: traced or known, the new one counts."""
+    other = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.1], [0.0, 0.1, 3.0]])
+
+    def products(scale):
+        old = hg.Gaussian(scale * jax.numpy.asarray(COVARIANCE))
+        several = jax.tree.map(lambda *leaves: jax.numpy.stack(leaves), old, old)
+        pairs = (old, scale * other), (old, other), (several, scale * np.stack([other, COVARIANCE]))
+        laws = [eqx.tree_at(lambda noise: noise.covariance, *pair) for pair in pairs]
+        return [(law.factor * law.weights[..., None, :]) @ law.factor.swapaxes(-1, -2) for law in laws]
+
+    with jax.enable_x64(True):
+        found = jax.jit(products)(3.0)
+    for product, expected in zip(found, (3 * other, other, 3 * np.stack([other, COVARIANCE])), strict=True):
+        np.testing.assert_allclose(product, expected, rtol=1e-12, atol=1e-15)

@@ -7,7 +7,9 @@ from weakref import ref
 import jax
 import numpy as np
 
+from heliograph.factors.covariance_factors import columns_of
 from heliograph.numerics.check import is_diagonal
+from heliograph.numerics.numpy_or_jax import is_traced
 
 LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
 FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
@@ -39,7 +41,7 @@ class WeightsOfFactor:
     """The field of a noise for the weights w of its factor A, with Cov = A diag(w) A': the last of its fields.
 
     JAX and Equinox (`eqx.tree_at`) make an object anew by setting its fields one after another. When the weights come,
-    covariance and factor are there; where they are numbers that do not belong together, the covariance counts.
+    covariance and factor are there; where these do not belong together, the covariance counts.
 
     Args:
         factor: returns A with A A' = S from a covariance S (n, n).
@@ -63,21 +65,38 @@ class WeightsOfFactor:
         held = noise.__dict__
         held["weights"] = weights
         covariance, factor = held.get("covariance"), held.get("factor")
-        if not all(_is_known(part) for part in (covariance, factor, weights)):
-            return
         found_factor, found_covariance = self._found.get(id(factor), (None, None))
-        if found_factor and found_covariance and found_factor() is factor and found_covariance() is covariance:
+        is_found = found_factor is not None and found_factor() is factor
+        if is_found and found_covariance is not None and found_covariance() is covariance:
             return
-        S, A, w = np.asarray(covariance), np.asarray(factor), np.asarray(weights)
+        if all(_is_known(part) for part in (covariance, factor, weights)):
+            S = np.asarray(covariance)
+            if self._belongs_to(np.asarray(factor), np.asarray(weights), S):
+                self._note(factor, covariance)
+            else:
+                n = S.shape[-1]
+                held["factor"] = np.reshape([self.factor(one) for one in S.reshape(-1, n, n)], S.shape)
+                held["weights"] = np.ones(S.shape[:-1])
+        elif is_traced(factor) and isinstance(covariance, np.ndarray | jax.Array):
+            # A traced factor tells nothing: it belongs to the covariance that it came with first.
+            if is_found:
+                make_columns = columns_of
+                for _ in range(covariance.ndim - 2):  # of one for each step, or each mode
+                    make_columns = jax.vmap(make_columns)
+                held["factor"], held["weights"] = make_columns(covariance)
+                factor = held["factor"]
+            self._note(factor, covariance)
+
+    def _belongs_to(self, A: np.ndarray, w: np.ndarray, S: np.ndarray) -> bool:
+        """Return whether A diag(w) A' is S (n, n), or whether these are no numbers of such a shape."""
         if S.shape[:-1] != A.shape[:-1] or S.dtype.kind != "f":
-            return
+            return True
         deviation = np.sqrt(np.maximum(np.diagonal(S, axis1=-2, axis2=-1), 0.0))
         allowed = self.tolerance * deviation[..., :, None] * deviation[..., None, :]
-        if not np.all(np.abs((A * w[..., None, :]) @ A.swapaxes(-1, -2) - S) <= allowed):
-            n = S.shape[-1]
-            held["factor"] = np.reshape([self.factor(one) for one in S.reshape(-1, n, n)], S.shape)
-            held["weights"] = np.ones(S.shape[:-1])
-            return
+        return bool(np.all(np.abs((A * w[..., None, :]) @ A.swapaxes(-1, -2) - S) <= allowed))
+
+    def _note(self, factor: Any, covariance: Any) -> None:
+        """Note that a factor belongs to a covariance, as long as both are held somewhere."""
         key = id(factor)
         self._found[key] = ref(factor, lambda _: self._found.pop(key, None)), ref(covariance)
 
