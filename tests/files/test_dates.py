@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.files.tables.table import read_table, write_table
-from heliograph.numerics import format_dates, parse_dates
-from heliograph.numerics.times.row_times import read_dates
+from heliograph.numerics import check_dates, format_dates, parse_dates
 from heliograph.serving import Message
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
@@ -188,7 +187,7 @@ def test_dates_up_to_the_ends_of_64_bits_are_read(text):
     assert moment.astype("datetime64[us]") == local - behind
     for unit in ("us", "ms", "s"):  # the same rule for arrays: dates in this unit within the ends
         date = moment.astype(f"datetime64[{unit}]")
-        assert read_dates("time", np.array([date]))[0] == date
+        assert check_dates("time", np.array([date]))[0] == date
 
 
 @pytest.mark.parametrize("text", ["1677-12-31T23:59:59.999999999Z", "2262-04-11T23:47:16.854775808Z",
@@ -204,7 +203,7 @@ def test_dates_beyond_64_bits_are_refused_at_every_door(text):
                          ("us", "2262-04-11T23:47:16.854776"), ("W", "2262-04-17"), ("s", "1500-01-01"),
                          ("ns", "1677-12-31")):  # fmt: skip
         with pytest.raises(ValueError, match=f"^time: expected dates {expected}, got {beyond[:4]}"):
-            read_dates("time", np.array([beyond, "NaT"], f"datetime64[{unit}]"))
+            check_dates("time", np.array([beyond, "NaT"], f"datetime64[{unit}]"))
 
 
 @settings(max_examples=100, derandomize=True)

@@ -112,5 +112,5 @@ def test_every_transmitter_sends_its_power() -> None:
     same = hg.Node(SENSOR, HOP, {"fed": fed_back_filter(PLANT, SENSOR, HOP)})
     with pytest.raises(ValueError, match="with feedback: expected a horizon"):
         hg.power(hg.Network(hg.LinearPlant([[0.9]], 1.0, [0.0], [[1.0]]), {"node": same}))
-    with pytest.raises(ValueError, match="got a sensor with feedback"):
+    with pytest.raises(ValueError, match="what it measures at each step, got feedback"):
         hg.design(network, error=hg.planning.Error(horizon=12), budget=3.0)
