@@ -178,6 +178,21 @@ def test_a_node_whose_measurement_is_missing_sends_when_the_next_step_has_begun(
     assert [(k, item["time"], item["values"][-1]) for k, item in sent] == [(k, k - 1, None) for k in (1, 2, 3)]
 
 
+@pytest.mark.slow
+def test_a_late_step_sends_its_own_message_and_none_again():
+    """Steps of a node without measurements, of which its neighbour's messages tell: the third comes after the fourth."""
+    node = Service(services()["c"], InMemoryStore())
+    heard = [0.0] * (len(PLANT.states) * (len(PLANT.states) + 1))
+    heard[len(PLANT.states) :: len(PLANT.states) + 1] = [1.0] * len(PLANT.states)
+    sent = []
+    for k in (0, 1, 3, 2, 4):
+        body = json.dumps({"node": "b", "sequence": k, "time": k, "values": heard})
+        outputs = node.take([body.encode()])
+        assert "refused" not in {output.kind for output in outputs}
+        sent.append([json.loads(output.body)["time"] for output in outputs if output.kind == "message"])
+    assert sent == [[], [0], [1], [2], [3]]
+
+
 @pytest.mark.parametrize(
     ("rule", "options", "message"),
     [

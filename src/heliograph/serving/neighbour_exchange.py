@@ -65,11 +65,12 @@ class NeighbourMessenger:
             measured_before.setdefault(id(row), old is not None and self._has_measurement(old[1]))
         new = {id(row) for row, old in plant.changes if old is None}
         held, due = plant.rows.held, []
+        # The last row that was there before; those ahead of it that were there too were followed, and so due, already.
+        newest_before = max((i for i, row in enumerate(held) if id(row) not in new), default=0)
         for i, row in enumerate(held[1:], 1):
-            after = held[i + 1] if i + 1 < len(held) else None
-            followed_before = after is not None and id(after) not in new and id(row) not in new
+            followed_before = id(row) not in new and i < newest_before
             was_due_before = followed_before or measured_before.get(id(row), self._has_measurement(row.events))
-            is_due = self._has_measurement(row.events) or after is not None
+            is_due = self._has_measurement(row.events) or i + 1 < len(held)
             if is_due and not was_due_before:
                 due.append(row)
         return due
