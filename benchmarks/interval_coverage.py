@@ -21,11 +21,12 @@ import numpy as np
 import heliograph as hg
 from heliograph.engine.choice import choose_code
 from heliograph.learning.free_parameters import Parameters
+from heliograph.learning.likelihood.climbs import Evaluated
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
 from heliograph.learning.likelihood.parameter_transforms import from_unconstrained
 from heliograph.learning.likelihood.surface import DIFFERENCE
-from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import NEAR, maximise_from_starts
 from heliograph.learning.long_run_covariance import (
     Method,
     compute_sandwich_covariance,
