@@ -180,7 +180,7 @@ def test_a_node_whose_measurement_is_missing_sends_when_the_next_step_has_begun(
 
 @pytest.mark.slow
 def test_a_late_step_sends_its_own_message_and_none_again():
-    """Steps of a node without measurements, of which its neighbour's messages tell: the third comes after the fourth."""
+    """Steps of a node without measurements, heard from its neighbour: the third comes after the fourth."""
     node = Service(services()["c"], InMemoryStore())
     heard = [0.0] * (len(PLANT.states) * (len(PLANT.states) + 1))
     heard[len(PLANT.states) :: len(PLANT.states) + 1] = [1.0] * len(PLANT.states)
