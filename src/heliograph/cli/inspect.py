@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
+    from heliograph.files.logs.log_sources import LogSources
     from heliograph.files.topic_statistics import TopicStatistics
 
 
@@ -18,6 +19,7 @@ def inspect(
         str, Parameter(help="Its nodes and inputs are listed: my_network.py, or my_network.py:name.")
     ] = "",
     dbc: Annotated[Path | None, Parameter(help="Database of the bus of a log of CAN: car.dbc.")] = None,
+    channel: Annotated[str, Parameter(help="Bus of a log of several: 1, or can0.")] = "",
     seconds: Annotated[float, Parameter(help="How long to listen to a broker.")] = 10.0,
 ) -> None:
     """List the topics of a bag, a file or a broker: rates, gaps, lateness, and `sources` to paste into a network.
@@ -25,11 +27,12 @@ def inspect(
     Parameters
     ----------
     recording:
-        A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a file of messages (lines of
-        JSON, a log, a table) or a folder of these, of which each is a topic, or the URL of a broker: mqtt://, nats://
-        or opc.tcp://.
+        A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg, .log of candump), a file of
+        messages (lines of JSON, a log, a table) or a folder of these, of which each is a topic, or the URL of a broker:
+        mqtt://, nats:// or opc.tcp://.
     """
     from heliograph.disk.quoted_text import visible
+    from heliograph.files.logs.log_sources import LogSources
     from heliograph.files.source_suggestions import suggest_sources
     from heliograph.numerics.check import TINY, scalar
 
@@ -42,7 +45,9 @@ def inspect(
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
     # The table of topics, the sources that are suggested for them, and what could not be read.
-    topics, broken = _collect_topics(recording, seconds, dbc)
+    topics, broken = _collect_topics(
+        recording, seconds, LogSources({}, dbc=dbc, channel=int(channel) if channel.isdigit() else channel or None)
+    )
     _print_table(topics)
     if topics:
         print(suggest_sources(topics, names))
@@ -50,13 +55,13 @@ def inspect(
         print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
 
 
-def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, TopicStatistics], str]":
+def _collect_topics(recording: str, seconds: float, of_log: "LogSources") -> "tuple[dict[str, TopicStatistics], str]":
     """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files.
 
     Args:
         recording: path of a file or folder, or the URL of a broker.
         seconds: how long to listen to a broker.
-        dbc: file that says which signals the frames of a CAN bus hold; None for none.
+        of_log: the database of a CAN bus, and which bus, for a log of frames.
 
     Returns:
         Statistics by topic, and the first reason why something cannot be read, "" if all can be.
@@ -69,7 +74,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
     from heliograph.report.progress import progress
 
     with progress(2) as advance:
-        # The URL of a broker; else by what the path is: a file of messages, a vehicle's log, a folder, or a bag.
+        # The URL of a broker; else by what the path is: a vehicle's log, a file of messages, a folder, or a bag.
         if "://" in recording:
             from heliograph.serving.brokers.broker_address import parse_address
             from heliograph.serving.brokers.broker_inspection import listen
@@ -77,12 +82,12 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
             advance(f"listening for {seconds:g} s")
             return listen(parse_address(recording), seconds), ""
         path = Path(recording)
+        if is_log(path):
+            advance(f"reading {recording}")
+            return inspect_log(path, of_log)
         if path.is_file() and find_extension(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)
-        if is_log(path):
-            advance(f"reading {recording}")
-            return inspect_log(path, dbc)
         if is_message_folder(path):
             advance(f"reading {recording}")
             return inspect_folder(path)

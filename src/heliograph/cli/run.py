@@ -54,12 +54,12 @@ def run(
     --report, --smooth, --forecast and --predicted need all rows at once, and so do columns of the truth.
 
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
-    A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a log or a table of somebody
-    else's making, or a folder of such files, each with a clock of its own, is events too, by the `sources` of the
-    network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with --lag,
-    those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT, and a page of
-    its own behind the report's overview, which has the most doubted first; in a store each has its name in the column
-    `plant`, and those of a lag go to the table TABLE_lagged.
+    A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg, .log of candump), a log or a table
+    of somebody else's making, or a folder of such files, each with a clock of its own, is events too, by the `sources`
+    of the network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with
+    --lag, those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT, and a
+    page of its own behind the report's overview, which has the most doubted first; in a store each has its name in the
+    column `plant`, and those of a lag go to the table TABLE_lagged.
 
     Parameters
     ----------
@@ -213,11 +213,12 @@ def _check_packages_and_files(
     """
     from heliograph.disk.atomic_files import FORMATS, check_writable
     from heliograph.files.logs.vehicle_log import PACKAGES
+    from heliograph.files.text.text_file import find_extension
     from heliograph.numerics.process.optional_packages import check_installed
     from heliograph.report.results_folder import NEEDS
 
     # Packages by the endings of files: of logs (PACKAGES), of ROS bags, of Parquet tables; a report needs NEEDS.
-    endings = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
+    endings = {find_extension(path) for path in (measurements, out) if isinstance(path, Path)}
     needed = [package for ending in endings & PACKAGES.keys() for package in PACKAGES[ending]]
     if endings & BAGS:
         needed.append("rosbags")

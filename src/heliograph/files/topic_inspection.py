@@ -138,19 +138,19 @@ def inspect_folder(path: Path) -> tuple[dict[str, TopicStatistics], str]:
     return topics, broken
 
 
-def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics], str]:
+def inspect_log(path: Path, sources: LogSources) -> tuple[dict[str, TopicStatistics], str]:
     """Return the messages of a vehicle's log, and the first reason why some cannot be read, "" if all can be.
 
     Args:
         path: the log, or a folder with several.
-        dbc: file (.dbc) that says which signals the frames of the CAN bus hold. None for a log that has this itself, or
-            to list the identifiers of the frames alone.
+        sources: the database (.dbc) that says which signals the frames of a CAN bus hold, and the channel of the bus.
+            Without a database the identifiers of frames are listed alone; other logs name their signals themselves.
 
     Raises:
         ValueError: no such file, one that cannot be opened, a database that does not fit; one line.
     """
     # All messages, by name: the units and bits of their signals, and the moments when they were logged.
-    log = open_logs(path, LogSources({}, dbc=dbc), lambda name: True)
+    log = open_logs(path, sources, lambda name: True)
     topics, broken = dict[str, TopicStatistics](), ""
     for message in log.messages:
         if isinstance(message, InputError):

@@ -33,7 +33,7 @@ def recorded(path, sources):
     return events, events.columns["wheel"].arrays()[0], np.array([event.values[0] for event in events.sort_events()])
 
 
-KINDS = (".blf", ".asc", "frames.mf4", "signals.mf4", ".ulg")
+KINDS = (".blf", ".asc", ".log", "frames.mf4", "signals.mf4", ".ulg")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -198,9 +198,24 @@ def test_a_message_of_two_buses_needs_its_channel(tmp_path):
     frames = [logs.frame(k, channel=k % 2) for k in range(logs.COUNT)]
     path, dbc = logs.write_frames(tmp_path / "drive.blf", frames), logs.database(tmp_path)
     table = {"WheelSpeeds": logs.wheel()}
-    assert "expected one bus, which channel= of LogSources names" in mistake(path, hg.files.LogSources(table, dbc=dbc))
+    assert "expected one bus, which channel= of LogSources" in mistake(path, hg.files.LogSources(table, dbc=dbc))
     events, time, _ = recorded(path, hg.files.LogSources(table, dbc=dbc, channel=1))
     assert len(time) == 20 and f"{path}: frames left out: of channel 0 (20)" in events.notes
+
+
+def test_a_log_of_candump_is_known_by_its_first_line_and_its_buses_have_names(tmp_path, capsys):
+    """Bus 0 is can0. Before, the lines were read as messages of MQTT, each moment a topic."""
+    frames = [logs.frame(k, channel=k % 2) for k in range(logs.COUNT)]
+    path, dbc = logs.write_frames(tmp_path / "candump-2026-09-21.log", frames), logs.database(tmp_path)
+    table = {"WheelSpeeds": logs.wheel()}
+    events, time, values = recorded(path, hg.files.LogSources(table, dbc=dbc, channel="can1"))
+    assert f"{path}: frames left out: of channel can0 (20)" in events.notes
+    assert np.abs(values - logs.SPEED[1::2] / 3.6).max() < RESOLUTION
+    assert np.abs(time / 1e9 - logs.START - logs.TIME[1::2]).max() < 1.1e-6
+    assert cli.main(["inspect", str(path), "--dbc", str(dbc)]) == 2
+    assert "(--channel of heliograph inspect) names, got ['can0', 'can1']" in capsys.readouterr().err
+    assert cli.main(["inspect", str(path), "--dbc", str(dbc), "--channel", "can1"]) == 0
+    assert " 20 " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("ending", [".blf", ".asc", ".mf4", ".ulg"])

@@ -1,4 +1,4 @@
-"""Frames of a CAN bus, of BLF, ASC and MDF4, to messages with the signals that a database describes."""
+"""Frames of a CAN bus, of BLF, ASC, candump and MDF4, to messages with the signals that a database describes."""
 
 import math
 from collections import Counter, defaultdict
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from heliograph.files.logs.log_sources import STAMP, LogSources
 from heliograph.files.logs.vehicle_log import DIGITS, Log, Wanted
 from heliograph.files.messages.message_files import FileMessage
-from heliograph.files.text.text_file import CutOffError
+from heliograph.files.text.text_file import CANDUMP, CutOffError, find_extension
 from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
@@ -206,7 +206,8 @@ class FrameReader:
         seen = self._channels[name]
         seen.add(channel)
         if len(seen) > 1:
-            raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
+            expected = "one bus, which channel= of LogSources (--channel of heliograph inspect) names"
+            raise fail(f"{self._path}, {name}", expected, sorted(map(str, seen)))
 
     def _check_frames_fit_database(self) -> None:
         """Raise ValueError if all frames of a wanted message are too short, or if no frame is of a wanted message.
@@ -262,12 +263,12 @@ class _OpenedFrames(NamedTuple):
 
 
 def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
-    """Open a log of frames by the kind of its name: BLF, ASC, or else MDF4; the stack closes it.
+    """Open a log of frames by its kind: BLF, ASC, candump, or else MDF4; the stack closes it.
 
     Raises:
         ValueError: an ASC log whose times are from each event to the next.
     """
-    kind = path.suffix.lower()
+    kind = find_extension(path)
     if kind == ".blf":
         from can import BLFReader
 
@@ -276,6 +277,13 @@ def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
         return _OpenedFrames(blf, begin=blf.start_timestamp, shift=0.0)
     if kind == ".asc":
         return _open_asc(path, stack)
+    if kind == CANDUMP:
+        from can import CanutilsLogReader
+
+        # A first reader for the time of the first frame, when the log began.
+        with CanutilsLogReader(path) as frames:
+            begin = next(iter(frames)).timestamp
+        return _OpenedFrames(stack.enter_context(CanutilsLogReader(path)), begin=begin, shift=0.0)
     import asammdf
     from can.io.mf4 import MF4Reader
 

@@ -29,7 +29,7 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
         sources: sources by name of the message, as `json_field` makes them.
         dbc: database of the bus, a file of `cantools` (.dbc, .kcd, .sym, .arxml), for frames of CAN; None where the
             log has signals already.
-        channel: number of the bus, where a log has several; None for any.
+        channel: number of the bus, or its name ("can0"), where a log has several; None for any.
         start: date of the log's begin, with a zone, in place of that in the file; None for that of the file, and of
             1970 where the file has none.
 
@@ -42,7 +42,7 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
         sources: "Mapping[str, Source | Sequence[Source]]",
         *,
         dbc: str | Path | None = None,
-        channel: int | None = None,
+        channel: int | str | None = None,
         start: str | None = None,
     ):
         """Check the options of a log, and keep its sources by message, as in a network's file.
@@ -50,7 +50,7 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
         Args:
             sources: by name of a message its source, or several.
             dbc: database that describes the frames of a bus; None for none.
-            channel: the bus's channel, of a log of several; None for any.
+            channel: number or name of the bus, of a log of several; None for any.
             start: date of the log's begin, with its zone; None for that in the log.
         """
         if not isinstance(sources, Mapping):
@@ -58,7 +58,9 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
             raise fail("LogSources, sources", expected, show_value(sources))
         self._sources = dict(sources)
         self.dbc = None if dbc is None else file_path("LogSources, dbc", dbc)
-        self.channel = None if channel is None else check_count("LogSources, channel", channel, 0)
+        # A bus has a number, or a name in a log of candump.
+        no_number = channel is None or isinstance(channel, str)
+        self.channel: int | str | None = channel if no_number else check_count("LogSources, channel", channel, 0)
         self.start = None if start is None else parse_start("LogSources, start", start) / SECOND
 
     def __getitem__(self, name: str) -> "Source | Sequence[Source]":

@@ -9,12 +9,13 @@ import numpy as np
 
 from heliograph.files.logs.log_sources import STAMP
 from heliograph.files.messages.message_files import FileMessage
+from heliograph.files.text.text_file import CANDUMP, find_extension
 from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 
-FRAMES, MDF, ULOG = (".blf", ".asc"), (".mf4",), (".ulg",)
+FRAMES, MDF, ULOG = (".blf", ".asc", CANDUMP), (".mf4",), (".ulg",)
 LOGS = (*FRAMES, *MDF, *ULOG)
-PACKAGES = {".blf": ("can", "cantools"), ".asc": ("can", "cantools"), ".mf4": ("asammdf",), ".ulg": ("pyulog",)}
+PACKAGES = {**dict.fromkeys(FRAMES, ("can", "cantools")), ".mf4": ("asammdf",), ".ulg": ("pyulog",)}
 DIGITS = 6  # of a second: doubles of our years tell microseconds apart
 Wanted = Callable[[str], bool]
 
@@ -45,15 +46,15 @@ class MessageSeries(NamedTuple):
 
 
 def is_log(path: Path) -> bool:
-    """Return whether a path is that of a vehicle's log, by its name, or of a folder with logs."""
+    """Return whether a path is that of a vehicle's log or of a folder with logs, by name or by how a .log begins."""
     return bool(list_logs(path))
 
 
 def list_logs(path: Path) -> list[Path]:
-    """Return the logs at a path: those in a folder, sorted by name, or the file itself if its extension is a log's."""
+    """Return the logs at a path: those in a folder, sorted by name, or the file itself if it is of a log's kind."""
     if path.is_dir():
-        return sorted(part for part in path.iterdir() if part.is_file() and part.suffix.lower() in LOGS)
-    return [path] if path.suffix.lower() in LOGS else []
+        return sorted(part for part in path.iterdir() if part.is_file() and find_extension(part) in LOGS)
+    return [path] if find_extension(path) in LOGS else []
 
 
 def merge_series(path: Path, begin: float, series: Mapping[str, MessageSeries]) -> Iterator[FileMessage]:

@@ -16,6 +16,8 @@ from heliograph.numerics.check import InputError, fail
 T = TypeVar("T")
 Progress: TypeAlias = Callable[[int, int], None]  # called with how much is done, and how much there is
 PACKED = ".gz"
+CANDUMP = ".candump"  # the kind of a .log of frames, as `candump -L` and `candump -l` write it
+FRAME = re.compile(r"\(\d+\.\d+\) \S+ [0-9A-Fa-f]{3,8}#")  # how each of its lines begins
 GZIP = b"\x1f\x8b"  # the first bytes of what is packed
 OTHER_KINDS = {  # what files begin with that are no text: what they are
     b"PAR1": "a Parquet file",
@@ -38,7 +40,12 @@ class CutOffError(InputError):
 
 
 def find_extension(path: Path) -> str:
-    """Return the extension of a file in small letters: before .gz where it is packed, ".csv" of a table in a .txt."""
+    """Return the extension of a file in small letters; where the name does not tell, what the file's text begins like.
+
+    It is that before .gz of a packed file, ".csv" of a table in a .txt, and CANDUMP of frames of a CAN bus in a .log.
+    """
+    if path.suffix.lower() == ".log" and path.is_file() and _begins_as_frames(path):
+        return CANDUMP
     kind = (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
     return ".csv" if kind == ".txt" and path.is_file() and _begins_as_table(path) else kind
 
@@ -55,6 +62,15 @@ def _begins_as_table(path: Path) -> bool:
         return len(names) > 1
     are_words = all(re.fullmatch(r"[^\W\d][^{}\[\]:]*", name.strip().strip('"')) for name in names)
     return len(names) > 1 and are_words and all(len(row.split(",")) == len(names) for row in rows)
+
+
+def _begins_as_frames(path: Path) -> bool:
+    """Return whether the first line of a text is a frame of a CAN bus: "(1790000000.020000) can0 1A0#100E0100"."""
+    try:
+        with open_text(path) as text:
+            return FRAME.match(next((line.strip() for line in text if line.strip()), "")) is not None
+    except (OSError, ValueError):
+        return False
 
 
 def guess_encoding(start: bytes) -> str:
