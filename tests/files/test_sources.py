@@ -276,6 +276,15 @@ def test_the_heading_of_a_quaternion(angle):
     np.testing.assert_allclose(reading.values[0], angle, rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.parametrize("up", [1, -1])
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_a_body_that_points_straight_up_or_down_has_no_heading(up, precision):
+    """Before, what was left by rounding was read: 0, or half a turn."""
+    half = float(precision(np.sqrt(0.5)))
+    heading = hg.files.Yaw("q").of(0.0, up * half, 0.0, half)
+    assert np.isnan(heading)
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

@@ -10,6 +10,7 @@ from heliograph.models.local_plane import LocalPlane
 from heliograph.numerics.check import TINY, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 
+VERTICAL = 1e-6  # of the length of a forward axis: a horizontal part below which its heading is rounding of float32
 SYMMETRIC = 1e-5  # of two deviations: what float32 may leave between two entries that are one
 
 
@@ -19,7 +20,8 @@ class Yaw:
     """Heading of a quaternion, atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)), in radians: a value in place of a path.
 
     Args:
-        path: dotted path of the quaternion, which has the fields x, y, z and w.
+        path: dotted path of the quaternion, which has the fields x, y, z and w. A body that points straight up or down
+            has no heading: the value did not arrive.
     """
 
     path: str
@@ -31,9 +33,11 @@ class Yaw:
 
     @staticmethod
     def of(x: Any, y: Any, z: Any, w: Any) -> Any:
-        """Return the heading, of numbers or of arrays; NaN where a part is missing or all are 0."""
+        """Return the heading, of numbers or of arrays; NaN where a part is missing, all are 0, or it is vertical."""
         size = x * x + y * y + z * z + w * w
-        return np.where(size > 0, np.arctan2(2 * (w * z + x * y), size - 2 * (y * y + z * z)), np.nan)
+        # The body's forward axis in the world, its x and y there, of length `size`.
+        x_axis, y_axis = size - 2 * (y * y + z * z), 2 * (w * z + x * y)
+        return np.where(np.hypot(x_axis, y_axis) > VERTICAL * size, np.arctan2(y_axis, x_axis), np.nan)
 
 
 @readable
