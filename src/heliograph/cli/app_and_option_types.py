@@ -16,7 +16,7 @@ app = App(
     name="heliograph",
     help="State estimation over relay networks.",
     version=heliograph.__version__,
-    help_format="plaintext",
+    help_format="restructuredtext",
 )
 
 
