@@ -20,6 +20,7 @@ from heliograph.files.recordings.recording_rows import (
     join_recording_rows,
     order_rows,
 )
+from heliograph.files.recordings.time_steps import compare_steps_with_times
 from heliograph.files.tables.table import TIME, convert_to_columns, read_rows, write_table
 from heliograph.files.tables.table_rows import TableRows
 from heliograph.files.tables.table_writer import predict_name_read_back
@@ -42,8 +43,6 @@ from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:
     from heliograph.files.stores.store_tables import StoreTable
-
-SAME_STEP = 1e-3  # share by which a time step may differ from the difference of two times, which are rounded
 
 
 @readable
@@ -289,32 +288,10 @@ def _make_inputs(
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
         if name == TIME_STEP and name in given:
-            u[:, i] = _bridge_refused_rows(u[:, i], time, rows.numbers, source)
+            u[:, i] = compare_steps_with_times(u[:, i], time, rows.numbers, source)
         if name == TIME_STEP and (fault := find_time_step_fault(u[:, i])):
             raise fail(f"{source}, row {rows.numbers[fault.row]}, column {name!r}", fault.expected, fault.came)
     return u
-
-
-def _bridge_refused_rows(dt: np.ndarray, time: np.ndarray, numbers: np.ndarray, source: str) -> np.ndarray:
-    """Return the time steps; behind rows that were refused, whose own steps are lost, the time since the row before.
-
-    A warning is given where the steps of the other rows are not the differences of their times, which tells nothing of
-    those that were refused. `numbers` are those of the rows in the table.
-    """
-    is_behind_refused = np.diff(numbers, prepend=numbers[:1]) > 1
-    if not is_behind_refused.any():
-        return dt
-    since_row_before = seconds_between(time)
-    others = np.flatnonzero(~is_behind_refused)[1:]  # the first row's step is not in the table's times
-    if np.allclose(dt[others], since_row_before[others], rtol=SAME_STEP, atol=0.0):
-        return np.where(is_behind_refused, since_row_before, dt)
-    row = numbers[np.argmax(is_behind_refused)]
-    warnings.warn(
-        f"{source}, row {row}, column {TIME_STEP!r}: the steps of the rows refused before it are left out, since steps "
-        "are not the differences of times here",
-        stacklevel=6,
-    )
-    return dt
 
 
 def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
