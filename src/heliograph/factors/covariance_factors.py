@@ -101,8 +101,11 @@ def below_diagonal(lower: jax.Array) -> jax.Array:
 
 
 def _take_entries(entries: jax.Array, indices: np.ndarray) -> jax.Array:
-    """Return `entries[..., indices]` as one operation: the indices are known, and need no check of their bounds."""
-    axis = entries.ndim - 1
+    """Return `entries[..., indices]` as one operation: the indices are known, and need no check of their bounds.
+
+    `entries` is (..., count) and `indices` an array of integers; the result is (..., *indices.shape).
+    """
+    axis = entries.ndim - 1  # the entries' axis: indexed, and replaced by those of the indices; all others are kept
     numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
     sizes = (*entries.shape[:-1], 1)
     return lax.gather(entries, indices[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
@@ -367,6 +370,10 @@ _eliminate_by_loop = operation(_eliminate_column_by_column)(_eliminate_in_loop)
 def insert_column(
     j: jax.Array, lower: jax.Array, column: jax.Array, variances: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return L with `column` as its column j, below the diagonal, and `variances` with d in entry j."""
+    """Return L (n, n) with `column` added to its column j, and `variances` (n,) with d in entry j.
+
+    A step of a factorisation in a loop, where j is traced: column j of `lower` was that of the identity, and `column`
+    (n,) is 0 on and above the diagonal.
+    """
     is_j = np.arange(len(variances)) == j
     return jnp.where(is_j, lower + column[:, None], lower), jnp.where(is_j, d, variances)

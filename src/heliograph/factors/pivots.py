@@ -113,10 +113,11 @@ def set_to_zero(numbers: jax.Array, is_rounding: jax.Array) -> jax.Array:
 
 
 def spoils_what_is_known(power: jax.Array, least: jax.Array, noise: jax.Array) -> jax.Array:
-    """Return whether slopes of a variance `power` are rounding, up to `least`, and would change what is known by it.
+    """Return whether a measurement's slopes are only rounding, so that measuring by them would spoil the state.
 
-    Beside a noise of more than `least` / eps they change no digit of a value. Where the program is differentiated they
-    count then, as their derivatives do.
+    They are rounding if their variance `power` = f' diag(d) f is at most `least`. In a program that is differentiated
+    they are kept all the same beside a noise variance of `least` / eps or more: they change no digit of a value then,
+    and their derivatives count.
     """
     is_rounding = power <= least
     return is_rounding & (least > unit_of(least) * noise) if writes_for_derivatives() else is_rounding
@@ -124,7 +125,11 @@ def spoils_what_is_known(power: jax.Array, least: jax.Array, noise: jax.Array) -
 
 @jax.custom_jvp
 def spoil_derivatives(numbers: jax.Array, spoilt: jax.Array) -> jax.Array:
-    """Return numbers whose derivatives are NaN where these cannot be had: `spoilt` has their shape, or fits to it."""
+    """Return the numbers unchanged, with derivatives that are NaN where `spoilt` says so.
+
+    For places where rounding leaves no digit of a derivative: NaN is seen, a wrong number is not. `spoilt` has the
+    shape of the numbers, or one that broadcasts to it.
+    """
     return numbers
 
 
@@ -137,13 +142,20 @@ def _differentiate_spoilt(primals: Any, tangents: Any) -> tuple[jax.Array, jax.A
 
 @jax.custom_jvp
 def differentiable_once(numbers: jax.Array, where: jax.Array) -> jax.Array:
-    """Return numbers whose second derivatives at `where`, which cannot be had, are infinite or NaN along themselves."""
+    """Return the numbers unchanged, such that their second derivatives at `where` become infinite or NaN.
+
+    Used where a first derivative is right, but rounding has taken all digits of the second.
+    """
     return numbers
 
 
 @differentiable_once.defjvp
 def _differentiate_once(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the numbers, and their derivatives times a 1 whose own derivative overflows at `where`."""
+    """Return the numbers, and their derivatives times the factor 1 + (x - c) largest^2, c the constant value of x.
+
+    The factor is 1. Its own derivative, largest^2, is 0 except at `where`, where it overflows: so second derivatives
+    are infinite or NaN there instead of wrong numbers.
+    """
     (numbers, where), (slopes, _) = primals, tangents
     largest = jnp.where(where, float(np.finfo(np.dtype(numbers.dtype)).max), jnp.zeros_like(numbers))
     none = numbers - lax.stop_gradient(numbers)

@@ -12,6 +12,9 @@ from heliograph.factors.repeated_measurements import noise_beside_rounding, roun
 from heliograph.numerics.linalg import WRITTEN, where
 from heliograph.numerics.trace_settings import writes_for_derivatives, writes_short_programs
 
+# From the part's number, the rows, the variances and its rounding variance, to rows, variances and gain given the part.
+MeasurePart = Callable[[int | jax.Array, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
+
 
 def update_by_scalar(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
@@ -83,7 +86,7 @@ def update_root_columns(
 
 
 def update_by_parts(
-    measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]],
+    measure_part: MeasurePart,
     root: jax.Array,
     d: jax.Array,
     rounding_variance: jax.Array,
@@ -156,8 +159,8 @@ def update_by_row(
     return root, d, gain, where(is_rounding, noise, variance)
 
 
-Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # rows, variances d, means, rounding variances
+Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # rows, d, means, innovations, their variances
 
 
 def update_by_rows(

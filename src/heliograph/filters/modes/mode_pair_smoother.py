@@ -15,15 +15,13 @@ import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, unit_lower
 from heliograph.factors.factored_gaussian import (
-    BackwardGain,
     Gaussian,
-    condition_on_next_state,
     from_columns,
     merge_mixture,
     moments_of_mixture,
-    rts_step,
     sum_unexplained,
 )
+from heliograph.factors.state_given_next import BackwardGain, condition_on_next_state, rts_step
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import condition_on_measurement
