@@ -61,12 +61,12 @@ class Signal(NamedTuple):
 
     @property
     def covariance(self) -> jax.Array:
-        """Covariance Cov y (p, p) of the signal, with the sensor's noise."""
+        """Cov y = slopes diag(d) slopes' + Cov v (p, p), d the variances of xi in the prior x = m + L xi."""
         return join_columns(WeightedColumns(self.slopes, self.prior.variances), self.noise).covariance
 
     @property
     def cross(self) -> jax.Array:
-        """Cross-covariance Cov(x, y) (n, p) of state and signal."""
+        """Cross-covariance Cov(x, y) = L diag(d) slopes' (n, p) of state and signal."""
         return jnp.asarray((self.prior.root * self.prior.variances) @ self.slopes.T)
 
     def about_mean(self) -> "Signal":
@@ -134,10 +134,16 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 
 def take_link_noise(channel: SecondOrder) -> WeightedColumns:
-    """Return columns of Cov n; of a traced law those with its derivatives, where the program is differentiated."""
+    """Return columns W and weights w of Cov n = W diag(w) W' of a channel z = G y + n.
+
+    Where the program is differentiated by parameters of the noise (its law is traced), the columns are found anew, so
+    that they have derivatives by them also where a variance is 0.
+    """
     if not (writes_for_derivatives() and is_traced(channel.noise)):
         return channel.noise
-    return columns_with_derivatives(channel.nominal.center[..., -1, -1] - channel.gain_covariance[..., -1, -1])
+    # Index -1 is that of the constant 1 in (y, 1), whose factor in z is n.
+    of_noise_and_gain = channel.nominal.center[..., -1, -1]
+    return columns_with_derivatives(of_noise_and_gain - channel.gain_covariance[..., -1, -1])
 
 
 def noise_behind_gain(
@@ -156,14 +162,23 @@ def noise_behind_gain(
 
 
 def factor_gain_noise(gain_covariance: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
-    """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
-    return factor_covariance(contract(gain_covariance, augmented_second_moment(second, mean, 1.0)))
+    """Return columns of E[(G - M) y y' (G - M)'] (m, m), the noise that a random gain G of mean M makes of y.
+
+    Args:
+        gain_covariance: Cov of the entries of (G, n), (m, m, p + 1, p + 1): entry [i, j, a, b] is Cov(G_ia, G_jb). The
+            last a and b, p, stand for the constant 1 below y, whose factor is the noise n.
+        second: E[y y'] (p, p).
+        mean: E[y] (p,).
+    """
+    Y = augmented_second_moment(second, mean, 1.0)  # of (y, 1)
+    return factor_covariance(contract(gain_covariance, Y))  # sum_ab Cov(G_ia, G_jb) Y_ab
 
 
 def factor_covariance(covariance: jax.Array) -> WeightedColumns:
-    """Return factors of a covariance that was formed as a matrix; each pivot is at least 100 eps of its variance.
+    """Return L and d of a covariance P = L diag(d) L' (m, m) that was computed as a matrix.
 
-    So large is the rounding of a combination that has no variance.
+    Each d_j is raised to at least LOST (100) eps of P_jj: so large is the rounding of a combination of components that
+    has no variance.
     """
     return eliminate(covariance, LOST * unit_of(covariance))
 

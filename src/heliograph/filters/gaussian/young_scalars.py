@@ -94,7 +94,10 @@ def newton_step(t: jax.Array, f_of_t: jax.Array, slopes: Slopes) -> jax.Array:
 
 
 def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array) -> jax.Array:
-    """Return Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part."""
+    """Return Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part (m, m), for beta (2,).
+
+    It bounds the covariance of what is received from a channel of uncertain law, for any positive beta_1 and beta_2.
+    """
     return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
 
 

@@ -37,7 +37,7 @@ class TrueError:
 
     @property
     def ratio(self) -> Float[np.ndarray, "time n"]:
-        """True over claimed variance of each state."""
+        """True over claimed variance of each state after each correction: 1 where the claim is right."""
         return np.asarray(np.diagonal(self.true, axis1=1, axis2=2) / np.diagonal(self.claimed, axis1=1, axis2=2))
 
 
