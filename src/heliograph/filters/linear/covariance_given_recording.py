@@ -56,7 +56,7 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: RecordedBelief, u: ArrayLike = (), k: Step = 0) -> RecordedBelief:
-        """Predict over x+ = A x + b + w: the filter's own state, and P given this recording, which becomes A P A' + Q."""
+        """Predict over x+ = A x + b + w: the filter's own state, and P given the recording, to A P A' + Q."""
         initial_power = second_moments_at_start(self.plant)
         move = motion_of_plant(at(self.plant, k), jnp.asarray(u), initial_power)
         covariance = move.matrix @ state.covariance @ move.matrix.T + move.covariance

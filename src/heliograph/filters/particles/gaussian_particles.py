@@ -14,7 +14,10 @@ from heliograph.numerics.types import Bool, Float, Int
 
 
 class Cloud(NamedTuple):
-    """Particles (N, ...): the Gaussian of x in every mode, and log probabilities of the modes (N, M)."""
+    """N particles, each a mixture: the Gaussian of x (n,) in each of M modes, and log probabilities of the modes.
+
+    Shapes: the Gaussians (N, M, n), log_mode (N, M).
+    """
 
     gaussian: Gaussian
     log_mode: jax.Array
@@ -49,7 +52,7 @@ class PartlyDrawn(NamedTuple):
 
 
 def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
-    """Return Gaussians (N, n) as those of every mode (N, M, n)."""
+    """Return N Gaussians of n states, each repeated for every one of M modes: means (N, n) become (N, M, n)."""
     repeated: Gaussian = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], modes, axis=1), x)
     return repeated
 
@@ -71,7 +74,12 @@ def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> 
 
 
 def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSums, angles: Angles) -> jax.Array:
-    """Return the second sums (n, n) of particles (B,) and modes about the mean of all."""
+    """Return the sum over particles and modes of w (d d' + P) (n, n), from which the covariance of x follows.
+
+    w is a particle's weight times its mode's probability, P the Gaussian's covariance and d the difference of its mean
+    from the mean of all particles, which `sums` (over all of them) give. Differences of `angles` are within half a
+    turn.
+    """
     weights, mean = _list_parts(weight, particles)
     deviation = wrap_angles(mean - sums.first.mean(angles), angles)
     n = mean.shape[1]
@@ -80,9 +88,9 @@ def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSu
 
 
 def _list_parts(weight: jax.Array, particles: Cloud) -> tuple[jax.Array, jax.Array]:
-    """Return weights (B M,) of particles and modes, and their means (B M, n).
+    """Return a list of all pairs of particle and mode: their weights (B M,), and means of their Gaussians (B M, n).
 
-    A particle has M modes, each with a Gaussian of n states and a log probability.
+    A pair's weight is the particle's weight (`weight` (B,)) times the probability of the mode.
     """
     x, log_mode = particles
     weights = (weight[:, None] * jax.nn.softmax(log_mode, axis=1)).ravel()

@@ -30,7 +30,10 @@ class FirstSums(NamedTuple):
 
 
 class StateSums(NamedTuple):
-    """First sums of the states of particles, and of the weights of modes (modes,), without any where there is one."""
+    """Sums over particles, from which their mean follows, and the sum of weights in each mode (M,).
+
+    `modes` is None where there is only one mode.
+    """
 
     first: FirstSums
     modes: jax.Array | None
@@ -53,7 +56,7 @@ def second_sums(weight: jax.Array, differences: jax.Array) -> jax.Array:
 
 
 def pack_sums(sums: PyTree) -> jax.Array:
-    """Return sums as one vector."""
+    """Return a tree of sums as one vector: native code adds up groups of particles in vectors."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
 
 

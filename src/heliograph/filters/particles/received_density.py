@@ -90,9 +90,10 @@ def _log_density_of_atom(expected: jax.Array, noise: jax.Array, z: jax.Array, an
 
 
 class ReceivedDensity(Module):
-    """Atoms of what is received at one step, in each mode, for each set of components that arrive together.
+    """Law of z given h(x) at one step: in each of M modes, for each of A sets of components that arrive together.
 
-    Shapes: present (A, m), chance (M, A), and the atoms' with first axes (M, A).
+    `present` (A, m) are the sets, `chance` (M, A) the probability of each set in each mode, and `atoms` the Gaussians
+    whose mixture is the law of what arrives, with first axes (M, A).
     """
 
     present: Bool[Array, "A m"]

@@ -15,7 +15,10 @@ MANY = 10_000  # normal numbers, more than a program of native code draws at onc
 
 
 def invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Return the index at which the distribution function of a law passes a uniform number: a draw from the law."""
+    """Return the index at which the distribution function of a law passes a uniform number: a draw from the law.
+
+    `law` (N,) are probabilities; `uniform` is a number of [0, 1), or an array of several, which give as many indices.
+    """
     return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform).astype(int)
 
 
