@@ -48,22 +48,25 @@ class WeightedColumns(NamedTuple):
         return variances
 
     def through(self, matrix: Array) -> "WeightedColumns":
-        """Return the covariance of A v for a v with this one."""
+        """Return the covariance of A v, for a v with this covariance: the columns A W with the same weights."""
         return WeightedColumns(matrix @ self.matrix, self.weights)
 
     def times(self, factor: Array) -> "WeightedColumns":
-        """Return the covariance times a number."""
+        """Return the covariance times a number `factor`: the same columns, with weights times it."""
         return WeightedColumns(self.matrix, self.weights * factor)
 
 
 def join_columns(*covariances: WeightedColumns) -> WeightedColumns:
-    """Add covariances: their columns side by side."""
+    """Return the sum of covariances W diag(w) W': their columns side by side, in one matrix."""
     matrix = jnp.concatenate([jnp.asarray(covariance.matrix) for covariance in covariances], axis=1)
     return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(covariance.weights) for covariance in covariances]))
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
-    """Return the columns of sum_i w_i P_i: `parts` has those of each P_i (i, n, columns), and `weights` are w_i."""
+    """Return the columns of sum_i w_i P_i, such as the mean of covariances P_i over modes of probability w_i.
+
+    `parts` has the columns of each P_i along a first axis (i, n, columns), and `weights` (i,) are w_i.
+    """
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     scaled_weights = (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1)
@@ -71,7 +74,7 @@ def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
 
 
 def zero_covariance(n: int) -> WeightedColumns:
-    """Return the covariance of zero of n components: no columns."""
+    """Return the covariance of n components that are known: (n, 0), a matrix without columns."""
     return WeightedColumns(np.zeros((n, 0)), np.zeros(0))
 
 
@@ -126,7 +129,10 @@ def triangularise(columns: WeightedColumns) -> WeightedColumns:
 
 
 def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
-    """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another."""
+    """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another.
+
+    d_j is the square of row j in the weights, after the rows below lost their parts along the rows above.
+    """
     rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
     n, lower, variances = len(rows), [], []
     for j in range(n):
@@ -311,13 +317,16 @@ def noise_beside_repeated(sizes: Array) -> Array:
 
 
 def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
-    """Return column j of L without its diagonal: the entries below it, zeros above."""
+    """Return column j of L - I, L unit lower triangular: the entries of `column` (n,) below row j, zeros elsewhere."""
     n = len(column)
     return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
 def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> WeightedColumns:
-    """Return L and d from the columns of L - I, which are 0 on and above the diagonal, and the entries of d."""
+    """Return L and d, as a covariance L diag(d) L', from a list of the columns of L - I and one of the entries of d.
+
+    A factorisation finds both one by one. The columns (n,) are 0 on and above the diagonal.
+    """
     n = len(variances)
     if not n:
         return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))

@@ -42,7 +42,7 @@ class Diffuse(NamedTuple):
 
     @property
     def unknown(self) -> jax.Array:
-        """Return which components have an infinite variance, (n,)."""
+        """Return which components have an infinite variance (n,): those with an entry of L in an unknown direction."""
         return jnp.any((self.root != 0) & (self.infinite > 0), axis=1)
 
     @property
@@ -371,5 +371,8 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
 
 
 def as_gaussian(x: Diffuse) -> Gaussian:
-    """Return x as a Gaussian in which an unknown direction has the variance NaN instead of infinity."""
+    """Return x as an ordinary Gaussian, whose variance is NaN in each direction that is unknown.
+
+    For code that knows no infinite variances: what depends on an unknown direction is then NaN too.
+    """
     return Gaussian(x.mean, x.lower, jnp.where(x.infinite > 0, jnp.nan, x.variances))

@@ -175,7 +175,10 @@ def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Weighted
 
 
 def take_leading(x: Gaussian, n: int) -> Gaussian:
-    """Return the marginal Gaussian of the first n components: the first rows of L."""
+    """Return the Gaussian of the first n components alone, whose factors are the first n rows and columns of L.
+
+    The entries of L below the diagonal are stored row by row, so that those of the first rows come first.
+    """
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 
@@ -213,7 +216,7 @@ class Innovations(NamedTuple):
 
     @property
     def determined(self) -> jax.Array:
-        """Return which components those before them determine, to rounding (m,)."""
+        """Return which components (m,) those before them determine: their innovation has no variance but rounding."""
         return self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
 
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
@@ -339,5 +342,8 @@ def moments_of_mixture(
 
 
 def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
-    """Merge a mixture into one Gaussian of its moments; `parts` have a leading axis."""
+    """Return the one Gaussian that has the mean and covariance of a mixture of Gaussians.
+
+    `parts` are the Gaussians of the mixture, with a leading axis, and `weights` their probabilities, of sum 1.
+    """
     return from_covariance_by_elimination(*moments_of_mixture(parts.mean, parts.covariance, weights))

@@ -32,7 +32,7 @@ def reciprocal_or_one(x: jax.Array) -> jax.Array:
 
 @jax.jit
 def reciprocal_or_zero(x: jax.Array) -> jax.Array:
-    """Return 1 / x of a positive number, and 0 of 0."""
+    """Return 1 / x of a positive number, and 0 of 0: of a variance that is 0, such a gain is 0."""
     positive, one = is_positive(x), lax.full_like(x, 1.0)
     return lax.select(positive, lax.div(one, lax.select(positive, x, one)), lax.full_like(x, 0.0))
 
@@ -64,7 +64,11 @@ def _differentiate_share(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Ar
 
 
 def replace_value(value: jax.Array, expression: jax.Array) -> jax.Array:
-    """Return a value with the derivatives of an expression that is another way to compute it, or all but it."""
+    """Return `value`, but with the derivatives of `value` plus those of `expression`.
+
+    The term that is added, the expression less itself as a constant, is 0 but has its derivatives. If the value is
+    constant, the result has those of the expression alone.
+    """
     return value + (expression - lax.stop_gradient(expression))
 
 
@@ -74,7 +78,7 @@ def rounding_of_pivots(covariance: Array) -> float:
 
 
 def unit_of(numbers: Array) -> float:
-    """Return eps of the precision in which these numbers are computed."""
+    """Return eps, the relative rounding error, of the precision in which these numbers are computed."""
     return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(precision_in_use()).eps))
 
 
@@ -105,7 +109,10 @@ def take_pivot(
 
 
 def set_to_zero(numbers: jax.Array, is_rounding: jax.Array) -> jax.Array:
-    """Return numbers, zero where they are rounding, but with their derivatives where the program is differentiated."""
+    """Return the numbers, with 0 in place of those that are only rounding.
+
+    Where the program is differentiated, these zeros keep the first derivatives of the numbers.
+    """
     if not writes_for_derivatives():
         return jnp.where(is_rounding, 0.0, numbers)
     once = differentiable_once(numbers, is_rounding)
@@ -135,7 +142,7 @@ def spoil_derivatives(numbers: jax.Array, spoilt: jax.Array) -> jax.Array:
 
 @spoil_derivatives.defjvp
 def _differentiate_spoilt(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the numbers, and their derivatives times NaN where they are spoilt."""
+    """Return the numbers, and their derivatives along a tangent: NaN where `spoilt`, and as they are elsewhere."""
     (numbers, spoilt), (slopes, _) = primals, tangents
     return numbers, slopes * jnp.where(spoilt, jnp.nan, 1.0)
 

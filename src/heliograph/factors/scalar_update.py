@@ -247,10 +247,10 @@ def _update_by_rows_in_loop(
 
 
 def _move_row_to_end(rows: jax.Array, i: int) -> jax.Array:
-    """Return rows with row i behind all others."""
+    """Return the rows in a new order: row i is the last, all others stay in their order."""
     return jnp.concatenate([rows[:i], rows[i + 1 :], rows[i : i + 1]])
 
 
 def stack_numbers(entries: list[jax.Array]) -> jax.Array:
-    """Return numbers as a vector, of none an empty one."""
+    """Return a list of numbers () as a vector; `jnp.stack` refuses an empty list, of which it is an empty one."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

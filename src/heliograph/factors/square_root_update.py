@@ -21,7 +21,7 @@ class ObservedRoot(NamedTuple):
 
 
 def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
-    """Return W W', symmetric to the last digit."""
+    """Return the covariance W W' (n, n) of a root W (n, columns), symmetric to the last digit."""
     product = root @ root.swapaxes(-1, -2)
     return np.asarray(product + product.swapaxes(-1, -2)) / 2
 

@@ -40,7 +40,7 @@ class BackwardGain(NamedTuple):
         return self.left.mean + self.gain @ self.apply_inverse_factor((later - self.ahead)[:, None])[:, 0]
 
     def apply_inverse_factor(self, rows: jax.Array) -> jax.Array:
-        """Return L^-1 times rows (n, ...)."""
+        """Return L^-1 times rows (n, ...): it turns x+ - m+ = L e into e, whose components are uncorrelated."""
         return decorrelate(unit_lower(self.lower), rows)
 
 
@@ -70,7 +70,10 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
     def measure_part(
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Measure part i of x+: return the rows and variances after it, and its gain."""
+        """Measure part i of x+: return the rows and variances after it, and its gain.
+
+        `root` has the rows of x and below them those of x+, on xi of variances `d`; `rounding`: see `update_by_parts`.
+        """
         # N is unit lower triangular, so part i is the first that omega_i is in, and the parts before it have determined
         # omega_0 ... omega_i-1. So it takes one more column than xi has: that of omega_i, with the slope 1 in part i.
         f, column, r = root[n + i], omega_rows[:, i], weights[i]  # Var(part i) = f diag(d) f' + r

@@ -97,7 +97,7 @@ class AdaptiveFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
-        """Predict the plant's state as the base filter does; the laws of the noise variances stay until data arrive."""
+        """Predict the plant's state as the base filter does; the laws of the noise variances stay until data come."""
         return AdaptiveBelief(self.base.predict(state.gaussian, u, k), state.shape, state.scale)
 
     @corrects

@@ -139,12 +139,16 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @property
     def has_known_gain(self) -> bool:
-        """True if no gain of the channel is random, so that no covariance needs E[x x'] (before any data)."""
-        return self.linear  # which says it, and more: plant and sensor are linear too
+        """True if all gains of the channel are known.
+
+        A random gain multiplies the whole signal, so that covariances would need E[x x'] before any data. `linear` says
+        that no gain is random, and that plant and sensor are linear, too: only such filters are asked.
+        """
+        return self.linear
 
     @property
     def law_at_start(self) -> HasInitialMoments:
-        """Where the law of the first state stands: here, since the filter may start from another one than its plant."""
+        """What holds the law of the first state: this filter, which may start from another law than its plant's."""
         return self
 
     def trace_log_likelihood(

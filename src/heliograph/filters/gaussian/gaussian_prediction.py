@@ -77,7 +77,7 @@ class AbstractGaussianStateFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
-        """Return the mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of x given the data, with angles between -pi and pi."""
         mean = wrap_angles(state.mean, first(self.plant).angles)
         return Estimate(mean, state.covariance, self.claim, attitude=self.attitude)
 

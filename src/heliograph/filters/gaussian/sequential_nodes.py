@@ -62,7 +62,10 @@ class SequentialFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with each node's measurement in turn; z holds the measurements of all nodes, one after another."""
+        """Correct with each node's measurement in turn: the posterior of one node is the prior of the next.
+
+        z holds the measurements of all nodes, one after another. The innovations are joined likewise.
+        """
         z = jnp.asarray(z)
         if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)
@@ -75,7 +78,11 @@ class SequentialFilter(AbstractSizedFilter):
         return state, _join_innovations(innovations)
 
     def _correct_in_one_loop(self, state: Gaussian, z: jax.Array, k: Step) -> tuple[Gaussian, Innovation]:
-        """Correct as `correct` does, by a loop over nodes whose filters have one structure: it is compiled once."""
+        """Correct with the measurement of node after node, as `correct` does, by one loop over the nodes.
+
+        The filters of all nodes have the same structure here and differ only in their arrays, so that the loop's body
+        is compiled once. `z` joins measurements of equal length.
+        """
         # `arrays`: what differs from node to node, stacked; `rest`: what all filters share.
         arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 

@@ -229,7 +229,11 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
 
 
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
-    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` as its last entry, which is 1 or is set to 0."""
+    """Return E[(y, 1)(y, 1)'] (p + 1, p + 1) from E[y y'] (p, p) and E[y] (p,).
+
+    Moments of a channel z = G y + n are maps of this matrix: the 1 is multiplied by n. Its last entry E[1] is `last`:
+    1, or 0 where the noise n is counted elsewhere.
+    """
     top = jnp.concatenate([second, mean[:, None]], axis=1)
     bottom = jnp.concatenate([mean, jnp.full(1, last, mean.dtype)])
     return jnp.concatenate([top, bottom[None]])

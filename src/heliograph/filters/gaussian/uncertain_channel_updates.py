@@ -266,7 +266,7 @@ def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
 
 
 def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
-    """Return whether the matrix is a number times the identity."""
+    """Return whether the matrix is a number times the identity: the hop treats all components alike."""
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 

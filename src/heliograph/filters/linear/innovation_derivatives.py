@@ -98,8 +98,7 @@ def differentiate_step(
     """
     z, u = row
     filter, present = make(x), ~jnp.isnan(z)
-    # For each free number a pair: (the step's matrices, the moments before data), the same in each, and their
-    # derivatives by that number.
+    # For each free number: (the step's matrices, moments before data), the same in each pair, and their derivatives.
     pairs = [
         jax.jvp(lambda x, moments: find_model_matrices(make(x), moments, u, k), (x, before.before_data), (axis, slope))
         for axis, slope in zip(np.eye(len(x)), before.slopes_before_data or [None] * len(x), strict=True)
@@ -113,7 +112,7 @@ def differentiate_step(
     factored = FactoredStep(prior=prior.gaussian, after=after.gaussian, e=value, S=covariance)
 
     def step(matrices: ModelMatrices, moments: StateMoments) -> StepMoments:
-        """Return what the row makes of the state's moments; `factored` has its values."""
+        """Return the state's moments after the row, and its innovation, with the values of `factored`."""
         return step_by_covariances(matrices, moments, jnp.asarray(z), factored)
 
     of_estimate = StateMoments(before.gaussian.mean, before.gaussian.covariance)

@@ -104,7 +104,10 @@ class ScoreRecursion(Recursion):
         return summed
 
     def scan_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return what `scan` returns, computed in chunks of rows; None where `sum_long` returns None."""
+        """Return log-densities, scores row by row and information, as `scan`, of a long recording: in chunks of rows.
+
+        Returns None if the recording is short or cannot be divided into chunks.
+        """
         sums = self.sum_long(z, u)
         if sums is None:
             return None
@@ -120,7 +123,10 @@ class ScoreRecursion(Recursion):
 
 
 def _start_of(recursion: ScoreRecursion) -> EstimateWithDerivatives:
-    """Return the estimate before the first row with its derivatives: compiled body of `ScoreRecursion._start`."""
+    """Return the estimate before the first row, with its derivatives by the free numbers.
+
+    A function of its own, so that it can be compiled: the body of `ScoreRecursion._start`.
+    """
     return differentiate_start(recursion.make, recursion.x, recursion.known_gain)
 
 

@@ -96,7 +96,7 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: CentredState, u: ArrayLike = (), k: Step = 0) -> CentredState:
-        """Predict with the inner filter of x - E[x], and propagate E[x]."""
+        """Predict x - E[x] by the inner filter, and the mean E[x], which is known before any data."""
         return CentredState(self.inner.predict(state.inner, u, k), predict_mean(self.centre, state.mean, k))
 
     @corrects

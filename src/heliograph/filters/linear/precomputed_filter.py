@@ -47,7 +47,7 @@ class LinearStep(NamedTuple):
         return jnp.asarray(mean + self.gain @ innovation)
 
     def error_transition(self) -> Float[jax.Array, "*node N N"]:
-        """Return I - K C, which maps the predicted mean, and its error, to the corrected one."""
+        """Return I - K C (N, N), which takes the error of the predicted mean to that of the corrected one."""
         return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
 
 
@@ -224,7 +224,7 @@ def record_step_matrices(
     zero_mean = jnp.zeros_like(gaussian_of(state).mean)
 
     def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
-        """Return the predicted mean, and the predicted state."""
+        """Return the predicted mean as a function of the mean before, to be differentiated, and the predicted state."""
         prior = filter.predict(_with_mean(state, mean), u, k)
         return jnp.asarray(gaussian_of(prior).mean), prior
 

@@ -62,12 +62,18 @@ def correct_in_every_mode(
 def _correct_in_mode(
     signal: Signal, mean: jax.Array, gain_covariance: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
 ) -> tuple[Gaussian, Innovation]:
-    """Correct the prior of a signal y with z = G y + n in one mode of the channel.
+    """Correct the Gaussian of x with z = G y + n, whose random gain G and noise n have the law of one mode.
 
-    In this mode `mean` is E[(G, n)], `gain_covariance` is Cov G, `link` has columns of Cov n; `angles` are those of z.
+    Args:
+        signal: moments of the sensor's signal y, and the prior of x.
+        mean: E[(G, n)] (m, p + 1), the mean noise as last column.
+        gain_covariance: covariances of the entries of G (m, m, p + 1, p + 1).
+        link: columns of Cov n.
+        z: measurement (m,), NaN for what did not arrive.
+        angles: components of z that are angles.
     """
-    gain = mean[:, :-1]
-    expected = gain @ signal.mean + mean[:, -1]
+    gain, offset = mean[:, :-1], mean[:, -1]  # E G and E n
+    expected = gain @ signal.mean + offset
     z = wrap_near(z, expected, angles)
     slopes, noise = gain @ signal.slopes, noise_behind_gain(signal, gain, gain_covariance, link)
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)

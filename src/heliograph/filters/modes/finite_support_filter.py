@@ -108,7 +108,7 @@ class MixtureFilter(AbstractSizedFilter):
     observed_angles: Angles = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @property
@@ -178,7 +178,7 @@ class MixtureFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: MixtureBelief) -> Estimate:
-        """Return the mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of x given the data, with angles between -pi and pi."""
         x = state.gaussian
         return Estimate(wrap_angles(x.mean, first(self.plant).angles), x.covariance, self.claim)
 
@@ -257,7 +257,11 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
 
 
 def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
-    """Combine a channel's memories in one chain; raise ValueError for a gain that drifts."""
+    """Return the modes of all links with memory as one Markov chain, with the links' law in each joint mode.
+
+    Raises:
+        ValueError: a gain that drifts continuously, which has no finite number of values.
+    """
     if any(memory.drifts for memory in memories(channel).values()):
         raise fail("mixture filter", "gains of finitely many values", "one that drifts")
     return joint_modes(channel)

@@ -21,13 +21,19 @@ from heliograph.numerics.types import ArrayLike
 
 
 def transition_with_constant(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
+    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) (n + 1, n + 1) of x~ = (x, 1).
+
+    Then x+ = A x + B u + w is x~+ = A~ x~ + a noise of mean 0 and covariance Q~.
+    """
     matrix = pad_with_zeros(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
     return matrix, pad_with_zeros(plant.noise_covariance(u))
 
 
 def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
-    """Return C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
+    """Return C~ = [[C, E v], [0, 1]] (p + 1, n + 1) and R~ = diag(R, 0) (p + 1, p + 1) of y~ = (y, 1).
+
+    Then y = C x + v is y~ = C~ (x, 1) + a noise of mean 0 and covariance R~.
+    """
     measure = pad_with_zeros(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
     return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
 
@@ -64,7 +70,7 @@ def noise_in_mode(plant: LinearPlant, u: ArrayLike, initial_power: jax.Array) ->
 
 
 def pad_with_zeros(a: jax.Array) -> jax.Array:
-    """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
+    """Return [[A, 0], [0, 0]], A with one more row and column of zeros: those of the constant 1 in (x, 1)."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
 

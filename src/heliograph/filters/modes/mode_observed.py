@@ -55,7 +55,7 @@ class ModeObservedBelief(NamedTuple):
 
     @property
     def gaussian(self) -> Gaussian:
-        """Law of the state given the data."""
+        """The Gaussian of x given the data: of the estimate, not the one before any data."""
         return self.belief.gaussian
 
 
@@ -171,7 +171,7 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:
-        """Return the mean and covariance of the estimate."""
+        """Return the mean and covariance of x given the data."""
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 

@@ -106,7 +106,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
     @abstractmethod
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
-        """Return mean and covariance: of `sums`, and of the second sums (n, n) about this mean, over all particles."""
+        """Return the estimate: the mean from `sums`, the covariance from `second`, both over all particles.
+
+        `second` (n, n) is the sum of w d d' with the difference d of each particle from that mean.
+        """
 
     @abstractmethod
     def sum_received(

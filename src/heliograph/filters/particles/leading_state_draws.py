@@ -68,5 +68,9 @@ def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -
 
 
 def draw_index(log_weight: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Draw an index with probabilities exp(log_weight) / sum for each row (N, M), by one uniform number each (N,)."""
-    return jnp.sum(jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)[:, :-1] <= uniform[:, None], axis=1)
+    """Draw an index for each row of log weights (N, M), by one uniform number of [0, 1) each (N,).
+
+    Index j has the probability exp(log_weight_j) / sum. It is drawn where the cumulated probabilities pass the number.
+    """
+    cumulated = jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)
+    return jnp.sum(cumulated[:, :-1] <= uniform[:, None], axis=1)

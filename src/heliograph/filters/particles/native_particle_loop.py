@@ -195,7 +195,7 @@ def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
 
 
 def _take_first(tree: PyTree) -> PyTree:
-    """Return the first of arrays along their leading axis."""
+    """Return the first entry of each array of a tree along its leading axis: one particle of several."""
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 

@@ -38,7 +38,7 @@ class ReceivedAtoms(Module):
     noise: Array
 
     def expected(self, y: jax.Array) -> jax.Array:
-        """Return E[z | y, atom] of each atom, (a, m)."""
+        """Return E[z | y, atom] = gain y + offset of each Gaussian (atom) of the mixture, (a, m)."""
         expected: jax.Array = jnp.asarray(self.gain) @ y + jnp.asarray(self.offset)
         return expected
 
@@ -129,7 +129,11 @@ class ReceivedByMode(NamedTuple):
 
 
 def find_received_by_mode(z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
-    """Return z with the Gaussians (atoms) of each mode's mixture, and with the one Gaussian that has their moments."""
+    """Return z (m,) with its law given h(x) in each mode: the mixture of Gaussians (atoms), and one Gaussian.
+
+    The one Gaussian has the moments of the mixture: with it a particle's posterior is computed to draw from. Noises are
+    returned as columns of their covariances.
+    """
     gain, offset, noise = jax.vmap(lambda atoms_of_mode: atoms_of_mode.moments())(atoms)
     return ReceivedByMode(
         z=z,

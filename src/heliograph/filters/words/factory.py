@@ -30,7 +30,11 @@ from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rou
 
 
 class WordAlphabet(NamedTuple):
-    """The codewords of each component: the lowest (or any one), step and centre (m,), bits (0 without end), dither."""
+    """The codewords that stand for each of m components: low + i step, i = 0, 1, ..., 2^bits - 1.
+
+    `centre` (m,) is the middle of their range. `bits` is 0 for codewords without end, of which `low` is any one.
+    `dither` is the kind of random number that the sender adds before it rounds.
+    """
 
     low: np.ndarray
     step: np.ndarray
@@ -59,11 +63,15 @@ def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
 
 
 def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
-    """Return the sensor with the noise that it has before it rounds: without the error of rounding."""
+    """Return the sensor without the error of rounding: with the noise that it has before it rounds its outputs.
+
+    A filter that knows which codeword came treats the rounding itself, not as noise.
+    """
     if not isinstance(sensor.noise, RoundedNoise):
         return sensor
     unrounded = copy(sensor)
-    object.__setattr__(unrounded, "noise", sensor.noise.source)  # fields are frozen
+    # Past the check that fields of a built object are not assigned.
+    object.__setattr__(unrounded, "noise", sensor.noise.source)
     return unrounded
 
 

@@ -72,7 +72,7 @@ class LinearWordsFilter(AbstractWrapper):
         return corrected, Innovation(value, covariance, innovation.log_likelihood)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter of the numbers."""
+        """Return what a backward pass needs of a step: the base filter's, with the codewords in z as its numbers."""
         return self.base.smoother_step(step._replace(z=self._convert_words_to_numbers(jnp.asarray(step.z))))
 
     def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
@@ -164,7 +164,11 @@ def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) 
 
 
 def _claim_despite_overload(overload: Overload) -> Claim:
-    """Return "exact" where overload changes the rms error by 1 % at most, else "nominal"."""
+    """Return "exact" where overload changes the rms error by at most SEEN (1 %), else "nominal".
+
+    A codeword is overloaded if y lies beyond the range that it can stand for. Where that change has no known bound, it
+    is NaN, and the claim "nominal".
+    """
     return "exact" if float(np.max(overload.bound, initial=0.0)) <= SEEN else "nominal"
 
 
