@@ -43,7 +43,7 @@ class WeightedColumns(NamedTuple):
 
     @property
     def diagonal(self) -> jax.Array:
-        """Diagonal of the covariance: variances (n,)."""
+        """Variances (n,): the diagonal of W diag(w) W', without forming the matrix."""
         variances: jax.Array = jnp.asarray(self.matrix) ** 2 @ self.weights
         return variances
 
@@ -89,11 +89,14 @@ def unit_lower(entries: Array) -> Any:
 
 @cache_arrays
 def _place_unit_lower(count: int) -> np.ndarray:
-    """Return for each number of L (n, n) its index in the list of `count` entries below the diagonal, a 0 and a 1."""
+    """Return for each number of L (n, n) its index in a list: `count` entries below the diagonal, then a 0, then a 1.
+
+    Entries are listed row by row. Numbers above the diagonal are the 0, those on it the 1.
+    """
     n = (1 + int(np.sqrt(1 + 8 * count))) // 2  # of count = n (n - 1) / 2
-    index = np.full((n, n), count)
+    index = np.full((n, n), count)  # the 0
     index[np.tril_indices(n, -1)] = np.arange(count)
-    np.fill_diagonal(index, count + 1)
+    np.fill_diagonal(index, count + 1)  # the 1
     return index
 
 
@@ -163,14 +166,19 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        """Return the factors of L diag(d) L' + w c c', (c, w) = `column`. Row j takes c_j L_ij off each c_i below."""
-        (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
-        # Row j takes its part of the column: d_j' = d_j + w c_j^2, s = d_j / d_j', g = w c_j / d_j'
+        """Absorb one column c of weight w: return the factors of L diag(d) L' + w c c'.
+
+        `carry` holds the entries of L below its diagonal and d, `column` holds c and w.
+        """
+        lower, variances = list(carry[0]), list(carry[1])
+        c, weight = list(column[0]), column[1]
+        # Row after row takes its part of the column: d_j' = d_j + w c_j^2, s = d_j / d_j', g = w c_j / d_j'
         # (1 and 0 if d_j' = 0).
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
             reciprocal = reciprocal_or_one(d)
-            s, g = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0), weight * c[j] * reciprocal
+            s = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0)
+            g = weight * c[j] * reciprocal
             variances[j] = d
             for i in range(j + 1, n):
                 e = flat_place[i, j]  # of L_ij among the entries
@@ -257,7 +265,10 @@ def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def columns_of(covariance: Array) -> WeightedColumns:
-    """Return W and w of P = W diag(w) W': as many columns as P's rank if P is known (NumPy), else n columns."""
+    """Return columns W and weights w of a covariance P = W diag(w) W' (n, n).
+
+    Of a NumPy array, whose numbers are known, there are as many columns as its rank; of a traced one n, by elimination.
+    """
     if isinstance(covariance, np.ndarray):
         root = find_covariance_root(covariance)
         return WeightedColumns(root, np.ones(root.shape[1]))

@@ -330,9 +330,10 @@ def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array,
 def moments_of_mixture(
     means: Float[jax.Array, "parts n"], covariances: Float[jax.Array, "parts n n"], weights: Float[jax.Array, " parts"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
+    """Return the mean m = sum_i w_i m_i (n,) and covariance sum_i w_i (P_i + (m_i - m)(m_i - m)') (n, n) of a mixture.
 
-    Differences are taken from the first mean, so that equal means, however large, have differences of exactly 0.
+    Means are counted from the first one, so that equal means, however large, have differences of exactly 0. The weights
+    w sum to 1.
     """
     about_first = means - means[0]
     shift = weights @ about_first

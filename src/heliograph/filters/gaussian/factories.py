@@ -215,7 +215,10 @@ def mean_gain_filter(
 def make_base_gaussian_filter(
     name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
 ) -> GaussianFilter:
-    """Return the Gaussian filter inside another filter; raise ValueError if the receiver is told the link's state.
+    """Return the Gaussian filter that another filter holds inside, of a plant, a sensor and a channel.
+
+    Behind a link that reports its state (a gain, say) with each message, `gaussian_filter` makes another kind of
+    filter, which those others cannot hold.
 
     Args:
         name: of the other filter, for the message.
@@ -224,6 +227,9 @@ def make_base_gaussian_filter(
         channel: from the sensor to the filter.
         transform: moments of a nonlinear function.
         rule: how an uncertain channel is bounded.
+
+    Raises:
+        ValueError: a channel that reports its state to the receiver; what `gaussian_filter` refuses.
     """
     filter = gaussian_filter(plant, sensor, channel, transform, rule)
     return instance(f"channel of a {name}", filter, GaussianFilter, "one of which nothing is told")

@@ -206,8 +206,10 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
     rows, columns = np.triu_indices(n, 1)
     points = [center, center + factor, center - factor, center + factor[:, rows] + factor[:, columns]]
     values = evaluate_at_points(function, jnp.concatenate(points, axis=1).T).T
+    # f at m (p, 1), at m + L_i (p, n), at m - L_i (p, n), and at m + L_i + L_j (p, pairs).
     start, ahead, behind, cross = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
-    slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start  # a_i and b_i
+    slopes = (ahead - behind) / 2  # a_i
+    squares = (ahead + behind) / 2 - start  # b_i
     mixed = cross - ahead[:, rows] - ahead[:, columns] + start  # b_ij
     weights = np.concatenate([np.full(n, 2.0), np.ones(len(rows))])
     curvature = WeightedColumns(jnp.concatenate([squares, mixed], axis=1), weights)

@@ -270,13 +270,16 @@ def signal_without_noise(
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
     """Return the mean, slopes and noise of t = G y + n, what a channel makes of the signal y.
 
-    With M = E G and b = E n the mean is M E y + b, and the slopes are M times those of y. The noise is that of n and
-    that of the spread of G.
+    With M = E G and b = E n the mean is M E y + b, and the slopes are M times those of y. The noise is that of n, that
+    of y, and (G - M) y: what a random gain adds.
     """
-    gain = jnp.asarray(channel.mean_gain)
-    mean = gain @ signal.mean + channel.offset
-    slopes, noise = gain @ signal.slopes, make_received_noise(signal, channel)
-    return PredictedMeasurement(signal.prior, mean, slopes, noise)
+    gain = jnp.asarray(channel.mean_gain)  # M
+    return PredictedMeasurement(
+        prior=signal.prior,
+        signal=gain @ signal.mean + channel.offset,
+        slopes=gain @ signal.slopes,
+        noise=make_received_noise(signal, channel),
+    )
 
 
 def _innovation_about_mean(

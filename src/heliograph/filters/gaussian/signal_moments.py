@@ -186,7 +186,8 @@ def factor_covariance(covariance: jax.Array) -> WeightedColumns:
 def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return columns of Cov(z given y) = Cov n + E[(G - M) y y' (G - M)'], for z = G y + n.
 
-    `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of the gain G are those of its nominal law.
+    To a receiver who knows y, this is the covariance of what the link adds: of its noise n, and of the random gain G
+    about its mean M. `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of G are those of its nominal law.
     """
     return join_columns(take_link_noise(channel), factor_gain_noise(channel.gain_covariance, second, mean))
 
@@ -203,10 +204,19 @@ def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnova
 def condition_on_measurement(
     x: Gaussian, slopes: jax.Array, noise: WeightedColumns, z: jax.Array, expected: jax.Array, angles: Angles = ()
 ) -> tuple[Gaussian, Innovation]:
-    """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive.
+    """Condition x = m + L xi on the linear measurement z = expected + slopes xi + noise: Kalman's update.
 
-    `angles` are the components of z that are angles. The innovation's covariance is NaN in the rows and columns of
-    missing components.
+    Args:
+        x: the prior.
+        slopes: of z in xi (m, n): H L for z = H x + noise.
+        noise: columns of the noise's covariance.
+        z: measurement (m,), NaN where a component did not arrive.
+        expected: E z (m,).
+        angles: components of z that are angles; they are taken within half a turn of what was expected.
+
+    Returns:
+        The posterior, and the innovation z - E z with its covariance (NaN in rows and columns of missing components)
+        and its Gaussian log-likelihood.
     """
     present = ~jnp.isnan(z)
     z = wrap_near(z, expected, angles)

@@ -107,6 +107,7 @@ def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInn
     # beta: the scalars that minimise the trace of the bound.
     cross = (slopes * prior.variances) @ prior.root.T  # C
     trace = jnp.trace(prior.covariance)
+    # Arguments of `young_fixed_point_map`: base, shift, mean_part, cross_square and trace.
     terms = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, trace
     beta = find_trace_minimising_scalars(young_fixed_point_map, scalars, terms)
     a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
@@ -148,12 +149,9 @@ def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: Arrive
     explained_weights = reciprocal_or_zero(factors.weights)  # 1 / s
     # The beta of least trace, then the update with the noise Omega - M H P H' M'.
     cross = (slopes * prior.variances) @ prior.root.T  # Cov(z, x)
-    terms = (
-        base + unit_variance_where_absent(present),
-        shift,
-        cross @ cross.T,
-        jnp.sum(explained**2 @ explained_weights),
-    )
+    trace_explained = jnp.sum(explained**2 @ explained_weights)  # tr(C Pyy^+ C')
+    # Arguments of `zero_mean_fixed_point_map`: base, shift, cross_square and trace_explained.
+    terms = base + unit_variance_where_absent(present), shift, cross @ cross.T, trace_explained
     beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, terms)[0]
     noise = factor_covariance(base + shift / beta - of_state)
     after, _ = condition_on_observation(prior, slopes, z.innovation, noise, present)

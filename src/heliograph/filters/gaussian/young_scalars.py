@@ -43,10 +43,12 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     free = jnp.isnan(given)
 
     def move(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-        """Return the scalars' logarithms t after a Newton step for f(t) = t in the free scalars; `refined` is f(t)."""
-        zero_if_given = [
-            [jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in zip(free, slopes, strict=True)
-        ]
+        """Return t after a Newton step for f(t) = t, with f(t) `refined` and its derivatives `slopes`.
+
+        A scalar that is given does not move: for it both are set so that f(t) = t.
+        """
+        rows = zip(free, slopes, strict=True)
+        zero_if_given = [[jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in rows]
         return newton_step(t, jnp.where(free, refined, t), zero_if_given)
 
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:

@@ -90,10 +90,10 @@ class ScoreRecursion(Recursion):
         return density, score, halves
 
     def sum_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return the sums over all rows of a long recording, computed in chunks of rows.
+        """Return sums over all rows of a long recording, of log-densities, scores and information, by chunks of rows.
 
-        Returns None if the recording is short or cannot be divided into chunks. `self._start()` is the estimate before
-        the first row, with its derivatives.
+        Chunks run side by side, each from an estimate that has forgotten its start. Returns None if the recording is
+        short or cannot be divided so. `self._start()` is the estimate before the first row, with its derivatives.
         """
         if not is_long(len(z)):
             return None

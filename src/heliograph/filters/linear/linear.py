@@ -129,7 +129,10 @@ class LinearFilter(AbstractSizedFilter):
 
     @property
     def has_known_gain(self) -> bool:
-        """True if no gain is random: then no covariance needs E[x x'] before data. A traced gain counts as random."""
+        """True if no gain of the channel is random: its covariance is 0 at all steps.
+
+        Then no covariance of the filter needs E[x x'] before any data. A gain that JAX traces counts as random.
+        """
         gain_covariance = stack_over_time(self.channel).gain_covariance
         return not (is_traced(gain_covariance) or np.any(np.asarray(gain_covariance)))
 
@@ -280,25 +283,21 @@ def linear_filter(
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         filter = _make_filter_behind_memory(plant, sensor, channel)
-        return (
-            replace(filter, claim=lower_claim_by_noise(filter.claim, sensor)) if find_rounded_noises(sensor) else filter
-        )
+        if not find_rounded_noises(sensor):
+            return filter
+        return replace(filter, claim=lower_claim_by_noise(filter.claim, sensor))
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
     moments = stack_over_time(described)
-    start = first(plant)
+    claim = lower_claim_by_noise(rule.claim(moments.uncertain), plant, sensor, channel)
     return LinearFilter(
         plant=plant,
         sensor=sensor,
         channel=described,
         rule=rule,
         mean_known=not moments.uncertain or has_known_mean(moments),
-        **make_sizes(
-            lower_claim_by_noise(rule.claim(moments.uncertain), plant, sensor, channel),
-            start,
-            first(channel).outputs,
-        ),
+        **make_sizes(claim, first(plant), first(channel).outputs),
     )
 
 
@@ -315,11 +314,9 @@ def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Chan
     if uncertain_chain(channel):
         return modes.uncertain_modal_filter(plant, sensor, channel)
     terms = modes.independent_terms(channel)
-    return (
-        modes.additive_modal_filter(plant, sensor, terms)
-        if len(terms) > 1
-        else modes.modal_filter(plant, sensor, channel)
-    )
+    if len(terms) > 1:
+        return modes.additive_modal_filter(plant, sensor, terms)
+    return modes.modal_filter(plant, sensor, channel)
 
 
 def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:

@@ -101,7 +101,10 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
-        """Correct the inner filter with all monomials up to `degree` of z, or of z - E[z] if a mean is subtracted."""
+        """Correct the inner filter, whose measurement is all monomials of z (or z - E[z]) up to `degree`.
+
+        E[z] is subtracted where the inner filter is of x - E[x]. The innovation that is returned is that of z itself.
+        """
         z = subtract_mean(self.centre, z, state.mean, k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
         after, innovation = self.inner.correct(state.inner, monomials, k)
@@ -225,9 +228,17 @@ def polynomial_filter(
 def lift_about_mean(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
-    """Lift the model to monomials up to `degree`, about its mean where the gain is known.
+    """Return the linear system of all powers (monomials) of the state up to `degree`, and the mean that they are about.
 
-    Return the unconditional mean that is subtracted, or None behind a random gain, and the lifted system.
+    Powers of a linear system's state follow a linear system of their own. Where the channel's gain is known they are
+    powers of x - E[x], so that a large mean costs no digits; the mean is None behind a random gain, or where it is 0.
+
+    Args:
+        plant: a linear plant.
+        sensor: a linear sensor.
+        channel: from the sensor to the filter.
+        degree: of the powers.
+        horizon: number of steps.
     """
     check_model(plant, sensor, channel)
     centre = find_unconditional_mean(plant, sensor, channel)

@@ -269,9 +269,10 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
 
 @compile_in_float64
 def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, rounding_errors: Array) -> WeightedColumns:
-    """Return the factors of each step's noise, joined with the rounding of numbers of these second moments.
+    """Return factors L diag(d) L' of each step's noise covariance, to which two diagonal covariances are added.
 
-    `rounding_errors` are those of the noise's variances. Shapes: noise (steps, n, columns), the others (steps, n).
+    They are the rounding of numbers with these second moments, and `rounding_errors`, that of the noise's variances
+    themselves. Shapes: noise (steps, n, columns), the others (steps, n).
     """
 
     def factor_step(noise: WeightedColumns, second_moments: jax.Array, rounding_errors: jax.Array) -> WeightedColumns:

@@ -28,10 +28,11 @@ def correct_in_every_mode(
     z: jax.Array,
     angles: Angles = (),
 ) -> tuple[Gaussian, jax.Array, Innovation]:
-    """Return the posteriors of several Gaussians, each corrected in its mode, their weights, the mixture's innovation.
+    """Correct several Gaussians of x, each in its own mode of the link, and weigh them by their likelihoods.
 
-    The weight becomes proportional to weight P(which components arrive | mode) N(z; ...). The innovation's likelihood
-    is that of z given which components arrive.
+    Gaussian c has the weight w_c before z, and z has the density N(z; z_c, S_c) under it, by the gain and noise of its
+    mode. Its weight becomes w_c P(which components arrive | its mode) N(z; z_c, S_c), divided by the sum of all. A
+    Gaussian whose mode cannot produce such a z stays as it was.
 
     Args:
         signal: moments of the sensor's signal y under each Gaussian of the state x (K, ...).
@@ -40,6 +41,10 @@ def correct_in_every_mode(
         weight: probability of each Gaussian and its mode (K,).
         z: measurement (m,), NaN for what did not arrive.
         angles: components of z that are angles.
+
+    Returns:
+        The posteriors (K, ...), their weights (K,), and the innovation of the mixture, with the likelihood of z given
+        which components arrive.
     """
     # Channel moments by mode, given which components arrived.
     pattern = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0

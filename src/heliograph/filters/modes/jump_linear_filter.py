@@ -99,12 +99,14 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """Return the estimate of x = `projection` zeta, and the covariance of its error.
+        """Return the estimate of x = P zeta, and the covariance of its error.
 
-        zeta holds the products of (x, 1) and functions of the modes.
+        The filter's state is the Gaussian of zeta, which holds the products of (x, 1) and functions of the modes; P is
+        a fixed matrix that picks or sums x among them.
         """
-        projection, x = self._projection_to_state(), state.gaussian
-        return Estimate(projection @ x.mean, WeightedColumns(projection @ x.root, x.variances).covariance, self.claim)
+        projection, zeta = self._projection_to_state(), state.gaussian
+        covariance = WeightedColumns(projection @ zeta.root, zeta.variances).covariance
+        return Estimate(projection @ zeta.mean, covariance, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Return the filter with gains and covariances of each step computed in advance, for complete data."""

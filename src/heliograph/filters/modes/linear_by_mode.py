@@ -173,12 +173,13 @@ def covariance_of_mode(transition: jax.Array) -> jax.Array:
 def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
     """Return columns (M s, ...) of a covariance of M blocks, one a mode, of size s, that sum to 0 over the modes.
 
-    Such are deviations of indicators, which sum to 1. `covariance` (M - 1, s, M - 1, s) is that of all modes but the
-    last, whose block is minus the sum of the others. So the singular covariance of all is never factored.
+    Such are deviations of the modes' indicators from their means, since the indicators sum to 1. `covariance` (M - 1,
+    s, M - 1, s) is that of all modes but the last, whose block is minus the sum of the others: x_M = -sum_j x_j. So the
+    singular covariance of all is never factored.
     """
     other_modes, size = covariance.shape[:2]
     factors = factor_covariance(covariance.reshape(other_modes * size, other_modes * size))
-    minus_sum = -np.tile(np.eye(size), (1, other_modes))
+    minus_sum = -np.tile(np.eye(size), (1, other_modes))  # maps the blocks of all other modes to that of the last
     return factors.through(np.concatenate([np.eye(other_modes * size), minus_sum]))
 
 

@@ -84,9 +84,10 @@ class AbstractMerging(Module):
         return numbers, numbers
 
     def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
-        """Return the components after a correction and their weights (K, M).
+        """Return the components that are kept after a correction with z, and their weights (K, M).
 
-        `gaussians` and `weight` (pairs,) hold what `list_update_pairs` lists, after the correction.
+        `gaussians` and `weight` (pairs,) are those of the pairs (component, mode) that `list_update_pairs` lists, after
+        the correction. Here pair j is component j with its own mode j: all are kept, with diagonal weights.
         """
         return gaussians, jnp.diag(weight)
 

@@ -200,7 +200,8 @@ class ModalSmootherStep(SmootherStep):
         def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
             """Condition the Gaussian x of one pair (mode, next mode) on later data; return it and the log-likelihood.
 
-            Later data act like a measurement value = rows x + noise.
+            Later data act like a measurement value = rows x + noise with uncorrelated noises, NaN where they say
+            nothing.
             """
             noise = WeightedColumns(jnp.eye(len(x.mean)), observed.noise)
             expected, slopes = observed.rows @ x.mean, observed.rows @ x.root

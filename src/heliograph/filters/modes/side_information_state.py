@@ -36,6 +36,7 @@ class SideInformationBelief(NamedTuple):
 
         Each of the M modes has q columns.
         """
+        # The rows of e are the first N of (e, x~); the sum over modes has the weight 1 for each.
         modes, errors_by_mode = len(self.lower), self.moments.matrix[:, : len(self.mean)]
         return side_by_side(WeightedColumns(errors_by_mode, self.moments.weights), np.ones(modes))
 
@@ -61,7 +62,7 @@ def split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, j
 def make_belief(
     mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
 ) -> SideInformationBelief:
-    """Return the filter's state.
+    """Return the filter's state, of which factors are stored as their entries below the diagonal.
 
     Args:
         mean: estimate of the products of (x - c, 1) and the modes' indicators.

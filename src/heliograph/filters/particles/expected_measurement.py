@@ -81,6 +81,7 @@ class ExpectedMeasurement(NamedTuple):
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
     """Return the index of the heaviest particle (N,) with finite expectations, or of the heaviest if no one has any.
 
+    Its innovation is subtracted from all others before they are summed, so that differences keep their digits.
     `predicted` holds what particles expect of z, in several arrays (N, ...).
     """
     xp = library(weight, predicted)

@@ -58,10 +58,11 @@ def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
 
 
 def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
-    """Return the first sums over particles (B,) and modes, and the sum of weights in each mode (None for one mode).
+    """Return sums over B particles, from which the mean of x and the modes' probabilities follow.
 
-    Each particle has a Gaussian in each of M modes. The first sums are those of weights, of squared weights, of means,
-    and of the angles' sines and cosines: E exp(i angle) of a Gaussian angle is exp(i mean - variance / 2).
+    Each particle is a mixture of a Gaussian in each of M modes. The sums are those of weights, of squared weights, of
+    weighted means, and of weighted sines and cosines of angles: a Gaussian angle has E exp(i angle) =
+    exp(i mean - variance / 2). Beside them the sum of weights in each mode (M,), None if there is one mode.
     """
     weights, mean = _list_parts(weight, particles)
     variances = jnp.diagonal(particles.gaussian.covariance, axis1=-2, axis2=-1).reshape(mean.shape)

@@ -40,9 +40,10 @@ class StateSums(NamedTuple):
 
 
 def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
-    """Return the first sums of numbers x (N, n) by weights (N,), which need not sum to 1.
+    """Return sums over N particles x (N, n) with weights w (N,), from which their weighted mean follows.
 
-    These are the sums of the weights, of their squares, of x, and of sine and cosine of the components that are angles.
+    They are the sums of w, w^2, w x, and of w sin x and w cos x of the components that are angles. The weights need not
+    sum to 1, and the sums of several groups of particles add up.
     """
     angle_columns = x[:, list(angles)]
     sum_of_squares = jnp.sum(weight**2)

@@ -185,8 +185,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
         """Draw each particle's mode j and some of its states d with z, and condition its other states on z.
 
-        They are drawn from a law q(j, d) near their posterior, so that the weight is multiplied by p(j, d, z) / q(j,
-        d).
+        They are drawn from a law q(j, d) near their posterior: the weight is multiplied by p(j, d, z) / q(j, d).
         """
         z = jnp.asarray(z)
         key, proposal_keys = self.keys_of_correction(state.key, z)

@@ -91,7 +91,7 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
         weights = np.array([[probability for probability, _ in mixture]], dtype=float)
         return LinkOfBits(links=tuple(link for _, link in mixture), weights=weights, flag=None)
     # A channel with modes, whose number is received with the codewords: the channel in each mode.
-    link_by_mode = list_told_modes(channel)
+    link_by_mode = list_links_by_reported_mode(channel)
     if not link_by_mode:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
@@ -106,7 +106,7 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
     return LinkOfBits(links=tuple(links), weights=weights, flag=channel.outputs - 1)  # the last output is the mode
 
 
-def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+def list_links_by_reported_mode(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the channel of codewords in each mode of its chain, without the output that reports the mode.
 
     A channel may report the mode of its only Markov chain with each message: its last output is then a `ModeOutput`,

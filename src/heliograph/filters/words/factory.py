@@ -107,8 +107,8 @@ def word_filter(
     far off for tens of steps.
 
     One word over several paths is used as one: the bits of all that came are weighed together. Error rates that are
-    drawn are averaged over. Modes that are told with each message (`hg.model.with_flag`) have their own rates. Words
-    that are late by a constant delay are used for the past, which is predicted to the present.
+    drawn are averaged over. Modes that are reported with each message (`hg.model.with_flag`) have their own rates.
+    Words that are late by a constant delay are used for the past, which is predicted to the present.
 
     Args:
         plant: linear or not; n states.
@@ -123,7 +123,7 @@ def word_filter(
 
     Raises:
         ValueError: parts that do not fit, angles, neither encoder nor resolution or both, a channel that is late by
-            chance, modes that are not told, words without end behind more than losses.
+            chance, modes that are not reported, words without end behind more than losses.
 
     Source: Curry, Estimation and control with quantized measurements (1970), the Gaussian fit, for any word channel.
     """

@@ -14,7 +14,7 @@ from heliograph.filters.base import (
     make_sizes,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.words.bit_likelihoods import list_told_modes
+from heliograph.filters.words.bit_likelihoods import list_links_by_reported_mode
 from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_sent
@@ -119,7 +119,7 @@ def build_behind_words(
     check_sent(first(sensor), first(channel))
     indices, numbers = find_carried_components(channel), rewrite_about_centres(encoder, channel)
     # The channel of codewords as numbers, z = G (y - c) + n: in each mode if modes are reported, else at each step.
-    channel_by_mode = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    channel_by_mode = [rewrite_about_centres(encoder, link) for link in list_links_by_reported_mode(first(channel))]
     channels = [first(link) for link in channel_by_mode or unstack(numbers)]
     # Whether G is random given the reported mode, as it is if bits flip.
     remembers = first(channel).remembers

@@ -171,9 +171,9 @@ def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
 def _find_models_of_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
-    """Return the motion, the sensing and the link at step k.
+    """Return the matrices of plant and sensor at step k, and the moments of the link.
 
-    `links` holds the link's moments at each step, or is None if there is no link.
+    `links` holds the link's moments at each step; None where they are not needed, and then the third result is None.
     """
     link = None if links is None else links[k]
     return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), link

@@ -128,7 +128,7 @@ class WordFilter(AbstractGaussianStateFilter):
         first_copies = []
         for i in range(len(self.low)):
             copies = np.flatnonzero(component == i)
-            first_copies.append(_pick_first_copy([(arrived[j], number[j], dither[j]) for j in copies]))
+            first_copies.append(_pick_first_copy([WordCopy(arrived[j], number[j], dither[j]) for j in copies]))
         present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
         # P(received | sent 0) and P(received | sent 1) of each bit, under each possible set of error rates of the link,
         # and the probabilities of these sets.
@@ -277,15 +277,22 @@ class ReceivedWords(NamedTuple):
     are_words: jax.Array
 
 
-def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
-    """Return presence, number and dither of the first copy that arrived, or False and zeros if none did.
+class WordCopy(NamedTuple):
+    """One copy of a codeword, as it came over one path: whether it arrived, its number and its dither, all ()."""
 
-    Each copy is a tuple of these three. The loop goes from the last copy to the first, so that the first one that
-    arrived overwrites all others.
+    arrived: jax.Array
+    number: jax.Array
+    dither: jax.Array
+
+
+def _pick_first_copy(copies: list[WordCopy]) -> WordCopy:
+    """Return the first copy of a codeword that arrived; one that did not, with zeros, if none did.
+
+    The loop goes from the last copy to the first, so that the first one that arrived overwrites all others.
     """
-    some_is_present, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
-    for is_present, number_of_copy, dither_of_copy in reversed(copies):
-        some_is_present = is_present | some_is_present
-        number = jnp.where(is_present, number_of_copy, number)
-        dither = jnp.where(is_present, dither_of_copy, dither)
-    return some_is_present, number, dither
+    arrived, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
+    for copy in reversed(copies):
+        arrived = copy.arrived | arrived
+        number = jnp.where(copy.arrived, copy.number, number)
+        dither = jnp.where(copy.arrived, copy.dither, dither)
+    return WordCopy(arrived, number, dither)

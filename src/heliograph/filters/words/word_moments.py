@@ -97,9 +97,10 @@ def sum_neighbouring_words(
     def add_block(
         carried: tuple[LikelihoodSums, jax.Array], block: jax.Array
     ) -> tuple[tuple[LikelihoodSums, jax.Array], None]:
-        """Add the sums over the upper edge of each codeword of one block.
+        """Add what the edges above each codeword of one block contribute: L jumps there to the next codeword's.
 
-        `carried`: the sums so far, and the likelihood of the block's high bits.
+        `carried`: the sums so far, and the likelihood of the block's high bits, with which the likelihood of each
+        codeword of the block is `high_bits @ tables`.
         """
         total, high_bits = carried
         high_bits_of_next = weigh_bits_above(block + 1)
