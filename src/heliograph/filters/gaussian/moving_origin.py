@@ -130,7 +130,7 @@ class CentredFilter(AbstractWrapper):
 
     @property
     def attitude(self) -> Angles:
-        """No attitudes: plants that have some are not treated about an origin."""
+        """Indices of attitudes among the states: none, since plants with attitudes are not treated about an origin."""
         return ()
 
     @in_float64

@@ -50,7 +50,7 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> RecordedBelief:
-        """Return the filter's prior; before any data, the error covariance given the data is the state's own."""
+        """Return the filter's state before any data, with the covariance of x_0 as that of the estimate's error."""
         own = self.filter.init()
         return RecordedBelief(own, covariance=own.state_covariance)
 

@@ -80,7 +80,11 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
 
 
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
-    """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
+    """Predict over x+ = A x + b + w the Gaussian of the estimate, and the state's moments before any data.
+
+    Both follow m+ = A m + b and P+ = A P A' + Cov w: the first by factors of P, the second by matrices. `step` has A, b
+    and Cov w.
+    """
     gaussian = predict_affine(belief.gaussian, step.matrix, step.offset, step.noise)
     before_data = MomentsBeforeData(belief.state_mean, belief.state_covariance)
     mean, covariance = before_data.predict(step.matrix, step.offset, step.covariance)

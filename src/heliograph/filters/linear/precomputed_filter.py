@@ -39,7 +39,7 @@ class LinearStep(NamedTuple):
         return jnp.asarray(self.transition @ mean + self.drift)
 
     def expect(self, mean: Float[Array, " N"]) -> Float[jax.Array, " m"]:
-        """Predict the measurement, C m- + c, from the predicted mean m-."""
+        """Return the expected measurement C m- + c, from the predicted mean m-."""
         return jnp.asarray(self.output @ mean + self.offset)
 
     def correct(self, mean: Float[Array, " N"], innovation: Float[jax.Array, " m"]) -> Float[jax.Array, " N"]:
@@ -110,11 +110,14 @@ class PlannedFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
-        """Return the mean of the state, with the planned covariance."""
+        """Return the state's mean, with the covariance that was computed in advance for this stage of the run."""
         return self._estimate(state.mean, state.stage)
 
     def after_step(self, state: PlannedMean, k: Step) -> Estimate:
-        """Return the mean of the state, with the planned covariance of step k, common to all runs."""
+        """Return the state's mean, with the covariance computed in advance for step k.
+
+        As k is the same of all runs that are stepped together, they share one covariance.
+        """
         return self._estimate(state.mean, 2 * k + 2)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

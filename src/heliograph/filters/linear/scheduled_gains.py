@@ -141,7 +141,7 @@ class ScheduledFilter(AbstractSizedFilter):
         return self._estimate(state, state.stage)
 
     def after_step(self, state: ScheduleState, k: Step) -> Estimate:
-        """Return the estimate after step k, with the covariance of that step, common to all runs."""
+        """Return the estimate after step k, with the covariance saved for step k: one for all runs stepped together."""
         return self._estimate(state, 2 * k + 2)
 
     def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:

@@ -57,8 +57,9 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
     def step(before: Carried, row: tuple[jax.Array, ...]) -> tuple[Carried, jax.Array]:
         """Filter a row (number, measurement, input) twice: by factors, and by covariances for the derivatives.
 
-        The values are those by factors, which are exact but are not differentiated. Return what is carried to the next
-        row, and the log-likelihood of this one.
+        The values are those by factors, which are more exact but are not differentiated; the same numbers by
+        covariances give them their derivatives. Returns what is carried to the next row (`Carried`), and the
+        log-likelihood of this one.
         """
         (state, moments, before_data), (k, z, u) = before, row
         prior = constant.predict(state, _hold_constant(u), k)

@@ -231,14 +231,18 @@ class MultipleModelFilter(AbstractSizedFilter):
         )  # fmt: skip
 
     def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
-        """Return the Gaussian and the probability of each mode, from a filter's state after a correction."""
+        """Return the Gaussian and the probability of each present mode, merged from a filter's components."""
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> PairSmootherTerms:
-        """Return the terms of a step for a smoother by pairs (mode i before the step, mode j after it).
+        """Return what a smoother needs of a step: for each pair (mode i before it, mode j after it) a Gaussian of x.
 
-        These are Gaussian and probability of each pair, the smoother gain back to mode i, and the Gaussian of each mode
-        j without later data. `step`: states around step k, u and z. `after`: law by mode after the correction.
+        With it the pair's probability, the smoother gain back to mode i, and for each mode j the Gaussian that a
+        smoothed one is divided by, to find what later data alone say.
+
+        Args:
+            step: the filter's states before the step, after its prediction and after its correction, with k, u and z.
+            after: Gaussian and probability of each mode after the correction.
         """
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = list_mode_models(at(self.plant, k)), second_moments_at_start(self.plant)

@@ -191,7 +191,7 @@ def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], diffe
 
 
 def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
-    """Return the particle of this number before any row, drawn with the key."""
+    """Return the particle of this number at the start, drawn from the law of x_0 with the key."""
     return _take_first(filter.draw_start(key, number[None]))
 
 
